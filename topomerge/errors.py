@@ -1,0 +1,7 @@
+"""Errors that are for people: one line that names the file, what is wrong with it and what to do."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """A file or a value from the user that can't be used. The command line prints it as one line and exits with status 1."""
