@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from topomerge.kernels import lookup, morton
+from topomerge.kernels import lookup, morton, stencil
 
 Array = NDArray[Any]
 
@@ -152,6 +152,10 @@ class VoxelGrid:
     @cached_property
     def _bricks(self) -> tuple[Array, Array]:
         return lookup.build(self.cells, self.shape)
+
+    @cached_property
+    def _columns(self) -> Array:
+        return stencil.columns(self.cells, *self._bricks)
 
     @property
     def bounds(self) -> tuple[Array, Array]:

@@ -1,0 +1,168 @@
+"""Moving a stencil over cells: compiled loops behind `extraction.convolution`.
+
+A stencil that only asks "is there a cell?" reads occupancy bits, eight cells of a column at a time: a body of 1.75 m is then
+three reads a column and not 18. What needs the rows themselves goes through the brick lookup.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from topomerge.kernels.lookup import row
+
+CHUNK = 2048  # cells a task: scratch memory is made once a task, and two cores stay level
+_ONES = np.array([bin(i).count("1") for i in range(256)], np.int64)
+
+
+@njit(cache=True)
+def _fill_columns(cells, table, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    for i in range(len(cells)):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        out[table[x >> 3, y >> 3, z >> 3], ((x & 7) << 3) | (y & 7)] |= np.uint8(1 << (z & 7))
+
+
+def columns(cells: NDArray[Any], table: NDArray[Any], bricks: NDArray[Any]) -> NDArray[np.uint8]:
+    """(bricks, 64) uint8: bit z of column 8 x + y is set where cell (x, y, z) of the brick is occupied."""
+    out = np.zeros((len(bricks), 64), np.uint8)
+    _fill_columns(cells, table, out)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _column(table, bits, x, y, low, high, stop):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Occupied cells (x, y, low .. high); with `stop` the count ends in the first brick that holds one."""
+    low, high = max(low, 0), min(high, table.shape[2] * 8 - 1)
+    if x < 0 or y < 0 or (x >> 3) >= table.shape[0] or (y >> 3) >= table.shape[1] or low > high:
+        return 0
+    count, column = 0, ((x & 7) << 3) | (y & 7)
+    for bz in range(low >> 3, (high >> 3) + 1):
+        brick = table[x >> 3, y >> 3, bz]
+        if brick < 0:
+            continue
+        mask = 255
+        if bz == low >> 3:
+            mask &= 255 << (low & 7)
+        if bz == high >> 3:
+            mask &= 255 >> (7 - (high & 7))
+        count += _ONES[bits[brick, column] & mask]
+        if stop and count:
+            break
+    return count
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def _count(table, bits, cells, runs, weights, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    for i in prange(len(cells)):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        total = 0.0
+        for j in range(len(runs)):
+            low, high = z + runs[j, 2], z + runs[j, 3]
+            total += weights[j] * _column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high, False)
+        out[i] = total
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def _any(table, bits, cells, runs, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    for i in prange(len(cells)):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        found = False
+        for j in range(len(runs)):
+            low, high = z + runs[j, 2], z + runs[j, 3]
+            if _column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high, True):
+                found = True
+                break
+        out[i] = found
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def _weigh(table, bricks, cells, offsets, weights, values, largest, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in prange(len(cells)):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        out[i] = -np.inf if largest else 0.0
+        for j in range(len(offsets)):
+            r = row(table, bricks, x + offsets[j, 0], y + offsets[j, 1], z + offsets[j, 2])
+            if r < 0:
+                continue
+            for c in range(values.shape[1]):
+                value = weights[j] * values[r, c]
+                if not largest:
+                    out[i, c] += value
+                elif value > out[i, c]:
+                    out[i, c] = value
+
+
+@njit(cache=True, error_model="numpy")
+def _winner(found, votes, count, own):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """The label with most votes: of several `own`, else the smallest; -1 where nobody voted."""
+    best, most = -1, 0.0
+    for k in range(count):
+        if votes[k] > most or (votes[k] == most and best != own and (found[k] == own or found[k] < best)):
+            best, most = found[k], votes[k]
+    return best
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def _vote(table, bricks, cells, offsets, weights, labels, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for task in prange((len(cells) + CHUNK - 1) // CHUNK):
+        found = np.empty(len(offsets), np.int64)  # labels met, in order of appearance: mostly one or two
+        votes = np.empty(len(offsets), np.float64)
+        for i in range(task * CHUNK, min((task + 1) * CHUNK, len(cells))):
+            x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+            count = 0
+            for j in range(len(offsets)):
+                r = row(table, bricks, x + offsets[j, 0], y + offsets[j, 1], z + offsets[j, 2])
+                if r < 0 or labels[r] < 0:
+                    continue
+                k = 0
+                while k < count and found[k] != labels[r]:
+                    k += 1
+                if k == count:
+                    found[k], votes[k] = labels[r], 0.0
+                    count += 1
+                votes[k] += weights[j]
+            out[i] = _winner(found, votes, count, labels[i])
+
+
+def count(
+    table: NDArray[Any], bits: NDArray[Any], cells: NDArray[Any], runs: NDArray[Any], weights: NDArray[Any]
+) -> NDArray[np.float64]:
+    """(m,) weighted number of cells under runs (dx, dy, lowest, highest dz) placed at each of (m, 3) int64 cells."""
+    out = np.empty(len(cells), np.float64)
+    _count(table, bits, cells, runs, weights, out)
+    return out
+
+
+def any_(table: NDArray[Any], bits: NDArray[Any], cells: NDArray[Any], runs: NDArray[Any]) -> NDArray[np.bool_]:
+    """(m,) is any cell under the runs placed at each of (m, 3) int64 cells occupied?"""
+    out = np.empty(len(cells), np.bool_)
+    _any(table, bits, cells, runs, out)
+    return out
+
+
+def weigh(
+    bricks: tuple[NDArray[Any], NDArray[Any]],
+    cells: NDArray[Any],
+    stencil: tuple[NDArray[Any], NDArray[Any]],
+    values: NDArray[Any],
+    largest: bool,
+) -> NDArray[np.float64]:
+    """(n, c) sum, or `largest`, of weight * value over the cells under (k, 3) int64 offsets; values (n, c) float64."""
+    out = np.empty(values.shape, np.float64)
+    _weigh(*bricks, cells, *stencil, values, largest, out)
+    return out
+
+
+def vote(
+    bricks: tuple[NDArray[Any], NDArray[Any]],
+    cells: NDArray[Any],
+    stencil: tuple[NDArray[Any], NDArray[Any]],
+    labels: NDArray[Any],
+) -> NDArray[np.int64]:
+    """(n,) most voted of the (n,) int64 labels under the stencil; negative labels do not vote."""
+    out = np.empty(len(cells), np.int64)
+    _vote(*bricks, cells, *stencil, labels, out)
+    return out
