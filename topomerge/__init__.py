@@ -1,3 +1,69 @@
-"""topomerge: rooms, doors and storeys out of partial indoor maps, matched and merged across sensors."""
+"""topomerge: rooms, doors and storeys out of partial indoor maps, matched and merged across sensors.
+
+    import topomerge as tm
+    a = tm.extract(tm.read_points("a.ply"))
+
+What the package offers is imported when it is first asked for, so that ``import topomerge`` and ``topomerge --help``
+stay fast.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from topomerge.errors import InputError as InputError
+    from topomerge.extraction.extract import PRESETS as PRESETS
+    from topomerge.extraction.extract import extract as extract
+    from topomerge.extraction.voxels import voxelise as voxelise
+    from topomerge.io.listing import map_to_json as map_to_json
+    from topomerge.io.listing import save_json as save_json
+    from topomerge.io.maps import load_map as load_map
+    from topomerge.io.maps import save_map as save_map
+    from topomerge.io.points import read_chunks as read_chunks
+    from topomerge.io.points import read_points as read_points
+    from topomerge.io.rooms_ply import save_rooms_ply as save_rooms_ply
+    from topomerge.types import PointCloud as PointCloud
+    from topomerge.types import Sim3 as Sim3
+    from topomerge.types import TopometricMap as TopometricMap
+    from topomerge.types import VoxelGrid as VoxelGrid
+    from topomerge.viz.figures import plan_figure as plan_figure
+    from topomerge.viz.figures import save_figure as save_figure
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "InputError": "topomerge.errors",
+    "PRESETS": "topomerge.extraction.extract",
+    "PointCloud": "topomerge.types",
+    "Sim3": "topomerge.types",
+    "TopometricMap": "topomerge.types",
+    "VoxelGrid": "topomerge.types",
+    "extract": "topomerge.extraction.extract",
+    "load_map": "topomerge.io.maps",
+    "map_to_json": "topomerge.io.listing",
+    "plan_figure": "topomerge.viz.figures",
+    "read_chunks": "topomerge.io.points",
+    "read_points": "topomerge.io.points",
+    "save_figure": "topomerge.viz.figures",
+    "save_json": "topomerge.io.listing",
+    "save_map": "topomerge.io.maps",
+    "save_rooms_ply": "topomerge.io.rooms_ply",
+    "voxelise": "topomerge.extraction.voxels",
+}
+
+__all__ = ["__version__", *_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its home (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'topomerge' has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,144 @@
+"""The commands of the command line. To add one, write a function and enter it in `COMMANDS`.
+
+Heavy modules are imported inside the functions, so that `--help` needs none of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import topomerge
+from topomerge.console import Bars, check_outputs, warn, write_all
+from topomerge.errors import InputError
+
+Argument = tuple[tuple[str, ...], dict[str, Any]]
+FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command: its function, its words for the help and its arguments."""
+
+    name: str
+    run: Callable[[argparse.Namespace], int]
+    summary: str
+    example: str
+    arguments: tuple[Argument, ...]
+    paths: tuple[str, ...] = ()  # arguments that name files, the input first: errors are told under its name
+    description: str = ""
+
+
+def option(*flags: str, **settings: Any) -> Argument:
+    """One argument, as argparse's `add_argument` takes it.
+
+    An option without `default` is absent from the namespace unless it was given: its default has one home, the function
+    that takes it.
+    """
+    if flags[0].startswith("-"):
+        settings.setdefault("default", argparse.SUPPRESS)
+    return flags, settings
+
+
+def _above_zero(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be a number above 0, not {text!r}")
+    return value
+
+
+def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    return {name: getattr(args, name) for name in names if hasattr(args, name)}
+
+
+READING = (
+    option("--up", choices=("z", "y", "x"), help="axis of the input that points up (default z)"),
+    option("--unit", choices=("m", "cm", "mm", "ft", "in"), help="unit of the input (default m)"),
+    option("--scale", type=_above_zero, metavar="S", help="multiply coordinates by this (default 1)"),
+    option("--resolution", type=_above_zero, metavar="R", help="m a pixel, of a plain image of a floor plan"),
+    option("--extrude", type=_above_zero, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
+    option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
+)
+
+
+def extract_command(args: argparse.Namespace) -> int:
+    """`topomerge extract`: points in, map out."""
+    outputs = _outputs(args)
+    check_outputs([path for path, _ in outputs], [args.input])
+    with Bars(enabled=not args.quiet) as bars:
+        from topomerge.extraction.extract import extract
+        from topomerge.io.points import read_chunks
+
+        reading = _given(args, "up", "unit", "scale", "resolution", "extrude", "ceiling")
+        chunks = read_chunks(args.input, **reading, progress=bars.task("read"))
+        choices = _given(args, "voxel_size", "preset")
+        found = extract(chunks, **choices, source=args.input, progress=bars.task("extract"))
+        write_all([(path, partial(getattr(topomerge, writer), found)) for path, writer in outputs])
+    warn(found.warnings)
+    if not args.quiet:
+        from topomerge.io.listing import map_to_text
+
+        print(map_to_text(found))
+    return 0
+
+
+def _outputs(args: argparse.Namespace) -> list[tuple[str, str]]:
+    """Where to write, and the name of topomerge's function (map, path) that writes it."""
+    if args.figure and Path(args.figure).suffix.lower() not in FIGURE_FORMATS:
+        raise InputError(f"{args.figure}: unknown kind of figure; end the name with one of {' '.join(FIGURE_FORMATS)}")
+    writers = {"output": "save_map", "json": "save_json", "ply": "save_rooms_ply", "figure": "save_figure"}
+    return [(getattr(args, name), writer) for name, writer in writers.items() if getattr(args, name)]
+
+
+def info_command(args: argparse.Namespace) -> int:
+    """`topomerge info`: what a map holds."""
+    from topomerge.io.listing import json_text, map_to_json, map_to_text
+    from topomerge.io.maps import load_map
+
+    found = load_map(args.input)
+    warn(found.warnings)
+    sys.stdout.write(json_text(map_to_json(found)) if args.json else map_to_text(found) + "\n")
+    return 0
+
+
+COMMANDS = (
+    Command(
+        "extract",
+        extract_command,
+        "find the rooms, doors and storeys of one partial map",
+        "topomerge extract scan.ply -o a.tmap --json a.json --ply a_rooms.ply --figure a.png",
+        (
+            option("input", metavar="SCAN", help="point cloud, mesh, building model, OctoMap or 2D map"),
+            option("-o", "--output", required=True, metavar="A.tmap", default=None, help="the map to write"),
+            option("--json", metavar="A.json", default=None, help="also write rooms, doors and storeys as JSON"),
+            option("--ply", metavar="A.ply", default=None, help="also write the occupied cells with their room as PLY"),
+            option("--figure", metavar="A.png", default=None, help="also draw the plan of each storey"),
+            option("--voxel-size", type=_above_zero, metavar="E", help="edge length of a cell, m (default 0.1)"),
+            option("--preset", choices=("default", "thesis"), help="parameters: ours (default) or those of the thesis"),
+            *READING,
+            option("-q", "--quiet", action="store_true", default=False, help="no table, no progress; only warnings"),
+        ),
+        paths=("input", "output", "json", "ply", "figure"),
+        description="Find the rooms, doors and storeys of one partial map, and print a table of them.",
+    ),
+    Command(
+        "info",
+        info_command,
+        "print what a map holds",
+        "topomerge info a.tmap",
+        (
+            option("input", metavar="A.tmap", help="a map that `topomerge extract` wrote"),
+            option("--json", action="store_true", default=False, help="print JSON instead of tables"),
+        ),
+        paths=("input",),
+        description="Print the rooms, storeys, doors and times of a map.",
+    ),
+)

@@ -1,0 +1,127 @@
+"""What the command line shows while it works, and how it writes: progress bars, warnings, all outputs or none."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+Report = Callable[[float, str], None]  # fraction done in 0..1, what is being done
+
+
+class Bars:
+    """Progress bars on stderr, one a task, that appear once the work has taken over two seconds and vanish at its end.
+
+    Args:
+        enabled: False for no bars at all. They are also left out where stderr is not a terminal.
+        delay: seconds before they appear.
+    """
+
+    def __init__(self, enabled: bool = True, delay: float = 2.0) -> None:
+        self.enabled = enabled and sys.stderr.isatty()
+        self._lock = threading.Lock()
+        self._state: dict[str, tuple[float, str]] = {}
+        self._rows: dict[str, Any] = {}
+        self._shown: Progress | None = None
+        self._timer = threading.Timer(delay, self._show)
+        self._timer.daemon = True
+
+    def __enter__(self) -> Bars:
+        if self.enabled:
+            self._timer.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._timer.cancel()
+        with self._lock:
+            self.enabled = False
+            if self._shown is not None:
+                self._shown.stop()
+
+    def task(self, title: str) -> Report | None:
+        """A callable that moves the bar of one task, or None where no bar will be shown."""
+        if not self.enabled:
+            return None
+
+        def report(fraction: float, text: str = "") -> None:
+            with self._lock:
+                self._state[title] = (min(max(float(fraction), 0.0), 1.0), text)
+                self._draw()
+
+        return report
+
+    def _show(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+        text = TextColumn("{task.description}", markup=False)
+        columns = (text, BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+        with self._lock:
+            if self.enabled:  # the work may have ended while rich was being imported
+                self._shown = Progress(*columns, console=Console(stderr=True), transient=True)
+                self._shown.start()
+                self._draw()
+
+    def _draw(self) -> None:
+        if self._shown is None:
+            return
+        for title, (fraction, text) in self._state.items():
+            if title not in self._rows:
+                self._rows[title] = self._shown.add_task(title, total=1.0)
+            description = f"{title}: {text}" if text else title
+            self._shown.update(self._rows[title], completed=fraction, description=description)
+
+
+def warn(messages: Iterable[str]) -> None:
+    """Print warnings to stderr, one line each."""
+    for message in messages:
+        print(f"topomerge: warning: {' '.join(message.split())}", file=sys.stderr)
+
+
+class _Probe(Exception):
+    """Ends a trial of writing."""
+
+
+def check_outputs(outputs: Sequence[str | Path], inputs: Sequence[str | Path] = ()) -> None:
+    """Find out before the work starts whether its results can be written.
+
+    Raises:
+        InputError: a folder is missing or can't be written, a path is a folder, is an input or is given twice.
+    """
+    taken = {Path(path).resolve(): "is the input: it would be overwritten; give another name" for path in inputs}
+    for path in map(Path, outputs):
+        if path.is_dir():
+            raise InputError(f"{path}: is a folder; give the name of a file in it")
+        place = path.resolve()
+        if place in taken:
+            raise InputError(f"{path}: {taken[place]}")
+        taken[place] = "is named for two outputs; give each its own name"
+        with suppress(_Probe), replacing(path):
+            raise _Probe
+
+
+def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> None:
+    """Write every output beside its place and rename them once all are whole: either all appear or none.
+
+    Args:
+        outputs: where, and what writes a file to the path that it is given.
+
+    Raises:
+        InputError: one can't be written.
+    """
+    with ExitStack() as stack:
+        for path, save in outputs:
+            beside = stack.enter_context(replacing(path))
+            try:
+                save(beside)
+            except OSError as error:
+                raise InputError(f"{path}: can't be written ({error.strerror or error})") from error

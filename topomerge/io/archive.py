@@ -1,0 +1,104 @@
+"""Arrays in one file: a NumPy archive (.npz) whose bytes depend only on its content, read without trusting it.
+
+The file can be opened with `numpy.load`. Unlike `numpy.savez_compressed` it holds no time of writing. Reading checks what
+the file declares about itself before memory is taken for it, and never unpickles.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+from topomerge.types import Array
+
+DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can tell
+MAX_BYTES = 4 << 30  # of all arrays together; a map of 100 million cells needs 2 GB
+MAX_RATIO = 1100  # deflate can't shrink by more than 1032; a file that claims more is damaged or hostile
+HEADER = 4096  # longest header of an array, bytes
+
+
+def write(arrays: Mapping[str, Array], path: str | Path) -> None:
+    """Write named arrays. The same arrays in the same order give the same bytes.
+
+    Raises:
+        InputError: the path can't be written.
+    """
+    with replacing(path) as beside, zipfile.ZipFile(beside, "w") as archive:
+        for name, array in arrays.items():
+            entry = zipfile.ZipInfo(f"{name}.npy", DATE)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.create_system = 3  # else it tells the platform
+            entry.external_attr = 0o644 << 16
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
+            archive.writestr(entry, buffer.getbuffer(), compresslevel=6)
+
+
+def read(path: str | Path, kind: str = "archive") -> dict[str, Array]:
+    """Read all arrays of a file that may be damaged or hostile.
+
+    Args:
+        path: the file.
+        kind: what it should be, for messages.
+
+    Raises:
+        InputError: no such file, not such an archive, damaged, or it declares more than it can hold.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, not a {kind}; name a file")
+    try:
+        with path.open("rb") as file:
+            start = file.read(4)
+            if not start:
+                raise InputError(f"{path}: is empty; make the {kind} again")
+            if start[:2] != b"PK":
+                raise InputError(f"{path}: is not a {kind}")
+            return _read(file, path.stat().st_size)
+    except (InputError, MemoryError):
+        raise
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except PermissionError as error:
+        raise InputError(f"{path}: can't be read (permission denied)") from error
+    except Exception as error:  # damage can surface anywhere in zipfile, zlib and NumPy, as nearly any exception
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{path}: damaged or cut off ({reason}); copy or make the {kind} again") from error
+
+
+def _read(file: io.BufferedReader, size: int) -> dict[str, Array]:
+    with zipfile.ZipFile(file) as archive:
+        entries = [entry for entry in archive.infolist() if entry.filename.endswith(".npy")]
+        if len({entry.filename for entry in entries}) < len(entries):
+            raise ValueError("an array is there twice")
+        for entry in entries:
+            if entry.compress_size > size or entry.file_size > MAX_RATIO * (entry.compress_size + 16):
+                raise ValueError(f"{entry.filename} claims {entry.file_size} bytes, more than it can hold")
+        if sum(entry.file_size for entry in entries) > MAX_BYTES:
+            raise ValueError(f"claims more than {MAX_BYTES >> 30} GB")
+        return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
+
+
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
+    """One array; its declared shape must fill the entry to the byte before the rest of it is read."""
+    with archive.open(entry) as stream:
+        head = io.BytesIO(stream.read(HEADER))
+        version = np.lib.format.read_magic(head)
+        if version != (1, 0):
+            raise ValueError(f"{entry.filename} has an array format {version} that maps don't use")
+        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=HEADER)
+        if dtype.hasobject:
+            raise ValueError(f"{entry.filename} holds pickled objects, which are not read for safety")
+        if by_columns or any(s < 0 for s in shape):
+            raise ValueError(f"{entry.filename} has a layout that maps don't use")
+        if head.tell() + math.prod(shape) * dtype.itemsize != entry.file_size:
+            raise ValueError(f"{entry.filename} claims shape {shape}, which is not its size")
+        body = head.read() + stream.read()  # reading to the end also checks the CRC
+    return np.frombuffer(body, dtype, count=math.prod(shape)).reshape(shape).copy()  # a copy can be written to

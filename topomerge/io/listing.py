@@ -1,0 +1,164 @@
+"""A map as a list of its rooms, doors and storeys: JSON for programs, tables for people.
+
+JSON, format 1. Lengths are m, areas m², volumes m³, angles radians, times seconds, coordinates those of the input (z up);
+what is not known is null. A height of 0 means that no ceiling (or lintel) was seen.
+
+    {"format": 1, "source": "a.ply", "voxel_size": 0.1,
+     "rooms": [{"id", "storey", "centroid": [x, y, z], "area", "height", "volume",
+                "bounding_box": {"min": [x, y, z], "max": [x, y, z]}, "cells", "glimpsed"}, …],
+     "edges": [{"rooms": [id, id], "door": {"centre": [x, y, z], "width", "height", "direction"}, "kind"}, …],
+     "storeys": [{"id", "floor", "ceiling", "area"}, …],
+     "seconds": {step: s}, "parameters": {…}, "warnings": […]}
+
+`kind` is door, opening or stairs; `direction` is that of the wall's normal seen from above, from x towards y.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.io.atomic import replacing
+from topomerge.types import TopometricMap
+
+FORMAT = 1
+DIGITS = 6  # micrometres: the digits behind are noise
+
+
+def plain(value: Any) -> Any:
+    """The value in Python's own types, as far as JSON has them: arrays and tuples as lists, anything odd as its text."""
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def _strict(value: Any) -> Any:
+    """Rounded, and null for the numbers that JSON does not have."""
+    if isinstance(value, float):
+        return round(value, DIGITS) if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _strict(item) for key, item in value.items()}
+    return [_strict(item) for item in value] if isinstance(value, list) else value
+
+
+def map_to_json(map: TopometricMap) -> dict[str, Any]:
+    """The map as a dictionary of plain Python values that is valid JSON; see the top of this file for its fields."""
+    rooms = [
+        {
+            "id": i,
+            **{name: room[name] for name in ("storey", "centroid", "area", "height", "volume")},
+            "bounding_box": {"min": room["lo"], "max": room["hi"]},
+            "cells": room["cells"],
+            "glimpsed": room["glimpsed"],
+        }
+        for i, room in enumerate(map.rooms)
+    ]
+    doors = ("centre", "width", "height", "direction")
+    edges = [{"rooms": e["rooms"], "door": {name: e[name] for name in doors}, "kind": e["kind"]} for e in map.edges]
+    storeys = [{"id": i, **{name: s[name] for name in s.dtype.names}} for i, s in enumerate(map.storeys)]
+    listing = {
+        "format": FORMAT,
+        "source": map.source,
+        "voxel_size": float(map.grid.edge),
+        "rooms": rooms,
+        "edges": edges,
+        "storeys": storeys,
+        "seconds": map.seconds,
+        "parameters": map.parameters,
+        "warnings": list(map.warnings),
+    }
+    strict: dict[str, Any] = _strict(plain(listing))
+    return strict
+
+
+def json_text(listing: Mapping[str, Any]) -> str:
+    """Strict JSON with a line for each room, edge and storey, so that it can be read and compared."""
+    lines = []
+    for key, value in listing.items():
+        text = json.dumps(value, allow_nan=False, ensure_ascii=False)
+        if isinstance(value, list) and value:
+            items = ",\n    ".join(json.dumps(item, allow_nan=False, ensure_ascii=False) for item in value)
+            text = f"[\n    {items}\n  ]"
+        lines.append(f"  {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def save_json(map: TopometricMap, path: str | Path) -> None:
+    """Write `map_to_json` as UTF-8.
+
+    Raises:
+        InputError: the path can't be written.
+    """
+    with replacing(path) as beside:
+        beside.write_text(json_text(map_to_json(map)), encoding="utf-8", errors="replace")
+
+
+def _columns(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a table: right-aligned, but for the last column."""
+    table = [list(header), *map(list, rows)]
+    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
+    last = len(header) - 1
+    cells = [[c.rjust(w) if i < last else c for i, (c, w) in enumerate(zip(r, widths, strict=True))] for r in table]
+    return ["  ".join(row).rstrip() for row in cells]
+
+
+def _number(value: float, digits: int, unknown: bool = False) -> str:
+    return "–" if unknown or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def _plural(count: int, word: str) -> str:
+    return f"{count} {word}{'' if count == 1 or word == 'stairs' else 's'}"
+
+
+def _neighbours(map: TopometricMap) -> list[list[str]]:
+    """For each room the rooms that it leads to; a second door to the same one is not told again."""
+    beside: list[dict[int, str]] = [{} for _ in map.rooms]
+    for edge in map.edges:
+        a, b = edge["rooms"].tolist()
+        mark = " (stairs)" if edge["kind"] == "stairs" else ""
+        beside[a].setdefault(b, mark)
+        beside[b].setdefault(a, mark)
+    return [[f"{room}{rooms[room]}" for room in sorted(rooms)] for rooms in beside]
+
+
+def map_to_text(map: TopometricMap) -> str:
+    """Tables of rooms, storeys and seconds for a terminal, without a line break at the end."""
+    kinds = Counter(map.edges["kind"].tolist())
+    counts = [_plural(len(map.rooms), "room"), _plural(len(map.storeys), "storey")]
+    counts += [_plural(kinds[kind], kind) for kind in ("door", "opening", "stairs")]
+    name = map.source or "map"
+    lines = [f"{name}: {', '.join(counts)}; {_plural(len(map.grid), 'cell')} of {map.grid.edge:g} m", ""]
+    neighbours = _neighbours(map)
+    doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
+    rooms = [
+        (
+            str(i),
+            str(room["storey"]),
+            _number(room["area"], 1),
+            _number(room["height"], 2, room["height"] == 0),
+            str(room["cells"]),
+            str(doors[i]),
+            ", ".join(neighbours[i]) + ("  glimpsed" if room["glimpsed"] else ""),
+        )
+        for i, room in enumerate(map.rooms)
+    ]
+    lines += _columns(("room", "storey", "area m²", "height m", "cells", "doors", "leads to"), rooms) + [""]
+    held = np.bincount(map.rooms["storey"], minlength=len(map.storeys))
+    storeys = [
+        (str(i), _number(s["floor"], 2), _number(s["ceiling"], 2), _number(s["area"], 1), str(held[i]))
+        for i, s in enumerate(map.storeys)
+    ]
+    lines += _columns(("storey", "floor m", "ceiling m", "area m²", "rooms"), storeys) + [""]
+    steps = [(f"{s:.2f}", step) for step, s in map.seconds.items()]
+    lines += _columns(("seconds", "step"), [*steps, (f"{sum(map.seconds.values()):.2f}", "all")])
+    return "\n".join(lines)

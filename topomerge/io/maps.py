@@ -1,0 +1,152 @@
+"""Topometric maps in files: `.tmap` in and out (and, from here too, JSON and PLY out).
+
+A `.tmap` is one compressed NumPy archive without pickled objects. Format 1 holds:
+
+| array | content |
+|---|---|
+| format | the number of the format |
+| about | JSON as bytes: source, parameters, seconds, warnings |
+| grid_cells, navigable_cells, free_cells | Morton codes ascending, each as the difference to the one before |
+| grid_frame, … | origin x, y, z and edge length, m |
+| grid_shape, … | cells along x, y, z |
+| grid_property.NAME, … | one row a cell |
+| room, navigable_room | int32 room of each cell, -1 none |
+| rooms, edges, storeys | tables, see `topomerge.types` |
+| provenance | uint32 bit set of the maps that saw each cell |
+
+`free_…` and `provenance` are absent where the map has none.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io import archive
+from topomerge.io.listing import map_to_json, plain, save_json
+from topomerge.io.rooms_ply import save_rooms_ply
+from topomerge.kernels import morton
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
+
+__all__ = ["FORMAT", "load_map", "map_to_json", "save_json", "save_map", "save_rooms_ply"]
+
+FORMAT = 1
+KIND = "map of topomerge (.tmap)"
+
+
+def save_map(map: TopometricMap, path: str | Path) -> None:
+    """Write a map. The same map gives the same bytes; `load_map` gives back an equal one.
+
+    Tuples in the parameters come back as lists.
+
+    Raises:
+        InputError: the path can't be written.
+        ValueError: a property of a grid holds Python objects.
+    """
+    about = {
+        "source": map.source,
+        "parameters": plain(dict(map.parameters)),
+        "seconds": plain(dict(map.seconds)),
+        "warnings": list(map.warnings),
+    }
+    arrays: dict[str, Array] = {"format": np.array(FORMAT, "<i4"), "about": np.array(json.dumps(about).encode())}
+    arrays |= _pack("grid", map.grid) | {"room": map.room.astype("<i4")}
+    arrays |= _pack("navigable", map.navigable) | {"navigable_room": map.navigable_room.astype("<i4")}
+    arrays |= {"rooms": map.rooms, "edges": map.edges, "storeys": map.storeys}
+    if map.free is not None:
+        arrays |= _pack("free", map.free)
+    if map.provenance is not None:
+        arrays["provenance"] = map.provenance.astype("<u4")
+    archive.write(arrays, path)
+
+
+def load_map(path: str | Path) -> TopometricMap:
+    """Read a map that `save_map` wrote.
+
+    Raises:
+        InputError: no such file, not a map, of a newer format, damaged or cut off.
+    """
+    arrays = archive.read(path, KIND)
+    if "format" not in arrays or "about" not in arrays:
+        raise InputError(f"{path}: is not a {KIND}: make one with `topomerge extract SCAN -o A.tmap`")
+    number = arrays["format"]
+    if number.shape != () or number.dtype.kind not in "iu" or int(number) != FORMAT:
+        raise InputError(f"{path}: is of format {number}, and this topomerge reads format {FORMAT}; update topomerge")
+    try:
+        return _map(arrays)
+    except KeyError as error:
+        raise InputError(f"{path}: damaged ({error} is missing); make it again") from error
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: damaged ({reason}); make it again") from error
+
+
+def _pack(name: str, grid: VoxelGrid) -> dict[str, Array]:
+    """A grid as arrays. Differences of neighbouring Morton codes are mostly 1, so they compress to about a bit."""
+    deltas = np.diff(grid.codes, prepend=np.zeros(1, np.uint64))
+    small = len(deltas) == 0 or deltas.max() < 1 << 32
+    packed = {
+        f"{name}_cells": deltas.astype("<u4" if small else "<u8"),
+        f"{name}_frame": np.array([*grid.origin, grid.edge], "<f8"),
+        f"{name}_shape": np.array(grid.shape, "<i4"),
+    }
+    for key in sorted(grid.properties):
+        values = np.asarray(grid.properties[key])
+        if values.dtype.kind not in "biuf":
+            raise ValueError(f"property {key!r} has type {values.dtype}; only numbers can be saved")
+        packed[f"{name}_property.{key}"] = values
+    return packed
+
+
+def _unpack(arrays: dict[str, Array], name: str) -> VoxelGrid:
+    deltas, frame = _typed(arrays, f"{name}_cells", "u", 1), _typed(arrays, f"{name}_frame", "f", 1)
+    shape = _typed(arrays, f"{name}_shape", "i", 1)
+    if frame.shape != (4,) or shape.shape != (3,) or not np.isfinite(frame).all():
+        raise ValueError(f"{name} has no proper frame")
+    codes = np.cumsum(deltas, dtype=np.uint64)
+    if len(codes) and (int(codes[-1]) >> 63 or not (codes[1:] > codes[:-1]).all()):
+        raise ValueError(f"the cells of {name} are not in order")
+    start = f"{name}_property."
+    properties = {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
+    x, y, z = shape.tolist()
+    return VoxelGrid(morton.decode(codes), frame[:3].copy(), float(frame[3]), (x, y, z), properties)
+
+
+def _typed(arrays: dict[str, Array], name: str, kind: str, dimensions: int) -> Array:
+    array = arrays[name]
+    if array.dtype.kind != kind or array.ndim != dimensions:
+        raise ValueError(f"{name} has type {array.dtype} and shape {array.shape}")
+    return array
+
+
+def _table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
+    table = _typed(arrays, name, "V", 1)
+    if table.dtype != dtype:
+        raise ValueError(f"{name} has other columns")
+    return table.astype(dtype, copy=False)
+
+
+def _map(arrays: dict[str, Array]) -> TopometricMap:
+    about = json.loads(arrays["about"].item())
+    provenance = _typed(arrays, "provenance", "u", 1).astype(np.uint32) if "provenance" in arrays else None
+    edges = _table(arrays, "edges", EDGE_DTYPE)
+    edges["kind"].tolist()  # fails here, not later, where the text is none
+    return TopometricMap(
+        grid=_unpack(arrays, "grid"),
+        room=_typed(arrays, "room", "i", 1).astype(np.int32),
+        navigable=_unpack(arrays, "navigable"),
+        navigable_room=_typed(arrays, "navigable_room", "i", 1).astype(np.int32),
+        rooms=_table(arrays, "rooms", ROOM_DTYPE),
+        edges=edges,
+        storeys=_table(arrays, "storeys", STOREY_DTYPE),
+        free=_unpack(arrays, "free") if "free_cells" in arrays else None,
+        provenance=provenance,
+        source=str(about["source"]),
+        parameters=dict(about["parameters"]),
+        seconds={str(step): float(s) for step, s in about["seconds"].items()},
+        warnings=tuple(str(message) for message in about["warnings"]),
+    )

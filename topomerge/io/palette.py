@@ -1,0 +1,74 @@
+"""Colours of rooms: rooms that stand side by side differ, also for people who see few colours.
+
+The colours are Paul Tol's "light" scheme (Colour Schemes, SRON technical note, 2021): made for areas with dark text on
+them and told apart under the common kinds of colour blindness.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topomerge.types import Array, TopometricMap
+
+LIGHT = ("77AADD", "EE8866", "EEDD88", "FFAABB", "44BB99", "BBCC33", "99DDFF", "AAAA00")
+NO_ROOM = (150, 150, 150)
+GAP = 0.4  # m: rooms with this much wall between them stand side by side
+
+
+def _palette() -> Array:
+    """(16, 3) uint8: the scheme, then the same darkened for maps that need more than eight."""
+    light = np.array([[int(code[i : i + 2], 16) for i in (0, 2, 4)] for code in LIGHT], np.float64)
+    return np.concatenate([light, light * 0.62]).round().astype(np.uint8)
+
+
+PALETTE = _palette()
+
+
+def beside(map: TopometricMap) -> Array:
+    """(k, 2) int64 pairs of rooms, ascending, that a door joins or that only a wall's thickness parts, on one storey."""
+    pairs = [np.sort(map.edges["rooms"].astype(np.int64), axis=1)]
+    pairs += [_touching(map, axis) for axis in (0, 1)]
+    both = np.concatenate(pairs)
+    return np.unique(both[both[:, 0] != both[:, 1]], axis=0).reshape(-1, 2)
+
+
+def _touching(map: TopometricMap, axis: int) -> Array:
+    """Pairs of rooms that follow each other along an axis, seen from above, no further apart than `GAP`."""
+    inside = map.navigable_room >= 0
+    room = map.navigable_room[inside].astype(np.int64)
+    along, across = map.navigable.cells[inside][:, (axis, 1 - axis)].T
+    storey = map.rooms["storey"][room]
+    order = np.lexsort((room, along, across, storey))
+    room, along, line = room[order], along[order], np.stack([storey[order], across[order]])
+    near = (np.diff(along) <= GAP / map.grid.edge + 1) & (np.diff(line, axis=1) == 0).all(axis=0)
+    return np.sort(np.stack([room[:-1], room[1:]], axis=1)[near], axis=1).reshape(-1, 2)
+
+
+def colour_numbers(rooms: int, pairs: Array) -> Array:
+    """(rooms,) int64 number in `PALETTE` of each room: greedy, the most constrained room first (Brélaz 1979).
+
+    Of the colours that a room may have it takes the one that is used least, so that a plan is not all in two colours.
+    """
+    around: list[set[int]] = [set() for _ in range(rooms)]
+    for a, b in pairs.tolist():
+        around[a].add(b)
+        around[b].add(a)
+    number = np.full(rooms, -1)
+    used = np.zeros(len(PALETTE), np.int64)
+    taken: list[set[int]] = [set() for _ in range(rooms)]
+    waiting = set(range(rooms))
+    while waiting:
+        room = min(waiting, key=lambda i: (-len(taken[i]), -len(around[i]), i))
+        waiting.remove(room)
+        allowed = [c for c in range(len(LIGHT)) if c not in taken[room]]
+        allowed = allowed or [c for c in range(len(PALETTE)) if c not in taken[room]] or list(range(len(PALETTE)))
+        number[room] = min(allowed, key=lambda c: (used[c], c))
+        used[number[room]] += 1
+        for other in around[room]:
+            taken[other].add(int(number[room]))
+    return number
+
+
+def room_colours(map: TopometricMap) -> Array:
+    """(R, 3) uint8 red, green, blue of each room. The same map gives the same colours."""
+    return PALETTE[colour_numbers(len(map.rooms), beside(map))].reshape(-1, 3)
