@@ -20,8 +20,8 @@ SLACK = 1e-6  # cells: 0.3 m are three cells of 0.1 m, whatever the last bit of 
 class Kernel:
     """A voxel grid with a weight for each voxel and an origin voxel (seeds 2.3.1).
 
-    A cell of weight 0 takes no part in any function: for a sum this is the seeds' formula, for a maximum it means that an
-    origin of weight 0 does not hold the result at 0 or above.
+    A cell of weight 0 takes no part in any function: for a sum this is the seeds' formula, for a maximum it means that
+    an origin of weight 0 does not hold the result at 0 or above.
 
     Args:
         cells: (k, 3) int32, unique and not negative.
@@ -153,9 +153,9 @@ def convolve(
     """Convolve a property of every cell: K_f({weight(v) * property(v) | v in K_v, v occupied}) (seeds 2.3.1).
 
     Args:
-        function: ``sum``; ``max``, -inf where no neighbour is occupied; ``most_common``, the label with the largest sum of
-            weights. Of several such labels it is the cell's own, else the smallest. Negative labels do not vote; -1 where
-            nobody does.
+        function: ``sum``; ``max``, -inf where no neighbour is occupied; ``most_common``, the label with the largest sum
+            of weights. Of several such labels it is the cell's own, else the smallest. Negative labels do not vote; -1
+            where nobody does.
         property: a property's name or an (n, ...) array; None is occupancy, 1 for each cell. ``most_common`` takes (n,)
             signed integers.
 
@@ -163,8 +163,8 @@ def convolve(
         (n, ...) float64, also of integers; for ``most_common`` the dtype of the labels.
 
     Raises:
-        ValueError: an unknown function or property, a property of the wrong length, labels that are no integers, weights
-            below 0 as votes.
+        ValueError: an unknown function or property, a property of the wrong length, labels that are no integers,
+            weights below 0 as votes.
     """
     if function not in ("sum", "max", "most_common"):
         raise ValueError(f"function must be sum, max or most_common, not {function!r}")
@@ -196,7 +196,7 @@ def _values(grid: VoxelGrid, property: str | Array | None) -> Array:
 
 
 def count_at(grid: VoxelGrid, cells: Array, kernel: Kernel) -> Array:
-    """(m,) float64 sum of occupancy under the kernel placed at any (m, 3) cells, also empty ones or outside the grid."""
+    """(m,) float64 sum of occupancy under the kernel placed at any (m, 3) cells, also empty ones or outside."""
     return stencil.count(grid._bricks[0], grid._columns, _cells(cells), *kernel.runs)
 
 

@@ -1,7 +1,7 @@
 """Moving a stencil over cells: compiled loops behind `extraction.convolution`.
 
-A stencil that only asks "is there a cell?" reads occupancy bits, eight cells of a column at a time: a body of 1.75 m is then
-three reads a column and not 18. What needs the rows themselves goes through the brick lookup.
+A stencil that only asks "is there a cell?" reads occupancy bits, eight cells of a column at a time: a body of 1.75 m is
+then three reads a column and not 18. What needs the rows themselves goes through the brick lookup.
 """
 
 from __future__ import annotations

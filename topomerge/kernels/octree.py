@@ -1,0 +1,169 @@
+"""Sparse voxel octree over Morton codes: building and querying (compiled loops behind `extraction.octree`).
+
+Leaves and nodes share one numbering: leaves 0 .. n - 1 are the rows of the grid, then the nodes level by level, the root
+last. The children of node n + j are ``child[j] .. child[j + 1] - 1``, its leaves the rows ``span[j]``, and ``box[j]`` the
+lowest and highest occupied cell in it: inside the bounds that its Morton prefix gives, and flat where a floor is flat.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+DEPTH = 8 * 22  # room on the stack: every level leaves at most seven siblings behind
+CHUNK = 64  # queries a task
+
+
+class Nodes(NamedTuple):
+    """The tree as arrays; `first` (levels + 1,) int64 tells where each level of nodes starts, counted without the leaves."""
+
+    child: NDArray[np.int64]  # (m + 1,)
+    span: NDArray[np.int64]  # (m, 2) first row, last row + 1
+    box: NDArray[np.int32]  # (m, 6) lowest and highest occupied cell
+    codes: NDArray[np.uint64]  # (m,) Morton prefix
+    first: NDArray[np.int64]
+
+
+@njit(cache=True)
+def _bucket(codes, child, parents, first):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    count = 0
+    for i in range(len(codes)):
+        parent = codes[i] >> np.uint64(3)
+        if count == 0 or parents[count - 1] != parent:
+            parents[count], first[count] = parent, child + i
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _bound(cells, child, span, box):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    n = len(cells)
+    for j in range(len(span)):
+        a, b = child[j], child[j + 1] - 1
+        span[j, 0] = a if a < n else span[a - n, 0]
+        span[j, 1] = b + 1 if b < n else span[b - n, 1]
+        box[j, :3], box[j, 3:] = 1 << 30, -1
+        for c in range(a, b + 1):
+            for k in range(3):
+                box[j, k] = min(box[j, k], cells[c, k] if c < n else box[c - n, k])
+                box[j, 3 + k] = max(box[j, 3 + k], cells[c, k] if c < n else box[c - n, 3 + k])
+
+
+def build(cells: NDArray[np.int32], codes: NDArray[np.uint64]) -> Nodes:
+    """Nodes over (n, 3) cells in Morton order: codes go into buckets of 8 until one bucket, the root, is left (seeds 2.2.1)."""
+    level, start = codes, 0
+    parts: list[tuple[NDArray[Any], NDArray[Any]]] = []
+    while len(codes) and (not parts or len(level) > 1):
+        parents, first = np.empty(len(level), np.uint64), np.empty(len(level), np.int64)
+        count = _bucket(level, start, parents, first)
+        start, level = start + len(level), parents[:count].copy()
+        parts.append((level, first[:count]))
+    sizes = np.array([len(p) for p, _ in parts], np.int64)
+    child = np.concatenate([f for _, f in parts] + [np.array([start], np.int64)])
+    size = int(sizes.sum())
+    span, box = np.empty((size, 2), np.int64), np.empty((size, 6), np.int32)
+    _bound(cells, child, span, box)
+    prefixes = np.concatenate([p for p, _ in parts]) if parts else np.empty(0, np.uint64)
+    return Nodes(child, span, box, prefixes, np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
+
+
+@njit(cache=True, error_model="numpy")
+def _in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Rows of the cells low <= cell < high into `out`; returns how many."""
+    n, count, top = len(cells), 0, 1
+    stack[0] = n + len(span) - 1
+    while top:
+        top -= 1
+        j = stack[top] - n
+        outside, inside = False, True
+        for k in range(3):
+            outside |= box[j, k] >= high[k] or box[j, 3 + k] < low[k]
+            inside &= low[k] <= box[j, k] and box[j, 3 + k] < high[k]
+        if outside:
+            continue
+        if inside:
+            for r in range(span[j, 0], span[j, 1]):
+                out[count] = r
+                count += 1
+        elif child[j] < n:
+            for r in range(child[j], child[j + 1]):
+                if low[0] <= cells[r, 0] < high[0] and low[1] <= cells[r, 1] < high[1] and low[2] <= cells[r, 2] < high[2]:
+                    out[count] = r
+                    count += 1
+        else:
+            for c in range(child[j + 1] - 1, child[j] - 1, -1):
+                stack[top] = c
+                top += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def _in_ball(cells, child, span, box, centre, square, stack, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Rows of the cells whose squared distance to `centre` (in cells) is at most `square`; returns how many."""
+    n, count, top = len(cells), 0, 1
+    x, y, z = centre[0], centre[1], centre[2]
+    stack[0] = n + len(span) - 1
+    while top:
+        top -= 1
+        j = stack[top] - n
+        ax, ay, az = box[j, 0] - x, box[j, 1] - y, box[j, 2] - z
+        bx, by, bz = box[j, 3] - x, box[j, 4] - y, box[j, 5] - z
+        dx, dy, dz = max(ax, -bx, 0.0), max(ay, -by, 0.0), max(az, -bz, 0.0)
+        if dx * dx + dy * dy + dz * dz > square:
+            continue
+        dx, dy, dz = max(-ax, bx), max(-ay, by), max(-az, bz)
+        if dx * dx + dy * dy + dz * dz <= square:
+            if fill:
+                for r in range(span[j, 0], span[j, 1]):
+                    out[count + r - span[j, 0]] = r
+            count += span[j, 1] - span[j, 0]
+        elif child[j] < n:
+            for r in range(child[j], child[j + 1]):
+                dx, dy, dz = cells[r, 0] - x, cells[r, 1] - y, cells[r, 2] - z
+                if dx * dx + dy * dy + dz * dz <= square:
+                    if fill:
+                        out[count] = r
+                    count += 1
+        else:
+            for c in range(child[j + 1] - 1, child[j] - 1, -1):
+                stack[top] = c
+                top += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def _in_balls(cells, child, span, box, centres, square, indptr, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for task in prange((len(centres) + CHUNK - 1) // CHUNK):
+        stack = np.empty(DEPTH, np.int64)
+        for i in range(task * CHUNK, min((task + 1) * CHUNK, len(centres))):
+            part = out[indptr[i] : indptr[i + 1]] if fill else out
+            count = _in_ball(cells, child, span, box, centres[i], square, stack, part, fill)
+            if not fill:
+                indptr[i + 1] = count
+
+
+def in_box(cells: NDArray[np.int32], nodes: Nodes, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Ascending rows of the cells low <= cell < high."""
+    out = np.empty(len(cells), np.int64)
+    if not len(cells):
+        return out
+    stack = np.empty(DEPTH, np.int64)
+    return out[: _in_box(cells, *nodes[:3], low, high, stack, out)].copy()
+
+
+def in_balls(
+    cells: NDArray[np.int32], nodes: Nodes, centres: NDArray[np.float64], radius: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """CSR (indptr, ascending rows) of the cells within `radius` of (q, 3) centres, all in cells."""
+    indptr = np.zeros(len(centres) + 1, np.int64)
+    rows = np.empty(0, np.int64)
+    if not len(cells):
+        return indptr, rows
+    _in_balls(cells, *nodes[:3], centres, radius * radius, indptr, rows, False)
+    np.cumsum(indptr, out=indptr)
+    rows = np.empty(indptr[-1], np.int64)
+    _in_balls(cells, *nodes[:3], centres, radius * radius, indptr, rows, True)
+    return indptr, rows
