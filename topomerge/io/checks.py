@@ -1,0 +1,75 @@
+"""Is this cloud in metres with z up? Warnings for people; nothing is ever changed here."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topomerge.io.frame import turn
+from topomerge.types import Array
+
+LARGE, HIGH = 2000.0, 500.0  # m, extents beyond any building
+SLAB = 0.1  # m
+ENOUGH = 200  # points below which nothing is judged
+
+
+class Sample:
+    """A thinned copy of all points seen so far, of bounded size."""
+
+    def __init__(self, limit: int = 400_000) -> None:
+        self.limit = limit
+        self.step = 1
+        self.parts: list[Array] = []
+
+    def add(self, points: Array) -> None:
+        """Take every `step`-th of the (n, 3) points."""
+        self.parts.append(np.array(points[:: self.step], np.float64))
+        while sum(len(p) for p in self.parts) > self.limit:
+            self.step *= 2
+            self.parts = [p[::2] for p in self.parts]
+
+    @property
+    def points(self) -> Array:
+        """(n, 3) float64."""
+        return np.concatenate(self.parts) if self.parts else np.empty((0, 3))
+
+
+def warn_about(points: Array, up: str) -> list[str]:
+    """What looks wrong with a sample of placed points (n, 3) that were read with axis `up` of the file taken as up."""
+    if len(points) < ENOUGH:
+        return []
+    low, high = np.percentile(points, (1, 99), axis=0)
+    return _unit_warning(high - low) or _up_warning(points, low, high, up)
+
+
+def _unit_warning(extent: Array) -> list[str]:
+    size = " x ".join(f"{e:.4g}" for e in extent)
+    across, tall = float(extent[:2].max()), float(extent[2])
+    if across > LARGE or tall > HIGH:
+        for unit, factor in (("mm", 0.001), ("cm", 0.01)):
+            if 1.5 <= tall * factor <= 400 and 1.5 <= across * factor <= LARGE:
+                name = {"mm": "millimetres", "cm": "centimetres"}[unit]
+                return [f"coordinates look like {name} (extent {size}): give --unit {unit}"]
+        return [f"extent of {size} m is beyond any building: check --unit and --scale"]
+    if max(across, tall) < 0.5:
+        return [f"extent of {size} m is smaller than any room: check --unit and --scale"]
+    return []
+
+
+def _up_warning(points: Array, low: Array, high: Array, up: str) -> list[str]:
+    scores = [flatness(points, axis, low, high) for axis in range(3)]
+    best = int(np.argmax(scores))
+    if best == 2 or scores[best] < 0.12 or scores[best] < 1.8 * scores[2]:
+        return []
+    axis = "xyz"[int(np.abs(turn(up)[best]).argmax())]
+    return [
+        f"floors and ceilings seem to lie across {axis}, not {up} ({scores[best]:.0%} of the surface lies flat in "
+        f"{axis}, {scores[2]:.0%} in {up}): if {axis} is up in this file, give --up {axis}"
+    ]
+
+
+def flatness(points: Array, axis: int, low: Array, high: Array) -> float:
+    """Share of the surface that lies in the strongest slab across `axis`."""
+    inside = points[((points >= low - SLAB) & (points <= high + SLAB)).all(axis=1)]
+    cells = np.unique(np.floor(inside / SLAB).astype(np.int64), axis=0)
+    counts = np.bincount(cells[:, axis] - cells[:, axis].min())
+    return float(np.convolve(counts, (1, 1)).max() / len(cells))

@@ -1,0 +1,72 @@
+"""From a file's frame and unit into ours: z up, metres, float32 about a float64 shift."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topomerge.types import Array, TrueRoom, VoxelGrid
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
+FAR = 1e4  # m from the origin from where float32 would lose millimetres
+
+# Right-handed turns that bring the named axis of the file up. Rows are the new axes in terms of the old ones.
+TURNS = {
+    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
+    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "-x": ((0, 1, 0), (0, 0, -1), (-1, 0, 0)),
+}
+
+
+def turn(up: str) -> Array:
+    """(3, 3) float64 rotation that brings axis `up` of the file to +z."""
+    return np.array(TURNS[up], np.float64)
+
+
+def place_points(points: Array, rotation: Array, factor: float) -> Array:
+    """(n, 3) float64 points in metres, z up."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = np.asarray(points, np.float64) * factor
+        if np.array_equal(rotation, np.eye(3)):
+            return scaled
+        # A product with the matrix would spread one axis's nan and inf to all; the turn only swaps axes and signs.
+        axes = np.abs(rotation).argmax(axis=1)
+        return scaled[:, axes] * rotation.sum(axis=1)
+
+
+def place_poses(poses: Array, rotation: Array, factor: float) -> Array:
+    """(K, 4, 4) float64 sensor poses in the placed frame."""
+    placed = np.array(poses, np.float64)
+    placed[:, :3, :3] = rotation @ placed[:, :3, :3]
+    placed[:, :3, 3] = factor * placed[:, :3, 3] @ rotation.T
+    return placed
+
+
+def place_grid(grid: VoxelGrid, rotation: Array, factor: float) -> VoxelGrid:
+    """The same cells in the placed frame; a turn by right angles keeps cells cells."""
+    axes, signs = np.abs(rotation).argmax(axis=1), rotation.sum(axis=1)
+    cells, shape = grid.cells[:, axes], np.asarray(grid.shape)[axes]
+    low, high = grid.bounds
+    origin = np.where(signs > 0, low[axes], -high[axes]) * factor
+    cells = np.where(signs > 0, cells, shape - 1 - cells)
+    nx, ny, nz = (int(s) for s in shape)
+    return VoxelGrid.from_cells(cells, origin, grid.edge * factor, (nx, ny, nz), grid.properties)
+
+
+def place_rooms(rooms: tuple[TrueRoom, ...], factor: float) -> tuple[TrueRoom, ...]:
+    """True rooms in metres. Formats that know rooms have z up, so nothing is turned."""
+    if factor == 1.0:
+        return rooms
+    return tuple(TrueRoom(r.name, r.polygon * factor, r.floor * factor, r.ceiling * factor, r.storey, r.kind) for r in rooms)
+
+
+def choose_shift(points: Array) -> Array:
+    """(3,) float64 shift for finite points (n, 3): zero near the origin, else their middle in whole 100 m.
+
+    The median, not the first point: one stray first point must not cost all the others their precision.
+    """
+    if not len(points) or float(np.abs(points).max()) <= FAR:
+        return np.zeros(3)
+    return np.round(np.median(points, axis=0) / 100.0) * 100.0

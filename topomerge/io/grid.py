@@ -1,0 +1,186 @@
+"""Floor plans from robots: a ROS map_server yaml with its image, or a plain image with a resolution.
+
+Occupied pixels become walls, free pixels a floor at z = 0; unknown ones give nothing. The frame is map_server's: x right and y
+up from the lower left corner of the image, turned by the yaw of the origin and moved to it.
+Source: http://wiki.ros.org/map_server (values, thresholds and modes).
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io.piece import BLOCK, LIMIT, Options, Piece, damaged, too_many
+from topomerge.types import Array
+
+PIXELS = 200_000_000  # more is refused
+LARGEST_YAML = 1 << 20  # bytes
+IMAGES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+MODES = ("trinary", "scale", "raw")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a map_server file says; the defaults are its own."""
+
+    image: Path
+    resolution: float  # m per pixel
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y (m) and yaw (rad) of the lower left corner
+    negate: bool = False
+    occupied: float = 0.65
+    free: float = 0.196
+    mode: str = "trinary"
+    warnings: tuple[str, ...] = ()
+
+
+def read(path: Path, options: Options) -> Iterator[Piece]:
+    """Floor points, then walls layer by layer, in metres."""
+    if path.suffix.lower() in (".yaml", ".yml"):
+        plan = read_yaml(path)
+        if options.resolution is not None:
+            raise InputError(f"{path}: states its own resolution of {plan.resolution:g} m; leave --resolution out")
+    elif options.resolution is None:
+        beside = next((b for b in (path.with_suffix(".yaml"), path.with_suffix(".yml")) if b.is_file()), None)
+        hint = f", or read {beside.name} instead" if beside else ""
+        raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{hint}")
+    else:
+        plan = Plan(path, options.resolution)
+    occupied, free = classify(read_image(plan.image), plan)
+    yield Piece(np.empty((0, 3)), warnings=plan.warnings, done=0.1)
+    # The grid is metric already; only a --scale is left to undo in the lengths that are given in metres.
+    yield from _extrude(path, occupied, free, plan, options)
+
+
+def read_yaml(path: Path) -> Plan:
+    """A map_server file.
+
+    Raises:
+        InputError: it is not one, a value can't be used, or its image is missing.
+    """
+    import yaml
+
+    if path.stat().st_size > LARGEST_YAML:
+        raise InputError(f"{path}: is too large for a map_server file; give the yaml that names the image")
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise damaged(path, "a map_server file", getattr(error, "problem", None) or error) from error
+    if not isinstance(values, dict) or "image" not in values or "resolution" not in values:
+        raise InputError(f"{path}: is not a map_server file (no image and resolution); give the yaml that names the image")
+    image, said = _find_image(path, str(values["image"]).strip())
+    resolution = _number(path, values, "resolution", None)
+    origin = values.get("origin", [0.0, 0.0, 0.0])
+    if not isinstance(origin, list) or len(origin) < 2:
+        raise InputError(f"{path}: origin is {origin!r}; it is a list of x, y and yaw")
+    x, y, yaw = (_number(path, {"origin": v}, "origin", None) for v in [*origin, 0.0][:3])
+    mode = str(values.get("mode", "trinary")).lower()
+    negate = values.get("negate", 0)
+    if mode not in MODES or negate not in (0, 1) or not resolution > 0:
+        wrong = f"mode {mode!r}, negate {negate!r} or resolution {resolution:g}"
+        raise InputError(f"{path}: {wrong} can't be used; mode is one of {', '.join(MODES)}, negate 0 or 1, resolution above 0")
+    occupied, free = _number(path, values, "occupied_thresh", 0.65), _number(path, values, "free_thresh", 0.196)
+    return Plan(image, resolution, (x, y, yaw), bool(negate), occupied, free, mode, said)
+
+
+def _number(path: Path, values: dict[str, Any], key: str, default: float | None) -> float:
+    try:
+        value = float(values.get(key, math.nan if default is None else default))
+    except (TypeError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{path}: {key} is {values.get(key)!r} instead of a number; mend it")
+    return value
+
+
+def _find_image(path: Path, name: str) -> tuple[Path, tuple[str, ...]]:
+    """The image a map_server file names: as written, else of that name beside the file, else of its stem or the yaml's."""
+    base = PureWindowsPath(name).name if "\\" in name else PurePosixPath(name).name
+    exact = path.parent / name
+    beside = path.parent / base
+    others = [path.parent / (stem + s) for stem in (Path(base).stem, path.stem) for s in IMAGES]
+    for candidate in (exact, beside, *others):
+        if base and candidate.is_file():
+            if candidate == exact:
+                return candidate, ()
+            return candidate, (f"{path.name} names the image {name}; {candidate.name} beside it was read",)
+    raise InputError(f"{path}: its image {name} does not exist; put it beside the yaml")
+
+
+def read_image(path: Path) -> tuple[Array, Array]:
+    """Brightness (h, w) in 0..1 and whether each pixel is transparent.
+
+    Raises:
+        InputError: not an image, or a huge one.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # our own limit is stricter than the library's warning
+            with Image.open(path) as image:
+                width, height = image.size
+                if width * height > PIXELS:
+                    limit = f"the limit is {PIXELS // 10**6} megapixels"
+                    raise InputError(f"{path}: has {width} x {height} pixels and {limit}; crop it or make it smaller")
+                if image.mode.startswith(("I", "F")):
+                    values = np.asarray(image, np.float64)
+                    top = 65535.0 if image.mode.startswith("I") else max(float(np.nanmax(values)), 1.0)
+                    return values / top, np.zeros(values.shape, bool)
+                rgba = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{path}: has far too many pixels; crop it or make it smaller") from error
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
+        raise damaged(path, "an image", error if str(error) else "cut short") from error
+    clear = rgba[..., 3] == 0 if rgba.shape[2] == 4 else np.zeros(rgba.shape[:2], bool)
+    return rgba[..., :3].mean(axis=2, dtype=np.float64) / 255.0, clear
+
+
+def classify(image: tuple[Array, Array], plan: Plan) -> tuple[Array, Array]:
+    """(h, w) bool occupied and free pixels of an image, as map_server has them."""
+    bright, clear = image
+    if plan.mode == "raw":
+        share = bright * 255.0 / 100.0  # the value itself is the probability in percent; above 100 is unknown
+        known = share <= 1.0
+        return known & (share >= plan.occupied), known & (share <= plan.free)
+    share = bright if plan.negate else 1.0 - bright
+    # In mode "scale" the values between the thresholds are kept by map_server; here they stay unknown in every mode.
+    return (share > plan.occupied) & ~clear, (share < plan.free) & ~clear
+
+
+def _extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: Options) -> Iterator[Piece]:
+    """Floor, walls and, if asked for, ceiling."""
+    spacing = (options.spacing or plan.resolution * options.factor) / options.factor
+    height = options.extrude / options.factor
+    parts = max(1, math.ceil(plan.resolution / spacing - 1e-6))  # points a pixel along each axis
+    levels = np.linspace(0.0, height, max(2, math.ceil(height / spacing - 1e-6) + 1))
+    walls, floor = int(occupied.sum()), int(free.sum())
+    total = parts**2 * (walls * float(len(levels)) + floor * (1 + options.ceiling))
+    if total > LIMIT:
+        raise too_many(path, total, spacing * options.factor)
+    layers = [(free, 0.0)] + [(occupied, z) for z in levels] + ([(free, height)] if options.ceiling else [])
+    for number, (mask, z) in enumerate(layers):
+        for points in _layer(mask, plan, parts):
+            flat = np.column_stack([points, np.full(len(points), z)])
+            yield Piece(flat, done=0.1 + 0.9 * (number + 1) / len(layers))
+
+
+def _layer(mask: Array, plan: Plan, parts: int) -> Iterator[Array]:
+    """Blocks (n, 2) of metric points of the masked pixels, parts² a pixel, at the centres of its parts."""
+    rows, columns = np.nonzero(mask)
+    inner = (np.arange(parts) + 0.5) / parts
+    dx, dy = (d.ravel() for d in np.meshgrid(inner, inner))
+    x0, y0, yaw = plan.origin
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    step = max(1, BLOCK // parts**2)
+    for start in range(0, len(rows), step):
+        cut = slice(start, start + step)
+        x = (columns[cut, None] + dx).ravel() * plan.resolution
+        y = (mask.shape[0] - 1 - rows[cut, None] + dy).ravel() * plan.resolution
+        yield np.column_stack([x0 + cos * x - sin * y, y0 + sin * x + cos * y])

@@ -1,0 +1,88 @@
+"""What a format reader hands over: pieces of a file, in the file's own frame and unit.
+
+Every format lives in a module of its own with one function ``read(path, options) -> Iterator[Piece]``; `topomerge.io.points`
+turns the pieces into point clouds. A reader that meets a fault raises `InputError`; any other exception is turned into one
+at the door.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.types import Array, TrueRoom, VoxelGrid
+
+BLOCK = 1 << 19  # points a reader hands over at a time
+LIMIT = 200_000_000  # points that a sampled or extruded file may become; more is a wrong unit, not a building
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a reader may need to know; lengths in metres.
+
+    Args:
+        factor: metres per unit of the file.
+        resolution: m per pixel of a plain image.
+        extrude: height of the walls of a floor plan, m.
+        ceiling: also close a floor plan from above.
+        spacing: distance between sampled points, m; None: 0.05 m for surfaces, the resolution for floor plans.
+        doors: keep the leaves of doors of a building model, which shut its doors.
+    """
+
+    factor: float = 1.0
+    resolution: float | None = None
+    extrude: float = 2.5
+    ceiling: bool = False
+    spacing: float | None = None
+    doors: bool = False
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some of the points of a file. `poses`, `free` and `rooms` describe the whole file and come with its first piece."""
+
+    points: Array  # (n, 3) float, in the file's frame and unit
+    colors: Array | None = None  # (n, 3) uint8
+    labels: Array | None = None  # (n,) int32
+    poses: Array | None = None  # (K, 4, 4) float64
+    pose_of: Array | None = None  # (n,) int32
+    free: VoxelGrid | None = None
+    rooms: tuple[TrueRoom, ...] = ()
+    warnings: tuple[str, ...] = ()
+    done: float = 0.0  # share of the file read so far
+
+
+def cut_short(path: Path, have: int, promised: int, what: str = "points") -> InputError:
+    """The error for a file that ends before what its header promises."""
+    return InputError(
+        f"{path}: holds {have:,} of the {promised:,} {what} that its header promises; the file is cut short, copy it again"
+    )
+
+
+def damaged(path: Path, kind: str, reason: object) -> InputError:
+    """The error for a file that is not what its name says."""
+    text = " ".join(str(reason).split())[:160] or type(reason).__name__
+    return InputError(f"{path}: damaged, or not {kind} ({text}); export it again")
+
+
+def too_many(path: Path, count: float, spacing: float) -> InputError:
+    """The error for a surface that would become an absurd number of points."""
+    return InputError(
+        f"{path}: would become {count:.1e} points at a spacing of {spacing:g} m; check --unit, or give a larger --spacing"
+    )
+
+
+def bytes8(colors: Array) -> Array:
+    """(n, 3) uint8 colours from bytes, 16-bit integers or floats in 0..1 or 0..255."""
+    if colors.dtype == np.uint8 or not len(colors):
+        return np.ascontiguousarray(colors, np.uint8)
+    values = np.nan_to_num(colors.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    top = float(values.max())
+    if np.issubdtype(colors.dtype, np.floating) and top <= 1.0:
+        values = values * 255.0
+    elif top > 255.0:
+        values = values / 257.0
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

@@ -1,0 +1,202 @@
+"""PLY: ascii and binary of either byte order, as clouds (mapped, in blocks) or as meshes (sampled).
+
+Source: G. Turk, "The PLY Polygon File Format", 1994.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io import text
+from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
+from topomerge.types import Array
+
+LONGEST_HEADER = 1 << 20  # bytes
+TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of a PLY header: properties as (name, type code), a list's as (name, None)."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str | None]]
+
+    @property
+    def fixed(self) -> bool:
+        """Do all rows have the same length?"""
+        return all(kind is not None for _, kind in self.properties)
+
+    def dtype(self, order: str) -> np.dtype:
+        """Type of a binary row."""
+        return np.dtype([(name, order + str(kind)) for name, kind in self.properties])
+
+    def shortest(self) -> int:
+        """Bytes that a row needs at least, binary or ascii."""
+        return max(len(self.properties), 1)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What stands before the rows; `start` is the offset of the first."""
+
+    order: str  # "", "<" or ">"
+    elements: list[Element]
+    start: int
+    lines: int
+
+    def find(self, name: str) -> Element | None:
+        """The element of that name."""
+        return next((e for e in self.elements if e.name == name), None)
+
+
+def read(path: Path, options: Options) -> Iterator[Piece]:
+    """Blocks of vertices, and where there are faces points sampled on them."""
+    header = read_header(path)
+    vertex, face = header.find("vertex"), header.find("face")
+    if vertex is None or not {"x", "y", "z"} <= {n for n, k in vertex.properties if k}:
+        raise InputError(f"{path}: has no vertices with x, y and z; export it as a point cloud")
+    size = path.stat().st_size
+    for element in header.elements:
+        if element.count * element.shortest() > size - header.start:
+            raise cut_short(path, 0, element.count, f"rows of {element.name}")
+    before = header.elements[: header.elements.index(vertex)]
+    if (face is not None and face.count) or not all(e.fixed for e in (*before, vertex)):
+        yield from _read_whole(path, options)
+    elif header.order:
+        yield from _read_binary(path, header, before, vertex)
+    else:
+        yield from _read_ascii(path, header, before, vertex)
+
+
+def read_header(path: Path) -> Header:
+    """The header of a PLY file.
+
+    Raises:
+        InputError: it is not one.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(LONGEST_HEADER)
+    if head[:3] != b"ply":
+        raise InputError(f"{path}: is not a PLY file (its first line is not 'ply'); check the file's suffix")
+    end = re.search(rb"(?m)^end_header[ \t]*(\r\n|\n|\r)", head)
+    if end is None:
+        raise InputError(f"{path}: its PLY header has no end; the file is cut short or damaged, copy it again")
+    lines = head[: end.end()].decode("latin-1").splitlines()
+    order: str | None = None
+    elements: list[Element] = []
+    for words in (line.split() for line in lines[1:-1]):
+        try:
+            if words[:1] == ["format"]:
+                order = ORDERS[words[1]]
+            elif words[:1] == ["element"]:
+                elements.append(Element(words[1], int(words[2]), []))
+            elif words[:1] == ["property"]:
+                is_list = words[1] == "list"
+                elements[-1].properties.append((words[-1], None if is_list else TYPES[words[1]]))
+        except (KeyError, IndexError, ValueError) as error:
+            raise damaged(path, "a PLY file", f"header line {' '.join(words)!r}") from error
+    if order is None or any(e.count < 0 or len({n for n, _ in e.properties}) < len(e.properties) for e in elements):
+        raise damaged(path, "a PLY file", "no format line, a negative count or a property named twice")
+    return Header(order, elements, end.end(), len(lines))
+
+
+def color_names(names: list[str]) -> tuple[str, ...]:
+    """The names of the colour channels, or none."""
+    return next((c for c in text.COLORS if all(n in names for n in c)), ())
+
+
+def _read_binary(path: Path, header: Header, before: list[Element], vertex: Element) -> Iterator[Piece]:
+    dtype = vertex.dtype(header.order)
+    start = header.start + sum(e.count * e.dtype(header.order).itemsize for e in before)
+    have = max(path.stat().st_size - start, 0) // dtype.itemsize
+    if have < vertex.count:
+        raise cut_short(path, have, vertex.count)
+    if not vertex.count:
+        return
+    rows = np.memmap(path, dtype, "r", start, (vertex.count,))
+    colors = color_names([n for n, _ in vertex.properties])
+    for first in range(0, vertex.count, BLOCK):
+        block = rows[first : first + BLOCK]
+        yield Piece(_stack(block, ("x", "y", "z")), _colors(block, colors), done=(first + len(block)) / vertex.count)
+
+
+def _stack(rows: Array, names: tuple[str, ...]) -> Array:
+    """(n, 3) from three columns of a structured array, in the machine's byte order."""
+    kind = np.result_type(*(rows.dtype[n] for n in names)).newbyteorder("=")
+    out = np.empty((len(rows), len(names)), kind)
+    for i, name in enumerate(names):
+        out[:, i] = rows[name]
+    return out
+
+
+def _colors(rows: Array, names: tuple[str, ...]) -> Array | None:
+    return bytes8(_stack(rows, names)) if names else None
+
+
+def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Element) -> Iterator[Piece]:
+    names = [n for n, _ in vertex.properties]
+    wanted = ("x", "y", "z", *color_names(names))
+    columns = tuple(names.index(n) for n in wanted)
+    found = 0
+    with path.open(encoding="latin-1") as stream:
+        skip = header.lines + sum(e.count for e in before)
+        lines = itertools.islice(stream, skip + vertex.count)
+        for values in text.rows(path, lines, columns, skip=skip):
+            found += len(values)
+            colors = values[:, 3:] if len(wanted) == 6 else None
+            if colors is not None and vertex.properties[columns[3]][1] not in ("f4", "f8"):
+                colors = colors.clip(0, 65535).astype(np.int64)
+            yield Piece(values[:, :3], None if colors is None else bytes8(colors), done=found / vertex.count)
+    if found < vertex.count:
+        raise cut_short(path, found, vertex.count)
+
+
+def _read_whole(path: Path, options: Options) -> Iterator[Piece]:
+    """Files with faces or with lists before the vertices: read by plyfile, the faces sampled."""
+    from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
+
+    from topomerge.io.mesh import sample
+
+    try:
+        try:
+            data = PlyData.read(str(path), known_list_len={"face": {"vertex_indices": 3, "vertex_index": 3}})
+        except (PlyElementParseError, KeyError, ValueError):
+            data = PlyData.read(str(path))  # slower: not all faces are triangles
+    except (PlyElementParseError, PlyHeaderParseError) as error:
+        raise damaged(path, "a PLY file", error) from error
+    rows = data["vertex"].data
+    vertices = _stack(rows, ("x", "y", "z"))
+    colors = _colors(rows, color_names(list(rows.dtype.names or ())))
+    yield Piece(vertices, colors, done=0.5)
+    faces = data["face"].data if "face" in data else np.empty(0, [("none", "u1")])
+    name = next((n for n in ("vertex_indices", "vertex_index") if n in (faces.dtype.names or ())), None)
+    if name is not None and len(faces):
+        yield from sample(path, vertices, _triangles(faces[name]), options, colors)
+
+
+def _triangles(polygons: Array) -> Array:
+    """(m, 3) int64 fans of triangles of polygons given as an (n, k) array or an object array of index lists."""
+    if polygons.dtype != object:
+        return polygons.astype(np.int64)
+    by_corners: dict[int, list[Array]] = {}
+    for polygon in polygons:
+        by_corners.setdefault(len(polygon), []).append(polygon)
+    parts = [np.empty((0, 3), np.int64)]
+    for corners, same in by_corners.items():
+        table = np.array(same, np.int64)
+        parts += [table[:, (0, i, i + 1)] for i in range(1, corners - 1)]
+    return np.concatenate(parts)
