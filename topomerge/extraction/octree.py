@@ -77,8 +77,8 @@ class SparseVoxelOctree:
             raise ValueError(f"a radius must be finite and not below 0 m, not {r}")
         if not np.issubdtype(centres.dtype, np.integer):
             centres = (centres.astype(np.float64) - self.grid.origin) / self.grid.edge - 0.5
-        in_cells = np.ascontiguousarray(centres, np.float64)
-        return octree.in_balls(self.grid.cells, self._nodes, in_cells, r / self.grid.edge + SLACK)
+        in_cells, table = np.ascontiguousarray(centres, np.float64), self.grid._bricks[0]
+        return octree.in_balls(self.grid.cells, self._nodes, table, in_cells, r / self.grid.edge + SLACK)
 
     def level_of_detail(self, k: int) -> VoxelGrid:
         """The grid k levels up, edge * 2**k, with the property ``count``: occupied cells in each octant; k in 0..21.

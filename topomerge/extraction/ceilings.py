@@ -1,0 +1,53 @@
+"""Keeping ceilings out of the navigable volume (the thesis' worst fault: findings.md, "Why the thesis fails").
+
+Seen from inside, a ceiling is a sheet with nothing above it: its upper side passes the stick kernel, and it is larger than the floor,
+which furniture interrupts.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topomerge.extraction.components import connected_components
+from topomerge.extraction.convolution import Kernel, any_at, moore
+from topomerge.extraction.distance_field import horizontal_distance_field
+from topomerge.kernels.columns import first_occupied
+from topomerge.types import VoxelGrid
+
+HEADROOM = 1.2  # m: empty space under a ceiling, above furniture
+STOREY = 8.0  # m: how far above a floor something may be, and how far below a ceiling its floor
+THICKNESS = 0.3  # m: a noisy sheet is this thick
+WALLED = 0.25  # share of a floor's boundary beside which walls rise
+
+
+def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
+    """The standing cells less those on the upper side of a ceiling.
+
+    A part of the standing cells with nothing above it is a ceiling if below most of it is empty space and then something. The floor
+    of an upper storey whose own ceiling was not scanned looks so, too; but walls rise along its boundary, and along a ceiling's they
+    end.
+    """
+    cells = standing.cells.astype(np.int64)
+    thick = max(int(np.ceil(THICKNESS / grid.edge)), 1)
+    far = int(np.ceil(STOREY / grid.edge))
+    bare = first_occupied(*grid._bricks, cells, thick + 1, 1, far) == 0
+    if not bare.any():
+        return standing
+    hollow = first_occupied(*grid._bricks, cells, thick + 1, -1, far) * grid.edge >= HEADROOM
+    component = connected_components(standing, moore(), group=np.where(bare, 0, -1))
+    count = int(component.max()) + 1
+    boundary = np.flatnonzero(bare & (horizontal_distance_field(standing) == 0))
+    walled = any_at(grid, cells[boundary], _beside_and_above(grid.edge))
+    on_boundary = np.bincount(component[boundary], minlength=count)
+    with_wall = np.bincount(component[boundary], walled, minlength=count)
+    hollow_share = np.bincount(component[bare], hollow[bare], minlength=count) / np.bincount(component[bare], minlength=count)
+    ceiling = (hollow_share > 0.5) & (with_wall < WALLED * np.maximum(on_boundary, 1))
+    return standing.subset(~(bare & ceiling[component]))
+
+
+def _beside_and_above(edge: float) -> Kernel:
+    """Cells within 0.35 m horizontally and 0.5 to 1.5 m above."""
+    reach = int(np.ceil(0.35 / edge))
+    steps = np.arange(-reach, reach + 1)
+    heights = np.arange(int(np.ceil(0.5 / edge)), int(np.ceil(1.5 / edge)) + 1)
+    return Kernel.from_offsets(np.stack(np.meshgrid(steps, steps, heights, indexing="ij"), -1).reshape(-1, 3))

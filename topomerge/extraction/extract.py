@@ -1,0 +1,211 @@
+"""Point cloud -> topometric map: the steps of section 2 of the seeds, in their order."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.extraction.ceilings import without_ceilings
+from topomerge.extraction.clustering import INFLATIONS, cluster_views
+from topomerge.extraction.convolution import Kernel, sphere, stick
+from topomerge.extraction.dilation import dilate_upwards
+from topomerge.extraction.distance_field import horizontal_distance_field
+from topomerge.extraction.floors import floor_components, largest_component
+from topomerge.extraction.gaps import bridge_gaps
+from topomerge.extraction.propagation import propagate_labels
+from topomerge.extraction.rooms import split_rooms
+from topomerge.extraction.similarity import jaccard_similarity
+from topomerge.extraction.topology import topometric_map
+from topomerge.extraction.unobstructed import unobstructed
+from topomerge.extraction.views import best_of_tiles, local_maxima, raise_views
+from topomerge.extraction.visibility import visible_cells
+from topomerge.extraction.votes import vote
+from topomerge.extraction.voxels import voxelise
+from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Parameters of the extraction; lengths in metres. The defaults mend the thesis' known faults where that is cheap."""
+
+    stem_height: float = 0.25  # a step may stand beside the foot
+    body_width: float = 0.30
+    body_height: float = 1.50  # with the stem 1.75: a grown-up
+    dilation: float = 0.25
+    bridge: float = 0.30  # half the gap in the floor that is bridged; 0: none
+    ceilings: bool = False  # may the upper side of a ceiling be floor?
+    largest_only: bool = False  # keep the largest component, or all that are floors
+    view_spacing: float = 1.0  # one view for each tile of this size; 0: local maxima of the distance field
+    view_radius: float = 0.5  # of the local maxima
+    view_height: float = 2.3  # over the lintels of most doors, and always below the ceiling
+    view_clearance: float = 0.3  # from the ceiling; 0: views may end up in it
+    range: float = 5.0
+    tolerance: float = 0.2  # noisy walls are cells thick
+    least_similarity: float = 0.3
+    inflations: tuple[float, ...] = INFLATIONS
+    propagation_radius: float = 0.2
+    propagation_rounds: int = 10
+    least_volume: float = 0.128  # of a room's occupied cells, m3
+    absorb: bool = True  # give smaller pieces to the room they touch
+
+
+PRESETS = {
+    "default": Preset(),
+    "thesis": Preset(
+        body_height=0.75,
+        bridge=0.0,
+        ceilings=True,
+        largest_only=True,
+        view_spacing=0.0,
+        view_height=1.6,
+        view_clearance=0.0,
+        tolerance=0.0,
+        absorb=False,
+    ),
+}
+
+
+def extract(
+    source: PointCloud | VoxelGrid | Array | Iterable[PointCloud],
+    *,
+    voxel_size: float = 0.1,
+    preset: str | Preset = "default",
+    name: str | None = None,
+    progress: Progress | None = None,
+    **overrides: Any,
+) -> TopometricMap:
+    """Extract rooms, doors and storeys (seeds 2).
+
+    Args:
+        source: a cloud, chunks of one, (N, 3) points, or occupied cells.
+        voxel_size: edge length of a cell, m (a grid keeps its own).
+        preset: ``"default"``, ``"thesis"`` or a `Preset`.
+        name: where the map comes from; the cloud's own source by default.
+        progress: called now and then with the share done and a text.
+        overrides: single parameters of the preset.
+
+    Raises:
+        InputError: no finite point, an absurd extent, or no floor that somebody could stand on.
+    """
+    p = _preset(preset, overrides)
+    clock = _Clock(progress)
+    warnings: list[str] = []
+    with clock("read and voxelise", 0.0):
+        grid, known = _grid(source, voxel_size, warnings)
+    with clock("navigable volume", 0.3):
+        navigable = navigable_volume(grid, p)
+    with clock("views", 0.4):
+        views = optimal_views(grid, navigable, p)
+    with clock("visibility", 0.45):
+        visibility = visible_cells(grid, views, p.range, p.tolerance)
+    with clock("similarity", 0.65):
+        similarity = jaccard_similarity(visibility, p.least_similarity, views, 2 * p.range)
+    with clock("clusters", 0.75):
+        cluster, inflation = cluster_views(similarity, p.inflations)
+    with clock("rooms", 0.85):
+        labels = vote(visibility, cluster)
+        labels = propagate_labels(grid, labels, sphere(p.propagation_radius, grid.edge), p.propagation_rounds)
+        room = split_rooms(grid, labels, p.least_volume, p.absorb)
+    with clock("topology", 0.95):
+        result = topometric_map(grid, room, navigable, p.body_width, p.stem_height + p.body_height)
+    parameters = {**asdict(p), "voxel_size": grid.edge, "preset": preset if isinstance(preset, str) else "custom"}
+    return replace(
+        result,
+        free=known.get("free"),
+        source=name if name is not None else known.get("source", ""),
+        parameters={**parameters, "inflation": inflation},
+        seconds=clock.seconds,
+        warnings=(*known.get("warnings", ()), *warnings),
+    )
+
+
+def navigable_volume(grid: VoxelGrid, p: Preset) -> VoxelGrid:
+    """Where a body can walk (seeds 2.3): standing room, joined upwards over steps, in connected parts.
+
+    Raises:
+        InputError: nowhere is room for a body on a floor.
+    """
+    body = stick_kernel(grid, p)
+    standing = unobstructed(grid, body)
+    if not p.ceilings:
+        standing = without_ceilings(grid, standing)
+    if p.bridge:
+        standing = bridge_gaps(grid, standing, body, p.bridge)
+    dilated = dilate_upwards(standing, p.dilation)
+    navigable = largest_component(dilated) if p.largest_only else floor_components(dilated)
+    if not len(navigable):
+        width = p.body_width
+        raise InputError(
+            f"no floor found: nowhere is an area of 1 m2 with {p.stem_height + p.body_height:g} m of space above it and {width:g} m "
+            "around; check --up and --unit, or take larger voxels if the points are sparse"
+        )
+    return navigable
+
+
+def optimal_views(grid: VoxelGrid, navigable: VoxelGrid, p: Preset) -> Array:
+    """(V, 3) positions from which the map is seen best (seeds 2.4)."""
+    distance = horizontal_distance_field(navigable)
+    if p.view_spacing:
+        rows = best_of_tiles(navigable, distance, p.view_spacing)
+    else:
+        rows = local_maxima(navigable, distance, p.view_radius)
+    return raise_views(grid, navigable.cells[rows], p.view_height, p.view_clearance or None)
+
+
+def stick_kernel(grid: VoxelGrid, p: Preset) -> Kernel:
+    """The stick that the preset describes, in cells of the grid."""
+    return stick(p.stem_height, p.body_width, p.body_height, grid.edge)
+
+
+def _preset(preset: str | Preset, overrides: dict[str, Any]) -> Preset:
+    if isinstance(preset, str):
+        if preset not in PRESETS:
+            raise InputError(f"unknown preset {preset!r}: take one of {', '.join(PRESETS)}")
+        preset = PRESETS[preset]
+    known = {f.name for f in fields(Preset)}
+    for key in overrides:
+        if key not in known:
+            raise InputError(f"unknown parameter {key!r} of the extraction: it has {', '.join(sorted(known))}")
+    return replace(preset, **overrides)
+
+
+def _grid(source: Any, edge: float, warnings: list[str]) -> tuple[VoxelGrid, dict[str, Any]]:
+    """The voxel grid, and what the cloud knows beside its points."""
+    if isinstance(source, VoxelGrid):
+        return source, {}
+    known: dict[str, Any] = {}
+
+    def chunks() -> Iterator[PointCloud]:
+        for chunk in [source] if isinstance(source, PointCloud) else source:
+            known["source"] = chunk.source
+            known["free"] = chunk.free if chunk.free is not None else known.get("free")
+            known["warnings"] = tuple(dict.fromkeys((*known.get("warnings", ()), *chunk.warnings)))
+            yield chunk
+
+    if isinstance(source, np.ndarray):
+        return voxelise(source, edge, warnings), known
+    return voxelise(chunks(), edge, warnings), known
+
+
+class _Clock:
+    """Seconds a step, and news of it."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self.seconds: dict[str, float] = {}
+        self.progress = progress
+
+    @contextmanager
+    def __call__(self, step: str, done: float) -> Iterator[None]:
+        if self.progress is not None:
+            self.progress(done, step)
+        began = time.perf_counter()
+        yield
+        self.seconds[step] = round(time.perf_counter() - began, 4)

@@ -1,0 +1,52 @@
+"""Storeys: levels at which much floor lies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topomerge.types import STOREY_DTYPE, Array, VoxelGrid
+
+LEAST_AREA = 3.0  # m2
+LEAST_SHARE = 0.04  # of the largest storey
+LEAST_HEIGHT = 1.9  # m between floors: nobody stands upright in less
+
+
+def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, Array]:
+    """Peaks of the height histogram of the floor, at least 1.9 m apart.
+
+    Args:
+        navigable: the navigable volume.
+        floor_to_ceiling: (m,) m of empty space above each navigable cell, 0 where nothing was seen.
+
+    Returns:
+        storeys (S,) STOREY_DTYPE, lowest first; (m,) int32 storey of each navigable cell: the one whose floor is nearest.
+    """
+    if not len(navigable):
+        return np.zeros(0, STOREY_DTYPE), np.zeros(0, np.int32)
+    lowest = lowest_of_column(navigable)
+    level = navigable.cells[lowest, 2]
+    area = np.bincount(level) * navigable.edge**2
+    smooth = np.convolve(area, np.ones(3), "same")
+    floors: list[int] = []
+    largest = smooth.max()
+    for z in np.argsort(-smooth, kind="stable"):
+        if smooth[z] < min(max(LEAST_AREA, LEAST_SHARE * largest), largest):
+            break
+        if all(abs(int(z) - f) * navigable.edge >= LEAST_HEIGHT for f in floors):
+            floors.append(int(z))
+    floors.sort()
+    storey = np.abs(navigable.cells[:, 2][:, None] - np.array(floors)).argmin(axis=1).astype(np.int32)
+    storeys = np.zeros(len(floors), STOREY_DTYPE)
+    for s, z in enumerate(floors):
+        rows = lowest[storey[lowest] == s]
+        near = rows[np.abs(navigable.cells[rows, 2] - z) <= 1]
+        height = navigable.origin[2] + (navigable.cells[near, 2].mean() + 0.5) * navigable.edge
+        above = floor_to_ceiling[near]
+        ceiling = height + np.median(above[above > 0]) if (above > 0).any() else np.nan
+        storeys[s] = (height, ceiling, len(rows) * navigable.edge**2)
+    return storeys, storey
+
+
+def lowest_of_column(navigable: VoxelGrid) -> Array:
+    """Ascending rows of the cells that have no navigable cell right below them: the floor proper, without its upward dilation."""
+    return np.flatnonzero(~navigable.contains(navigable.cells.astype(np.int64) - (0, 0, 1)))

@@ -1,0 +1,129 @@
+"""Points -> voxel grid (seeds 2.2): one chunk at a time, so that a cloud may be larger than memory."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.errors import InputError
+from topomerge.kernels import lookup, morton
+from topomerge.kernels import voxelise as kernel
+from topomerge.types import Array, PointCloud, VoxelGrid
+
+log = logging.getLogger(__name__)
+
+# A group of points is a stray when it lies this far (m) from every larger group and holds less than this share of the cells.
+STRAY_DISTANCE = 10.0
+STRAY_SHARE = 0.01
+LARGE = 2e8  # cells: 200 x 200 x 5 m at 0.1 m; smaller grids cost little whatever is in them
+
+
+def voxelise(
+    cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1, warnings: list[str] | None = None
+) -> VoxelGrid:
+    """Occupied cells of a point cloud, with the property ``count``, the number of points in each.
+
+    V_min is a multiple of the edge length, so the cells of a cloud do not depend on what else is in the file or on its order.
+
+    Args:
+        cloud: a cloud, (N, 3) points in metres, or chunks of one cloud.
+        edge: edge length of a cell, m.
+        warnings: what the user should know is appended here.
+
+    Raises:
+        InputError: no finite point, or an extent that no building has.
+    """
+    if not (np.isfinite(edge) and 0.001 <= edge <= 10):
+        raise InputError(f"voxel size must be between 0.001 and 10 m, not {edge}")
+    if isinstance(cloud, PointCloud):
+        chunks: Iterable[PointCloud] = [cloud]
+    elif isinstance(cloud, np.ndarray):
+        chunks = [PointCloud(cloud)]
+    else:
+        chunks = cloud
+    cells, counts = _gather(chunks, edge)
+    if not len(cells):
+        raise InputError("no finite point: nothing to voxelise")
+    base, shape = _box(cells)
+    if _volume(shape) > LARGE:
+        kept = _without_strays(cells, edge)
+        # Nothing is dropped unless that makes the grid much smaller: a wing that was scanned thinly is no stray.
+        if _volume(_box(cells[kept])[1]) < _volume(shape) / 4:
+            warn(warnings, f"{counts[~kept].sum()} stray points lie more than {STRAY_DISTANCE:g} m from the rest: left out")
+            cells, counts = cells[kept], counts[kept]
+            base, shape = _box(cells)
+    if (shape > morton.LIMIT).any() or _volume(shape) / 512 > lookup.MAX_BRICKS:
+        extent = " x ".join(f"{s * edge:.0f}" for s in shape)
+        raise InputError(f"the points span {extent} m: too large for {edge:g} m voxels; check --unit, or crop the file")
+    size = (int(shape[0]), int(shape[1]), int(shape[2]))
+    return VoxelGrid.from_cells(cells - base, base * edge, edge, size, {"count": counts})
+
+
+def _gather(chunks: Iterable[PointCloud], edge: float) -> tuple[Array, Array]:
+    """Lattice cells and counts of all chunks. Pending chunks are merged when they outgrow what is merged already."""
+    merged = (np.zeros((0, 3), np.int64), np.zeros(0, np.int64))
+    pending: list[tuple[Array, Array]] = []
+    for chunk in chunks:
+        base, cells, counts = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), edge)
+        pending.append((cells + base, counts))
+        if sum(len(c) for c, _ in pending) > max(len(merged[0]), 4_000_000):
+            merged, pending = _merge([merged, *pending]), []
+    return _merge([merged, *pending])
+
+
+def _merge(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    parts = [p for p in parts if len(p[0])]
+    if len(parts) <= 1:
+        return parts[0] if parts else (np.zeros((0, 3), np.int64), np.zeros(0, np.int64))
+    cells, counts = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    base = cells.min(axis=0)
+    if ((cells.max(axis=0) - base) < morton.LIMIT).all():
+        _, first, inverse = np.unique(morton.encode(cells - base), return_index=True, return_inverse=True)
+    else:
+        _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    return cells[first], np.bincount(inverse.ravel(), counts, len(first)).astype(np.int64)
+
+
+def _box(cells: Array) -> tuple[Array, Array]:
+    low = cells.min(axis=0)
+    return low, cells.max(axis=0) - low + 1
+
+
+def _volume(shape: Array) -> float:
+    """Cells of a box of whole bricks: what the lookup table has to cover."""
+    return float(np.prod(((shape + 7) // 8 * 8).astype(np.float64)))
+
+
+def warn(warnings: list[str] | None, message: str) -> None:
+    """Log a warning and keep it for the map that is being made."""
+    log.warning("%s", message)
+    if warnings is not None:
+        warnings.append(message)
+
+
+def _without_strays(cells: Array, edge: float) -> Array:
+    """(n,) bool: not in a small group of cells far from the rest. One stray return must not decide the size of the grid."""
+    block = max(int(STRAY_DISTANCE / edge), 1)
+    keys, of_block = np.unique(cells // block, axis=0, return_inverse=True)
+    group = _groups(keys)[of_block.ravel()]
+    size = np.bincount(group)
+    keep = (size >= STRAY_SHARE * len(cells))[group]
+    return keep if keep.any() else group == size.argmax()
+
+
+def _groups(keys: Array) -> Array:
+    """Connected groups of few, widely spread blocks: axes are first squeezed so that gaps cost no memory."""
+    squeezed = np.empty_like(keys)
+    for axis in range(3):
+        values, inverse = np.unique(keys[:, axis], return_inverse=True)
+        steps = np.minimum(np.diff(values, prepend=values[0]), 2)
+        squeezed[:, axis] = np.cumsum(steps)[inverse.ravel()]
+    if np.prod(squeezed.max(axis=0).astype(np.float64) + 1) > 5e8:
+        raise InputError("the points are scattered over an extent that no building has: check --unit, or crop the file")
+    dense = np.zeros(tuple(squeezed.max(axis=0) + 1), bool)
+    dense[tuple(squeezed.T)] = True
+    labels, _ = ndimage.label(dense, np.ones((3, 3, 3)))
+    return labels[tuple(squeezed.T)] - 1

@@ -1,0 +1,129 @@
+"""Points -> occupied lattice cells with counts, in two passes over a coarse table of bricks (8 x 8 x 8 cells)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from topomerge.kernels import morton
+
+MAX_TABLE = 1 << 26  # bricks of the dense table; larger extents are sorted instead
+
+
+@njit(cache=True, parallel=True)
+def bounds(points):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Lowest and highest finite coordinates of (N, 3) points and the number of points that are not finite."""
+    parts = 16
+    low = np.full((parts, 3), np.inf)
+    high = np.full((parts, 3), -np.inf)
+    bad = np.zeros(parts, np.int64)
+    n = len(points)
+    for p in prange(parts):
+        for i in range(n * p // parts, n * (p + 1) // parts):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+                bad[p] += 1
+                continue
+            low[p, 0], high[p, 0] = min(low[p, 0], x), max(high[p, 0], x)
+            low[p, 1], high[p, 1] = min(low[p, 1], y), max(high[p, 1], y)
+            low[p, 2], high[p, 2] = min(low[p, 2], z), max(high[p, 2], z)
+    for p in range(1, parts):
+        for a in range(3):
+            low[0, a], high[0, a] = min(low[0, a], low[p, a]), max(high[0, a], high[p, a])
+    return low[0], high[0], bad.sum()
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def to_lattice(points, shift, edge, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Lattice cell floor((p + shift) / edge) of each point; points that are not finite get the lowest integer."""
+    for i in prange(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if np.isfinite(x) and np.isfinite(y) and np.isfinite(z):
+            out[i, 0] = np.int64(np.floor((x + shift[0]) / edge))
+            out[i, 1] = np.int64(np.floor((y + shift[1]) / edge))
+            out[i, 2] = np.int64(np.floor((z + shift[2]) / edge))
+        else:
+            out[i, 0] = out[i, 1] = out[i, 2] = np.iinfo(np.int64).min
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def mark(points, shift, edge, base, table):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """First pass: 1 in `table` for each brick that holds a point. Threads may write the same 1 twice."""
+    for i in prange(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if np.isfinite(x) and np.isfinite(y) and np.isfinite(z):
+            cx = np.int64(np.floor((x + shift[0]) / edge)) - base[0]
+            cy = np.int64(np.floor((y + shift[1]) / edge)) - base[1]
+            cz = np.int64(np.floor((z + shift[2]) / edge)) - base[2]
+            table[cx >> 3, cy >> 3, cz >> 3] = 1
+
+
+@njit(cache=True, error_model="numpy")
+def count(points, shift, edge, base, table, counts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Second pass: points in each cell of the bricks in use; within a brick cells stand in Morton order."""
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if np.isfinite(x) and np.isfinite(y) and np.isfinite(z):
+            cx = np.int64(np.floor((x + shift[0]) / edge)) - base[0]
+            cy = np.int64(np.floor((y + shift[1]) / edge)) - base[1]
+            cz = np.int64(np.floor((z + shift[2]) / edge)) - base[2]
+            x3, y3, z3 = cx & 7, cy & 7, cz & 7
+            code = (x3 & 1) | (y3 & 1) << 1 | (z3 & 1) << 2
+            code |= (x3 & 2) << 2 | (y3 & 2) << 3 | (z3 & 2) << 4
+            code |= (x3 & 4) << 4 | (y3 & 4) << 5 | (z3 & 4) << 6
+            counts[table[cx >> 3, cy >> 3, cz >> 3], code] += 1
+
+
+def occupied(
+    points: NDArray[Any], shift: NDArray[Any], edge: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Occupied lattice cells of one chunk of points.
+
+    Args:
+        points: (N, 3) float; points that are not finite are left out.
+        shift: (3,) float64, added to the points.
+        edge: edge length of a cell, m.
+
+    Returns:
+        base (3,) int64; cells (n, 3) int64 relative to it, not negative; their counts (n,) int64.
+    """
+    low, high, _ = bounds(points)
+    if not np.isfinite(low).all():
+        return np.zeros(3, np.int64), np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
+    first = np.floor((low + shift) / edge).astype(np.int64)
+    last = np.floor((high + shift) / edge).astype(np.int64)
+    base = (first >> 3) << 3
+    size = ((last - base) >> 3) + 1
+    if float(np.prod(size.astype(np.float64))) > MAX_TABLE:
+        return _split(points, shift, edge)
+    table = np.zeros(tuple(size), np.int32)
+    mark(points, shift, edge, base, table)
+    bricks = np.argwhere(table)
+    bricks = bricks[np.argsort(morton.encode(bricks), kind="stable")]
+    table[tuple(bricks.T)] = np.arange(len(bricks))
+    counts = np.zeros((len(bricks), 512), np.uint32)
+    count(points, shift, edge, base, table, counts)
+    which, code = np.nonzero(counts)
+    cells = (bricks[which] << 3) + morton.decode(code)
+    return base, cells, counts[which, code].astype(np.int64)
+
+
+def _split(
+    points: NDArray[Any], shift: NDArray[Any], edge: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """`occupied` for an extent too large for a table: a table around the median point, the points far from it sorted."""
+    cells = np.empty((len(points), 3), np.int64)
+    to_lattice(points, shift, edge, cells)
+    cells = cells[cells[:, 0] != np.iinfo(np.int64).min]
+    middle = np.median(cells[:: max(len(cells) // 100_000, 1)], axis=0).astype(np.int64)
+    near = (np.abs(cells - middle) < (1 << 11)).all(axis=1)
+    kept, counts = np.unique(cells[~near], axis=0, return_counts=True)
+    if near.any():
+        points_near = (cells[near] - middle + 0.5).astype(np.float32)
+        base, inner, inner_counts = occupied(points_near, np.zeros(3), 1.0)
+        kept, counts = np.concatenate([inner + base + middle, kept]), np.concatenate([inner_counts, counts])
+    low = kept.min(axis=0)
+    return low, kept - low, counts
