@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 DEPTH = 8 * 22  # room on the stack: every level leaves at most seven siblings behind
 CHUNK = 64  # queries a task
+BRICKS = 64  # a ball that may touch more bricks than this is searched from the root
 
 
 class Nodes(NamedTuple):
@@ -101,11 +102,45 @@ def _in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-
 
 
 @njit(cache=True, error_model="numpy")
-def _in_ball(cells, child, span, box, centre, square, stack, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Rows of the cells whose squared distance to `centre` (in cells) is at most `square`; returns how many."""
-    n, count, top = len(cells), 0, 1
+def _bricks(centre, reach, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """First and last + 1 of the bricks that an axis of the ball may touch; an empty range where it lies outside."""
+    low = min(max(np.ceil(centre - reach), 0.0), 8.0 * size)  # clipped as floats: a far point is no integer
+    high = max(min(np.floor(centre + reach), 8.0 * size - 1.0), -1.0)
+    first = int(low) >> 3
+    return first, max((int(high) >> 3) + 1, first)
+
+
+@njit(cache=True, error_model="numpy")
+def _start(table, first_brick, centre, reach, root, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Put the nodes where a ball query starts on the stack, the last row's first: the few bricks that a small ball can
+    touch, which are the third level of the tree and numbered as it is, else the root. Returns how many."""
+    stack[0] = root
+    x0, x1 = _bricks(centre[0], reach, table.shape[0])
+    y0, y1 = _bricks(centre[1], reach, table.shape[1])
+    z0, z1 = _bricks(centre[2], reach, table.shape[2])
+    if first_brick < 0 or (x1 - x0) * (y1 - y0) * (z1 - z0) > BRICKS:
+        return 1
+    top = 0
+    for x in range(x0, x1):
+        for y in range(y0, y1):
+            for z in range(z0, z1):
+                if table[x, y, z] < 0:
+                    continue
+                node, at = first_brick + table[x, y, z], top
+                while at and stack[at - 1] < node:
+                    stack[at] = stack[at - 1]
+                    at -= 1
+                stack[at] = node
+                top += 1
+    return top
+
+
+@njit(cache=True, error_model="numpy")
+def _in_ball(cells, child, span, box, centre, square, top, stack, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Rows of the cells whose squared distance to `centre` (in cells) is at most `square`, below the `top` nodes on the
+    stack; returns how many."""
+    n, count = len(cells), 0
     x, y, z = centre[0], centre[1], centre[2]
-    stack[0] = n + len(span) - 1
     while top:
         top -= 1
         j = stack[top] - n
@@ -134,15 +169,22 @@ def _in_ball(cells, child, span, box, centre, square, stack, out, fill):  # type
     return count
 
 
+@njit(cache=True, error_model="numpy")
+def _task(tree, centres, reach, indptr, out, fill, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    cells, child, span, box, table, first_brick = tree
+    root, stack = len(cells) + len(span) - 1, np.empty(DEPTH, np.int64)
+    for i in range(begin, end):
+        part = out[indptr[i] : indptr[i + 1]] if fill else out
+        top = _start(table, first_brick, centres[i], reach, root, stack)
+        count = _in_ball(cells, child, span, box, centres[i], reach * reach, top, stack, part, fill)
+        if not fill:
+            indptr[i + 1] = count
+
+
 @njit(cache=True, error_model="numpy", parallel=True)
-def _in_balls(cells, child, span, box, centres, square, indptr, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _tasks(tree, centres, reach, indptr, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for task in prange((len(centres) + CHUNK - 1) // CHUNK):
-        stack = np.empty(DEPTH, np.int64)
-        for i in range(task * CHUNK, min((task + 1) * CHUNK, len(centres))):
-            part = out[indptr[i] : indptr[i + 1]] if fill else out
-            count = _in_ball(cells, child, span, box, centres[i], square, stack, part, fill)
-            if not fill:
-                indptr[i + 1] = count
+        _task(tree, centres, reach, indptr, out, fill, task * CHUNK, min((task + 1) * CHUNK, len(centres)))
 
 
 def in_box(cells: NDArray[np.int32], nodes: Nodes, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -155,15 +197,21 @@ def in_box(cells: NDArray[np.int32], nodes: Nodes, low: NDArray[np.int64], high:
 
 
 def in_balls(
-    cells: NDArray[np.int32], nodes: Nodes, centres: NDArray[np.float64], radius: float
+    cells: NDArray[np.int32], nodes: Nodes, table: NDArray[np.int32], centres: NDArray[np.float64], radius: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """CSR (indptr, ascending rows) of the cells within `radius` of (q, 3) centres, all in cells."""
+    """CSR (indptr, ascending rows) of the cells within `radius` of (q, 3) centres, all in cells; `table` is `lookup.build`'s."""
     indptr = np.zeros(len(centres) + 1, np.int64)
     rows = np.empty(0, np.int64)
     if not len(cells):
         return indptr, rows
-    _in_balls(cells, *nodes[:3], centres, radius * radius, indptr, rows, False)
-    np.cumsum(indptr, out=indptr)
-    rows = np.empty(indptr[-1], np.int64)
-    _in_balls(cells, *nodes[:3], centres, radius * radius, indptr, rows, True)
+    first_brick = len(cells) + int(nodes.first[2]) if len(nodes.first) > 3 else -1
+    tree = (cells, *nodes[:3], table, first_brick)
+    for fill in (False, True):
+        if fill:
+            np.cumsum(indptr, out=indptr)
+            rows = np.empty(indptr[-1], np.int64)
+        if len(centres) > CHUNK:
+            _tasks(tree, centres, radius, indptr, rows, fill)
+        else:  # waking the other cores costs more than so few queries
+            _task(tree, centres, radius, indptr, rows, fill, 0, len(centres))
     return indptr, rows
