@@ -37,7 +37,7 @@ def write(arrays: Mapping[str, Array], path: str | Path) -> None:
             entry.create_system = 3  # else it tells the platform
             entry.external_attr = 0o644 << 16
             buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
+            np.lib.format.write_array(buffer, np.asarray(array, order="C"), allow_pickle=False)
             archive.writestr(entry, buffer.getbuffer(), compresslevel=6)
 
 
@@ -76,8 +76,8 @@ def read(path: str | Path, kind: str = "archive") -> dict[str, Array]:
 def _read(file: io.BufferedReader, size: int) -> dict[str, Array]:
     with zipfile.ZipFile(file) as archive:
         entries = [entry for entry in archive.infolist() if entry.filename.endswith(".npy")]
-        if len({entry.filename for entry in entries}) < len(entries):
-            raise ValueError("an array is there twice")
+        if entries and len({entry.filename for entry in entries}) < len(archive.infolist()):
+            raise ValueError("something is in it twice, or is no array")
         for entry in entries:
             if entry.compress_size > size or entry.file_size > MAX_RATIO * (entry.compress_size + 16):
                 raise ValueError(f"{entry.filename} claims {entry.file_size} bytes, more than it can hold")

@@ -131,34 +131,42 @@ def _neighbours(map: TopometricMap) -> list[list[str]]:
     return [[f"{room}{rooms[room]}" for room in sorted(rooms)] for rooms in beside]
 
 
-def map_to_text(map: TopometricMap) -> str:
-    """Tables of rooms, storeys and seconds for a terminal, without a line break at the end."""
-    kinds = Counter(map.edges["kind"].tolist())
-    counts = [_plural(len(map.rooms), "room"), _plural(len(map.storeys), "storey")]
-    counts += [_plural(kinds[kind], kind) for kind in ("door", "opening", "stairs")]
-    name = map.source or "map"
-    lines = [f"{name}: {', '.join(counts)}; {_plural(len(map.grid), 'cell')} of {map.grid.edge:g} m", ""]
-    neighbours = _neighbours(map)
+def _room_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
-    rooms = [
-        (
+    for i, (room, beside) in enumerate(zip(map.rooms, _neighbours(map), strict=True)):
+        yield (
             str(i),
             str(room["storey"]),
             _number(room["area"], 1),
             _number(room["height"], 2, room["height"] == 0),
             str(room["cells"]),
             str(doors[i]),
-            ", ".join(neighbours[i]) + ("  glimpsed" if room["glimpsed"] else ""),
+            ", ".join(beside) + ("  glimpsed" if room["glimpsed"] else ""),
         )
-        for i, room in enumerate(map.rooms)
-    ]
-    lines += _columns(("room", "storey", "area m²", "height m", "cells", "doors", "leads to"), rooms) + [""]
-    held = np.bincount(map.rooms["storey"], minlength=len(map.storeys))
-    storeys = [
-        (str(i), _number(s["floor"], 2), _number(s["ceiling"], 2), _number(s["area"], 1), str(held[i]))
-        for i, s in enumerate(map.storeys)
-    ]
-    lines += _columns(("storey", "floor m", "ceiling m", "area m²", "rooms"), storeys) + [""]
+
+
+def _storey_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
+    rooms = np.bincount(map.rooms["storey"], minlength=len(map.storeys))
+    for i, storey in enumerate(map.storeys):
+        floor, ceiling, area = storey["floor"], storey["ceiling"], storey["area"]
+        yield str(i), _number(floor, 2), _number(ceiling, 2), _number(area, 1), str(rooms[i])
+
+
+def map_to_text(map: TopometricMap) -> str:
+    """Tables of rooms, storeys and seconds for a terminal, without a line break at the end."""
+    kinds = Counter(map.edges["kind"].tolist())
+    counts = [_plural(len(map.rooms), "room"), _plural(len(map.storeys), "storey")]
+    counts += [_plural(kinds[kind], kind) for kind in ("door", "opening", "stairs")]
     steps = [(f"{s:.2f}", step) for step, s in map.seconds.items()]
-    lines += _columns(("seconds", "step"), [*steps, (f"{sum(map.seconds.values()):.2f}", "all")])
-    return "\n".join(lines)
+    steps.append((f"{sum(map.seconds.values()):.2f}", "all"))
+    return "\n".join(
+        (
+            f"{map.source or 'map'}: {', '.join(counts)}; {_plural(len(map.grid), 'cell')} of {map.grid.edge:g} m",
+            "",
+            *_columns(("room", "storey", "area m²", "height m", "cells", "doors", "leads to"), _room_rows(map)),
+            "",
+            *_columns(("storey", "floor m", "ceiling m", "area m²", "rooms"), _storey_rows(map)),
+            "",
+            *_columns(("seconds", "step"), steps),
+        )
+    )

@@ -5,7 +5,7 @@ A `.tmap` is one compressed NumPy archive without pickled objects. Format 1 hold
 | array | content |
 |---|---|
 | format | the number of the format |
-| about | JSON as bytes: source, parameters, seconds, warnings |
+| about | JSON as bytes: source, parameters, seconds, warnings, names of the arrays that follow |
 | grid_cells, navigable_cells, free_cells | Morton codes ascending, each as the difference to the one before |
 | grid_frame, … | origin x, y, z and edge length, m |
 | grid_shape, … | cells along x, y, z |
@@ -47,20 +47,21 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
         InputError: the path can't be written.
         ValueError: a property of a grid holds Python objects.
     """
-    about = {
-        "source": map.source,
-        "parameters": plain(dict(map.parameters)),
-        "seconds": plain(dict(map.seconds)),
-        "warnings": list(map.warnings),
-    }
-    arrays: dict[str, Array] = {"format": np.array(FORMAT, "<i4"), "about": np.array(json.dumps(about).encode())}
-    arrays |= _pack("grid", map.grid) | {"room": map.room.astype("<i4")}
+    arrays = _pack("grid", map.grid) | {"room": map.room.astype("<i4")}
     arrays |= _pack("navigable", map.navigable) | {"navigable_room": map.navigable_room.astype("<i4")}
     arrays |= {"rooms": map.rooms, "edges": map.edges, "storeys": map.storeys}
     if map.free is not None:
         arrays |= _pack("free", map.free)
     if map.provenance is not None:
         arrays["provenance"] = map.provenance.astype("<u4")
+    about = {
+        "source": map.source,
+        "parameters": plain(dict(map.parameters)),
+        "seconds": plain(dict(map.seconds)),
+        "warnings": list(map.warnings),
+        "arrays": list(arrays),
+    }
+    arrays = {"format": np.array(FORMAT, "<i4"), "about": np.array(json.dumps(about).encode()), **arrays}
     archive.write(arrays, path)
 
 
@@ -132,6 +133,8 @@ def _table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
 
 def _map(arrays: dict[str, Array]) -> TopometricMap:
     about = json.loads(arrays["about"].item())
+    if missing := set(about["arrays"]) - set(arrays):
+        raise KeyError(min(missing))
     provenance = _typed(arrays, "provenance", "u", 1).astype(np.uint32) if "provenance" in arrays else None
     edges = _table(arrays, "edges", EDGE_DTYPE)
     edges["kind"].tolist()  # fails here, not later, where the text is none

@@ -1,0 +1,113 @@
+"""Plans: what stands where, and that any map can be drawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.scenes_map import building
+from topomerge.errors import InputError
+from topomerge.io.palette import beside, colour_numbers, room_colours
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, TopometricMap, VoxelGrid
+from topomerge.viz.figures import plan_figure, save_figure
+from topomerge.viz.plan import frame_of, places, storey_plans
+
+
+def without_rooms(map: TopometricMap) -> TopometricMap:
+    none = np.full(len(map.grid), -1, np.int32)
+    tables = {name: np.zeros(0, d) for name, d in (("rooms", ROOM_DTYPE), ("edges", EDGE_DTYPE), ("storeys", STOREY_DTYPE))}
+    return replace(map, room=none, navigable_room=np.full(len(map.navigable), -1, np.int32), **tables)
+
+
+@pytest.mark.parametrize("storeys", [1, 2, 5])
+def test_one_panel_a_storey_at_one_scale(storeys: int) -> None:
+    figure = plan_figure(building(2, storeys))
+    assert len(figure.axes) == storeys
+    scales = set()
+    for ax in figure.axes:
+        box = ax.get_position()
+        across, down = figure.get_size_inches() * (box.width, box.height)
+        (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+        scales |= {round(across / (x1 - x0), 6), round(down / (y1 - y0), 6)}
+    assert len(scales) == 1
+
+
+def test_title_and_legend_tell_what_is_drawn() -> None:
+    figure = plan_figure(building(2, 2))
+    words = [text.get_text() for text in figure.texts]
+    assert "building.ply: 10 rooms, 2 storeys" in words
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == ["door", "opening", "stairs", "wall", "no room"]
+
+
+def test_every_room_has_its_number_inside_it() -> None:
+    scene = building(3, 2)
+    frame = frame_of(scene)
+    for storey, plan in enumerate(storey_plans(scene, frame)):
+        found = places(plan, frame)
+        assert sorted(found) == np.flatnonzero(scene.rooms["storey"] == storey).tolist()
+        for room, place in found.items():
+            i, j = ((np.array([place.x, place.y]) - frame.low) / frame.size).astype(int)
+            assert plan.room[i, j] == room and not plan.wall[i, j]
+    texts = [text.get_text() for ax in plan_figure(scene).axes for text in ax.texts]
+    assert [t for t in texts if t.isdigit()] == [str(i) for i in range(len(scene.rooms))]
+
+
+def test_walls_are_cut_and_doors_are_open() -> None:
+    scene = building(1, 2)
+    frame = frame_of(scene)
+    for storey, plan in enumerate(storey_plans(scene, frame)):
+        assert plan.wall[0].all() and plan.wall[:, 0].all()
+        for edge in scene.edges[(scene.rooms["storey"][scene.edges["rooms"]] == storey).all(axis=1)]:
+            i, j = ((edge["centre"][:2] - frame.low) / frame.size).astype(int)
+            assert not plan.wall[i, j]
+
+
+def test_rooms_side_by_side_differ() -> None:
+    scene = building(6, 3)
+    pairs = beside(scene)
+    assert {(0, 2), (0, 12), (12, 25)} <= {tuple(pair) for pair in pairs.tolist()}
+    colours = room_colours(scene)
+    assert (colours[pairs[:, 0]] != colours[pairs[:, 1]]).any(axis=1).all()
+
+
+def test_colours_of_a_dense_graph() -> None:
+    pairs = np.array([(a, b) for a in range(14) for b in range(a)])
+    assert len(set(colour_numbers(14, pairs).tolist())) == 14
+    assert len(colour_numbers(40, np.array([(a, b) for a in range(40) for b in range(a)]))) == 40
+    assert len(colour_numbers(0, np.zeros((0, 2), int))) == 0
+
+
+def test_same_map_same_file(tmp_path: Path) -> None:
+    for name in ("a.png", "a.svg", "a.pdf"):
+        save_figure(building(1, 1), tmp_path / name)
+        save_figure(building(1, 1), tmp_path / f"again_{name}")
+        assert (tmp_path / name).read_bytes() == (tmp_path / f"again_{name}").read_bytes()
+    image = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"))
+    assert min(image.shape[:2]) > 500 and len(np.unique(image.reshape(-1, 3), axis=0)) > 5
+
+
+def test_maps_with_little_in_them(tmp_path: Path) -> None:
+    save_figure(without_rooms(building(1, 1)), tmp_path / "walls.png")
+    grid = VoxelGrid.from_cells(np.zeros((0, 3), np.int32))
+    empty = without_rooms(
+        replace(building(1, 1), grid=grid, room=np.zeros(0, np.int32), navigable=grid, navigable_room=np.zeros(0, np.int32))
+    )
+    save_figure(replace(empty, source="$x^2$"), tmp_path / "empty.png")
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_far_apart_cells_are_drawn_together() -> None:
+    cells = np.array([[0, 0, 0], [200_000, 5, 3]])
+    grid = VoxelGrid.from_cells(cells)
+    scene = without_rooms(replace(building(1, 1), grid=grid, room=np.full(2, -1, np.int32)))
+    assert max(frame_of(scene).shape) <= 1500
+
+
+def test_unknown_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="can't be written"):
+        save_figure(building(1, 1), tmp_path / "absent" / "a.png")
