@@ -1,0 +1,363 @@
+"""Furniture: what it is made of, which rooms hold what, and where it can stand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from topomerge.datasets.solids import rotation
+
+from topomerge.types import Array
+
+TRIES = 10
+BODY = 0.28  # m, half of what a person needs to pass
+
+
+@dataclass(frozen=True, eq=False)
+class Item:
+    """A thing at its place: boxes (n, 6) about `at` on the floor, turned by `yaw`; `size` of the box around them."""
+
+    kind: str
+    parts: Array
+    at: Array  # (2,) middle of its footprint
+    yaw: float
+    size: tuple[float, float, float]
+    movable: bool = True
+    label: str = "furniture"
+
+    @property
+    def outline(self) -> shapely.Polygon:
+        """Its footprint."""
+        return _outline(self.at, self.yaw, self.size)
+
+
+def _table(w: float, d: float, h: float = 0.74) -> list[list[float]]:
+    legs = [[x * (w / 2 - 0.05), y * (d / 2 - 0.05), h / 2, 0.05, 0.05, h] for x in (-1, 1) for y in (-1, 1)]
+    return [[0, 0, h - 0.015, w, d, 0.03], *legs]
+
+
+def _chair(x: float = 0.0, y: float = 0.0, back: float = -1.0) -> list[list[float]]:
+    return [
+        [x, y, 0.44, 0.45, 0.45, 0.06],
+        [x, y + back * 0.21, 0.7, 0.42, 0.04, 0.45],
+        *_around(x, y, 0.18, 0.18, 0.21, 0.04, 0.42),
+    ]
+
+
+def _around(x: float, y: float, dx: float, dy: float, z: float, side: float, h: float) -> list[list[float]]:
+    return [[x + i * dx, y + j * dy, z, side, side, h] for i in (-1, 1) for j in (-1, 1)]
+
+
+def _shelf(w: float, d: float, h: float) -> list[list[float]]:
+    boards = [[0, 0, z, w, d, 0.03] for z in np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))]
+    books = [
+        [0, 0.03, z + 0.14, w * 0.8, d * 0.6, 0.25] for z in np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))[:-1:2]
+    ]
+    return [
+        [0, d / 2 - 0.01, h / 2, w, 0.02, h],
+        [-w / 2, 0, h / 2, 0.03, d, h],
+        [w / 2, 0, h / 2, 0.03, d, h],
+        *boards,
+        *books,
+    ]
+
+
+def _bed(w: float, d: float = 2.05) -> list[list[float]]:
+    return [[0, 0, 0.3, w, d, 0.3], [0, d / 2 - 0.03, 0.5, w, 0.06, 1.0], [0, d / 2 - 0.35, 0.5, w * 0.8, 0.4, 0.12]]
+
+
+def _sofa(w: float, d: float = 0.9) -> list[list[float]]:
+    arms = [[s * (w / 2 - 0.09), 0, 0.3, 0.18, d, 0.6] for s in (-1, 1)]
+    return [[0, 0, 0.21, w, d, 0.42], [0, d / 2 - 0.1, 0.55, w, 0.2, 0.6], *arms]
+
+
+def _desk(w: float, d: float) -> list[list[float]]:
+    """Desk with screen and chair; the chair's side is y < 0."""
+    y = 0.35
+    shift = [[b[0], b[1] + y, *b[2:]] for b in _table(w, d)]
+    return [
+        *shift,
+        [0, y + 0.2, 1.0, 0.55, 0.04, 0.33],
+        [0, y + 0.2, 0.8, 0.2, 0.15, 0.12],
+        *_chair(0.0, y - d / 2 - 0.2),
+    ]
+
+
+def _dining(w: float, d: float) -> list[list[float]]:
+    xs = np.arange(int(w / 0.65)) * 0.65
+    xs = xs - xs.mean()
+    return [*_table(w, d), *(b for x in xs for s in (-1, 1) for b in _chair(float(x), s * (d / 2 + 0.12), float(s)))]
+
+
+def _counter(w: float, d: float = 0.6) -> list[list[float]]:
+    """Kitchen run with cupboards above and a tall fridge."""
+    cupboard = [w * 0.1, d / 2 - 0.17, 1.75, w * 0.75, 0.34, 0.65]
+    return [[0, 0, 0.45, w, d, 0.9], cupboard, [-w / 2 + 0.3, 0, 0.95, 0.6, d, 1.9]]
+
+
+def _toilet() -> list[list[float]]:
+    return [[0, -0.05, 0.2, 0.37, 0.5, 0.4], [0, 0.22, 0.6, 0.4, 0.18, 0.4]]
+
+
+def _bench(w: float, d: float) -> list[list[float]]:
+    """Laboratory island: drawers, a worktop and a rack of shelves along its middle."""
+    return [
+        [0, 0, 0.42, w * 0.95, d * 0.8, 0.84],
+        [0, 0, 0.89, w, d, 0.06],
+        [0, 0, 1.35, w * 0.9, 0.3, 0.03],
+        [0, 0, 1.2, 0.05, 0.3, 0.6],
+    ]
+
+
+def _seat(w: float) -> list[list[float]]:
+    """School desk for two with two chairs."""
+    back = [b for x in (-w / 4, w / 4) for b in _chair(x, -0.5)]
+    return [*_table(w, 0.5, 0.72), *back]
+
+
+Make = Callable[[np.random.Generator], list[list[float]]]
+ITEMS: dict[str, Make] = {
+    "desk": lambda g: _desk(g.choice([1.2, 1.4, 1.6]), 0.8),
+    "shelf": lambda g: _shelf(g.choice([0.8, 1.0, 1.6]), 0.35, g.choice([1.2, 1.9, 2.1])),
+    "cabinet": lambda g: [[0, 0, (h := g.uniform(0.8, 1.5)) / 2, g.choice([0.8, 1.2]), 0.45, h]],
+    "wardrobe": lambda g: [[0, 0, 1.05, g.choice([1.0, 1.5, 2.0]), 0.6, 2.1]],
+    "bed": lambda g: _bed(g.choice([0.9, 1.4, 1.6])),
+    "hospitalbed": lambda g: _bed(0.95, 2.15),
+    "nightstand": lambda g: [[0, 0, 0.27, 0.45, 0.4, 0.54]],
+    "sofa": lambda g: _sofa(g.choice([1.5, 1.9, 2.3])),
+    "lowtable": lambda g: _table(1.0, 0.6, 0.4),
+    "armchair": lambda g: _sofa(0.9, 0.85),
+    "dining": lambda g: _dining(g.choice([1.4, 1.8]), 0.85),
+    "meeting": lambda g: _dining(g.choice([2.4, 3.2]), 1.1),
+    "kitchen": lambda g: _counter(g.choice([1.8, 2.4, 3.0])),
+    "tv": lambda g: [[0, 0, 0.25, 1.5, 0.4, 0.5], [0, 0.05, 0.85, 1.1, 0.06, 0.65]],
+    "toilet": lambda g: _toilet(),
+    "sink": lambda g: [[0, 0, 0.8, 0.55, 0.45, 0.16], [0, 0.1, 0.36, 0.18, 0.2, 0.72], [0, 0.21, 1.5, 0.5, 0.03, 0.7]],
+    "shower": lambda g: [[0, 0, 0.04, 0.9, 0.9, 0.08], [0, 0.42, 1.1, 0.05, 0.05, 2.0]],
+    "bath": lambda g: [[0, 0, 0.28, 1.7, 0.75, 0.56]],
+    "bench": lambda g: _bench(g.choice([1.8, 2.4, 3.0]), g.choice([0.8, 1.4])),
+    "hood": lambda g: [[0, 0, 0.45, 1.5, 0.8, 0.9], [0, 0.3, 1.6, 1.5, 0.2, 1.4], [0, 0, 2.25, 1.5, 0.8, 0.3]],
+    "seat": lambda g: _seat(1.3),
+    "board": lambda g: [[0, 0, 1.5, g.choice([1.8, 2.4, 3.6]), 0.05, 1.2]],
+    "locker": lambda g: [[0, 0, 0.9, g.choice([0.9, 1.8, 2.7]), 0.4, 1.8]],
+    "printer": lambda g: [[0, 0, 0.55, 0.65, 0.6, 1.1]],
+    "sidebench": lambda g: [
+        [0, 0, 0.43, 1.5, 0.4, 0.05],
+        [-0.6, 0, 0.2, 0.05, 0.35, 0.4],
+        [0.6, 0, 0.2, 0.05, 0.35, 0.4],
+    ],
+    "plant": lambda g: [
+        [0, 0, 0.2, 0.35, 0.35, 0.4],
+        [0, 0, 0.9, 0.5, 0.5, (h := g.uniform(0.6, 1.2))],
+        [0, 0, 0.7, 0.06, 0.06, h],
+    ],
+    "rack": lambda g: _shelf(1.2, 0.6, 2.1),
+    "trolley": lambda g: [[0, 0, 0.5, 0.8, 0.5, 0.9]],
+    "radiator": lambda g: [[0, 0, 0.45, g.choice([0.8, 1.2]), 0.1, 0.6]],
+    "partition": lambda g: [[0, 0, 0.75, 1.6, 0.05, 1.5]],
+    "counterdesk": lambda g: [[0, 0, 0.55, 2.2, 0.7, 1.1], [0, 0.6, 0.72, 2.0, 0.5, 0.04]],
+    "clutter": lambda g: [[0, 0, (h := g.uniform(0.12, 0.6)) / 2, g.uniform(0.15, 0.5), g.uniform(0.15, 0.5), h]],
+    "person": lambda g: [[0, 0, 0.42, 0.32, 0.24, 0.84], [0, 0, 1.15, 0.44, 0.26, 0.66], [0, 0, 1.6, 0.2, 0.22, 0.26]],
+}
+FIXED = {"kitchen", "toilet", "sink", "shower", "bath", "bench", "hood", "board", "radiator", "counterdesk"}
+# kind of room -> (item, where, number, m2 for each further one: 0 none). "rows" fill the room's middle.
+WALL, MIDDLE, ROWS = "wall", "middle", "rows"
+ROOMS: dict[str, list[tuple[str, str, int, float]]] = {
+    "office": [
+        ("desk", WALL, 1, 9),
+        ("shelf", WALL, 1, 14),
+        ("cabinet", WALL, 1, 16),
+        ("radiator", WALL, 1, 0),
+        ("plant", WALL, 0, 25),
+    ],
+    "openplan": [("desk", ROWS, 4, 7), ("cabinet", WALL, 2, 25), ("partition", MIDDLE, 1, 40), ("plant", WALL, 1, 40)],
+    "meeting": [("meeting", MIDDLE, 1, 60), ("board", WALL, 1, 0), ("cabinet", WALL, 0, 30)],
+    "corridor": [
+        ("cabinet", WALL, 0, 40),
+        ("plant", WALL, 0, 60),
+        ("sidebench", WALL, 0, 60),
+        ("printer", WALL, 0, 70),
+    ],
+    "lobby": [
+        ("counterdesk", MIDDLE, 1, 0),
+        ("sofa", WALL, 1, 40),
+        ("lowtable", MIDDLE, 1, 60),
+        ("plant", WALL, 1, 30),
+    ],
+    "atrium": [("sofa", MIDDLE, 1, 60), ("lowtable", MIDDLE, 1, 60), ("plant", WALL, 2, 40), ("dining", MIDDLE, 0, 60)],
+    "kitchen": [("kitchen", WALL, 1, 0), ("dining", MIDDLE, 1, 0), ("cabinet", WALL, 0, 15)],
+    "living": [
+        ("sofa", WALL, 1, 25),
+        ("lowtable", MIDDLE, 1, 0),
+        ("tv", WALL, 1, 0),
+        ("shelf", WALL, 1, 12),
+        ("dining", MIDDLE, 0, 22),
+        ("armchair", MIDDLE, 0, 15),
+        ("plant", WALL, 1, 0),
+    ],
+    "bedroom": [("bed", WALL, 1, 0), ("wardrobe", WALL, 1, 18), ("nightstand", WALL, 1, 0), ("desk", WALL, 0, 14)],
+    "hotel": [
+        ("bed", WALL, 1, 0),
+        ("wardrobe", WALL, 1, 0),
+        ("nightstand", WALL, 1, 0),
+        ("tv", WALL, 1, 0),
+        ("armchair", WALL, 0, 20),
+    ],
+    "ward": [
+        ("hospitalbed", WALL, 1, 11),
+        ("nightstand", WALL, 1, 11),
+        ("wardrobe", WALL, 1, 30),
+        ("trolley", WALL, 0, 20),
+    ],
+    "bath": [("toilet", WALL, 1, 0), ("sink", WALL, 1, 0), ("shower", WALL, 1, 0), ("bath", WALL, 0, 6)],
+    "toilets": [("toilet", WALL, 1, 5), ("sink", WALL, 1, 7)],
+    "classroom": [
+        ("board", WALL, 1, 0),
+        ("seat", ROWS, 6, 4.5),
+        ("desk", MIDDLE, 1, 0),
+        ("shelf", WALL, 1, 40),
+        ("cabinet", WALL, 1, 40),
+    ],
+    "hall": [("sidebench", WALL, 2, 50), ("seat", ROWS, 0, 60), ("cabinet", WALL, 1, 80)],
+    "canteen": [("dining", ROWS, 3, 12), ("counterdesk", WALL, 1, 0)],
+    "lab": [
+        ("bench", ROWS, 1, 16),
+        ("hood", WALL, 1, 30),
+        ("shelf", WALL, 1, 20),
+        ("desk", WALL, 0, 25),
+        ("cabinet", WALL, 1, 25),
+    ],
+    "storage": [("rack", WALL, 2, 5), ("clutter", MIDDLE, 1, 5)],
+    "nurses": [("counterdesk", MIDDLE, 1, 0), ("desk", WALL, 1, 12), ("shelf", WALL, 1, 10), ("trolley", WALL, 1, 12)],
+    "library": [("shelf", ROWS, 4, 6), ("desk", WALL, 1, 25), ("dining", MIDDLE, 0, 40)],
+    "cloakroom": [("locker", WALL, 2, 6), ("sidebench", MIDDLE, 1, 12)],
+}
+
+
+def _outline(at: Array, yaw: float, size: Sequence[float]) -> shapely.Polygon:
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size[:2]) / 2
+    return shapely.Polygon(corners @ rotation(yaw) + at)
+
+
+def make_item(kind: str, rng: np.random.Generator) -> Item:
+    """An item at the origin, its back towards +y, centred on its footprint."""
+    parts = np.array(ITEMS[kind](rng), float)
+    low, high = (parts[:, :3] - parts[:, 3:] / 2).min(axis=0), (parts[:, :3] + parts[:, 3:] / 2).max(axis=0)
+    parts[:, :2] -= (low + high)[:2] / 2
+    size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
+    label = kind if kind in ("clutter", "person") else "furniture"
+    return Item(kind, parts, np.zeros(2), 0.0, size, kind not in FIXED, label)
+
+
+@dataclass(eq=False)
+class Floor:
+    """A room while it is being furnished."""
+
+    shape: shapely.Polygon
+    taken: list[shapely.Polygon]
+    rng: np.random.Generator
+    height: float = 2.5
+
+    def put(self, item: Item, where: str) -> Item | None:
+        """The item at a place that is free, or None when none was found."""
+        for _ in range(TRIES):
+            at, yaw = self._by_wall(item) if where == WALL else self._in_middle(item)
+            outline = _outline(at, yaw, item.size)
+            if self.fits(outline):
+                return self._place(item, at, yaw, outline)
+        return None
+
+    def fits(self, outline: shapely.Polygon) -> bool:
+        """Does a footprint lie within the room and clear of everything?"""
+        return bool(self.shape.contains(outline)) and not any(outline.intersects(t) for t in self.taken)
+
+    def _place(self, item: Item, at: Array, yaw: float, outline: shapely.Polygon) -> Item:
+        self.taken.append(outline.buffer(0.02, join_style="mitre"))
+        return Item(item.kind, item.parts, at, yaw, item.size, item.movable, item.label)
+
+    def _by_wall(self, item: Item) -> tuple[Array, float]:
+        ring = np.asarray(self.shape.exterior.coords)
+        steps = np.diff(ring, axis=0)
+        lengths = np.hypot(steps[:, 0], steps[:, 1])
+        weight = np.maximum(lengths - item.size[0], 0) + 1e-9
+        k = int(self.rng.choice(len(weight), p=weight / weight.sum()))
+        along = steps[k] / lengths[k]
+        spare = max(lengths[k] - item.size[0], 0.0)
+        inward = np.array([-along[1], along[0]])  # the ring is counter-clockwise
+        # half of the things go into a corner, as people put them
+        offset = self.rng.choice([0.04, spare - 0.04, *self.rng.uniform(0, spare, 2)])
+        at = ring[k] + along * (item.size[0] / 2 + offset) + inward * (item.size[1] / 2 + 0.03)
+        return at, float(np.arctan2(-inward[1], -inward[0]) - np.pi / 2)
+
+    def _in_middle(self, item: Item) -> tuple[Array, float]:
+        low, high = np.array(self.shape.bounds).reshape(2, 2)
+        yaw = self.bearing() + float(self.rng.integers(4)) * np.pi / 2
+        if item.kind in ("clutter", "person", "armchair", "plant"):
+            yaw = float(self.rng.uniform(0, 2 * np.pi))
+        return self.rng.uniform(low, high), yaw
+
+    def bearing(self) -> float:
+        """rad, direction of the longest wall."""
+        steps = np.diff(np.asarray(self.shape.exterior.coords), axis=0)
+        longest = steps[np.argmax(np.hypot(steps[:, 0], steps[:, 1]))]
+        return float(np.arctan2(longest[1], longest[0]))
+
+    def rows(self, kind: str, count: int) -> list[Item]:
+        """Up to `count` items of one make on a grid in the room's middle, with aisles."""
+        item, yaw, out = make_item(kind, self.rng), self.bearing(), []
+        turned = np.asarray(self.shape.exterior.coords) @ rotation(-yaw)
+        low, high = turned.min(axis=0) + 0.7, turned.max(axis=0) - 0.7
+        xs = np.arange(
+            low[0] + item.size[0] / 2, high[0] - item.size[0] / 2 + 1e-6, item.size[0] + self.rng.uniform(0.5, 0.9)
+        )
+        ys = np.arange(
+            low[1] + item.size[1] / 2, high[1] - item.size[1] / 2 + 1e-6, item.size[1] + self.rng.uniform(0.5, 0.9)
+        )
+        for spot in ((x, y) for y in ys for x in xs):
+            at = np.array(spot) @ rotation(yaw)
+            outline = _outline(at, yaw, item.size)
+            if len(out) < count and self.fits(outline):
+                out.append(self._place(item, at, yaw, outline))
+        return out
+
+
+def furnish(floor: Floor, kind: str, density: float, clutter: float, doors: Array) -> list[Item]:
+    """Things for a room of a kind.
+
+    Args:
+        floor: the room, with what is taken already (door swings, stairs, columns).
+        kind: of the room; an unknown one gets the furniture of an office.
+        density: 1 is usual.
+        clutter: things on the floor of 10 m2.
+        doors: (d, 2) where people stand when they enter; all must stay reachable from each other.
+    """
+    area, out = floor.shape.area, []
+    wanted = ROOMS.get(kind, [] if kind in ("stairs", "lift", "shaft", "balcony") else ROOMS["office"])
+    for name, where, least, every in wanted:
+        count = (least + (area / every if every else 0.0)) * density
+        number = int(count) + int(floor.rng.random() < count % 1)
+        if where == ROWS:
+            out += floor.rows(name, number)
+            continue
+        placed = (floor.put(make_item(name, floor.rng), where) for _ in range(number))
+        out += [item for item in placed if item is not None]
+    number = int(floor.rng.poisson(clutter * area / 10 * min(density, 1)))
+    if kind not in ("lift", "shaft"):
+        strewn = (floor.put(make_item("clutter", floor.rng), MIDDLE) for _ in range(number))
+        out += [item for item in strewn if item is not None]
+    out = [item for item in out if item.size[2] < floor.height]
+    while out and not passable(floor.shape, out, doors):
+        out = out[: len(out) * 2 // 3]
+    return out
+
+
+def passable(shape: shapely.Polygon, items: list[Item], doors: Array) -> bool:
+    """Can a person get from every door to every other one, and some way into the room?"""
+    blocked = shapely.union_all([i.outline for i in items if i.kind != "board"]).buffer(BODY, 4)
+    parts = shapely.get_parts(shape.buffer(0.1).buffer(-0.1 - BODY * 0.9).difference(blocked))
+    if not len(doors):
+        return True
+    near = shapely.distance(parts[:, None], shapely.points(doors)[None]) < 0.45
+    return bool((near.all(axis=1) & (shapely.area(parts) > 0.15 * shape.area * (shape.area > 8))).any())
