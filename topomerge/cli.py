@@ -138,5 +138,3 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _run(args)
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 1 if stop.code else 0
-
-

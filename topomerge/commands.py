@@ -60,7 +60,11 @@ def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 READING = (
-    option("--up", choices=("z", "y", "x"), help="axis of the input that points up (default z)"),
+    option(
+        "--up",
+        choices=("z", "y", "x", "-z", "-y", "-x"),
+        help="axis of the input that points up (default z, for glTF y); write --up=-y for one that points down",
+    ),
     option("--unit", choices=("m", "cm", "mm", "ft", "in"), help="unit of the input (default m)"),
     option("--scale", type=_above_zero, metavar="S", help="multiply coordinates by this (default 1)"),
     option("--resolution", type=_above_zero, metavar="R", help="m a pixel, of a plain image of a floor plan"),
@@ -80,7 +84,7 @@ def extract_command(args: argparse.Namespace) -> int:
         reading = _given(args, "up", "unit", "scale", "resolution", "extrude", "ceiling")
         chunks = read_chunks(args.input, **reading, progress=bars.task("read"))
         choices = _given(args, "voxel_size", "preset")
-        found = extract(chunks, **choices, source=args.input, progress=bars.task("extract"))
+        found = extract(chunks, **choices, name=args.input, progress=bars.task("extract"))
         write_all([(path, partial(getattr(topomerge, writer), found)) for path, writer in outputs])
     warn(found.warnings)
     if not args.quiet:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from topomerge.errors import InputError
-from topomerge.io.atomic import replacing
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -97,6 +96,8 @@ def check_outputs(outputs: Sequence[str | Path], inputs: Sequence[str | Path] = 
     Raises:
         InputError: a folder is missing or can't be written, a path is a folder, is an input or is given twice.
     """
+    from topomerge.io.atomic import replacing  # here, because topomerge.io imports NumPy
+
     taken = {Path(path).resolve(): "is the input: it would be overwritten; give another name" for path in inputs}
     for path in map(Path, outputs):
         if path.is_dir():
@@ -118,6 +119,8 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
     Raises:
         InputError: one can't be written.
     """
+    from topomerge.io.atomic import replacing
+
     with ExitStack() as stack:
         for path, save in outputs:
             beside = stack.enter_context(replacing(path))
