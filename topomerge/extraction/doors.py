@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import edt
 import numpy as np
+from scipy import ndimage
 
 from topomerge.extraction.components import connected_components
 from topomerge.extraction.convolution import sphere
 from topomerge.types import EDGE_DTYPE, Array, VoxelGrid
 
 DOOR_WIDTH = 1.6  # m: what is wider is an opening
+SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
 NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
 
 
@@ -46,27 +49,120 @@ def find_edges(
         meeting = navigable.subset(rows)
         contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))
         for c in range(int(contact.max()) + 1):
-            edges.append(_edge(navigable, pair, rows[contact == c], storey_of_room, floor_to_ceiling, body))
+            edges.append(_edge(navigable, room, rows[contact == c], storey_of_room, floor_to_ceiling, body))
     return np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
 
 
 def _edge(
-    navigable: VoxelGrid, pair: Array, rows: Array, storey_of_room: Array, floor_to_ceiling: Array, body: float
+    navigable: VoxelGrid, room: Array, rows: Array, storey_of_room: Array, floor_to_ceiling: Array, body: float
 ) -> tuple[object, ...]:
-    """One row of EDGE_DTYPE from the cells of both rooms that touch."""
-    points = navigable.centroids(navigable.cells[rows])
-    plan = np.unique(navigable.cells[rows, :2], axis=0) * navigable.edge
-    along = np.array([1.0, 0.0])
-    if len(plan) > 2:
-        along = np.linalg.svd(plan - plan.mean(axis=0), full_matrices=False)[2][0]
-    across = float(np.arctan2(along[0], -along[1]) % np.pi)  # the wall's normal
+    """One row of EDGE_DTYPE from the cells (`rows`) of two rooms that touch."""
+    pair = np.unique(room[rows])
+    cells = navigable.cells[rows]
+    middle, along, span = _extent(np.unique(cells[:, :2], axis=0))
+    narrow = _narrowest(navigable, room, pair, cells)
+    if narrow is not None and narrow[2] <= span:
+        middle, along, span = narrow
+    at_door = np.abs(cells[:, :2] - middle).max(axis=1) <= max(span / 2, 2)
+    rows = rows[at_door] if at_door.any() else rows
     above = floor_to_ceiling[rows]
     height = float(above[above > 0].min()) if (above > 0).any() else 0.0
-    floor = float(np.sort(points[:, 2])[: max(len(points) // 4, 1)].mean())
-    centre = (float(points[:, 0].mean()), float(points[:, 1].mean()), floor)
-    width = float(np.ptp(plan @ along)) + body
+    levels = np.sort(navigable.cells[rows, 2])
+    floor = float(levels[: max(len(levels) // 4, 1)].mean())
+    centre = navigable.origin + (np.array([*middle, floor]) + 0.5) * navigable.edge
+    width = span * navigable.edge + 2 * (int(np.ceil(body / navigable.edge - 1e-6)) // 2) * navigable.edge
     if storey_of_room[pair[0]] != storey_of_room[pair[1]]:
         kind = "stairs"
     else:
         kind = "door" if width <= DOOR_WIDTH else "opening"
-    return (tuple(int(p) for p in pair), centre, width, height, across, kind)
+    across = float(np.arctan2(along[0], -along[1]) % np.pi)  # the wall's normal
+    return (tuple(int(p) for p in pair), tuple(centre.tolist()), width, height, across, kind)
+
+
+def _extent(plan: Array) -> tuple[Array, Array, float]:
+    """Middle, direction and length (cells) of a strip of columns."""
+    middle = plan.mean(axis=0)
+    along = np.array([1.0, 0.0])
+    if len(plan) > 2:
+        along = np.linalg.svd(plan - middle, full_matrices=False)[2][0]
+    return middle, along, float(np.ptp(plan @ along)) + 1
+
+
+def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -> tuple[Array, Array, float] | None:
+    """Middle, direction and width (cells) of the narrowest place on the widest way between two rooms, near their contact.
+
+    Borders between clusters of views lie somewhere near a door, not in it; the floor itself is narrowest in the door.
+    """
+    reach = int(np.ceil(SEARCH / navigable.edge))
+    low = contact[:, :2].min(axis=0) - reach
+    size = contact[:, :2].max(axis=0) + reach + 1 - low
+    z = contact[:, 2].mean()
+    at = navigable.cells
+    near = np.flatnonzero(
+        ((at[:, :2] >= low) & (at[:, :2] < low + size)).all(axis=1) & (np.abs(at[:, 2] - z) * navigable.edge <= 0.6)
+    )
+    owner = np.full(size, -1, np.int64)
+    owner[tuple((at[near, :2] - low).T)] = room[near]
+    free = np.pad(owner >= 0, 1)
+    clearance = np.sqrt(edt.edtsq(free.view(np.uint8), parallel=1))[1:-1, 1:-1]
+    # Each room is represented by its widest place away from the border, which may lie on the wrong side of the door.
+    far = np.ones(size, bool)
+    far[tuple((contact[:, :2] - low).T)] = False
+    away = np.sqrt(edt.edtsq(far.view(np.uint8), parallel=1))
+    sides = []
+    for p in pair:
+        mine = owner == p
+        away_enough = mine & (away >= min(0.6 * reach, away[mine].max()))
+        sides.append(np.argmax(np.where(away_enough, clearance, -1.0)))
+    if clearance.flat[sides[0]] <= 1 or clearance.flat[sides[1]] <= 1:
+        return None
+    apart: Array | None = None
+    for level in np.unique(clearance[clearance > 0])[::-1]:
+        parts, _ = ndimage.label(clearance >= level, np.ones((3, 3)))
+        a, b = parts.flat[sides[0]], parts.flat[sides[1]]
+        if a and b and a == b:
+            break
+        if a and b:
+            apart = np.where(parts == a, 1, np.where(parts == b, 2, 0))
+    else:
+        return None
+    if apart is None:
+        return None
+    saddle = _between(apart, parts == a)
+    return None if saddle is None else _across(owner >= 0, clearance, saddle, low)
+
+
+def _between(apart: Array, way: Array) -> Array | None:
+    """The cell of `way` halfway between parts 1 and 2 on the shortest connection."""
+    steps = [np.where(apart == part, 0, -1) for part in (1, 2)]
+    for distance in steps:
+        reached = distance >= 0
+        for n in range(1, way.size):
+            grown = ndimage.binary_dilation(reached, np.ones((3, 3)), mask=way) & ~reached
+            if not grown.any():
+                break
+            distance[grown] = n
+            reached |= grown
+    total = np.where((steps[0] > 0) & (steps[1] > 0), steps[0] + steps[1], np.iinfo(np.int64).max)
+    if not (total < np.iinfo(np.int64).max).any():
+        return None
+    cells = np.argwhere(total == total.min())
+    return cells[np.abs(steps[0] - steps[1])[tuple(cells.T)].argmin()]
+
+
+def _across(free: Array, clearance: Array, saddle: Array, low: Array) -> tuple[Array, Array, float]:
+    """Middle, direction and width of the passage at `saddle`: from its nearest wall straight to the one opposite."""
+    _, nearest = ndimage.distance_transform_edt(np.pad(free, 1), return_indices=True)
+    wall = nearest[:, saddle[0] + 1, saddle[1] + 1] - 1
+    along = (wall - saddle) / max(float(np.linalg.norm(wall - saddle)), 1e-9)
+    ends = []
+    for sign in (1.0, -1.0):
+        length = 0.0
+        while True:
+            cell = np.rint(saddle + sign * (length + 0.5) * along).astype(int)
+            if (cell < 0).any() or (cell >= free.shape).any() or not free[tuple(cell)]:
+                break
+            length += 0.5
+        ends.append(length)
+    middle = saddle + along * (ends[0] - ends[1]) / 2 + low
+    return middle, along, sum(ends) + (0.0 if sum(ends) else 1.0)

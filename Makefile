@@ -1,0 +1,39 @@
+# `make demo` and `make test` do everything on a fresh machine with Python 3.11 to 3.13.
+PYTHON ?= python3
+BIN := .venv/bin
+export TOPOMERGE_DATA ?= $(wildcard ../shared/data)
+export MPLBACKEND := Agg
+
+.PHONY: setup demo test test-slow lint bench clean
+setup: .venv/ready
+
+.venv/ready: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 13) else "topomerge needs Python 3.11, 3.12 or 3.13, not %s: make PYTHON=python3.12" % sys.version.split()[0])'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,dev]'
+	@touch $@
+
+demo: setup
+	$(BIN)/topomerge simulate --building office --seed 7 --sensors tls -o demo
+	$(BIN)/topomerge extract demo/a.ply -o demo/a.tmap --json demo/a.json --ply demo/a_rooms.ply --figure demo/a.png
+	@echo "The map from above: demo/a.png"
+
+test: setup
+	$(BIN)/python -m pytest -m 'not slow'
+
+test-slow: setup
+	$(BIN)/python -m pytest -m slow
+
+# models/ and datasets/ are installed as topomerge.models and topomerge.datasets: types are checked as installed, outside the checkout.
+lint: setup
+	$(BIN)/ruff check .
+	rm -rf build/lint && $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/lint .
+	cd build/lint && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p topomerge
+
+bench: setup
+	@for b in benchmarks/[a-z]*.py; do case $$b in benchmarks/bench.py) ;; *) $(BIN)/python $$b || exit 1 ;; esac; done
+
+clean:
+	rm -rf build demo dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
