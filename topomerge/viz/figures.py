@@ -128,6 +128,7 @@ def _draw_cells(ax: Axes, plan: StoreyPlan, frame: Frame, colours: Any) -> None:
 
 def _draw_edges(ax: Axes, map: TopometricMap, storey: int, places: dict[int, Place]) -> None:
     """Lines from room to door to room; of stairs the half that lies on this storey, with the room that they lead to."""
+    told: set[int] = set()  # rooms above or below that a label names already
     for edge in map.edges:
         a, b = edge["rooms"].tolist()
         here = [room for room in (a, b) if map.rooms["storey"][room] == storey and room in places]
@@ -141,8 +142,9 @@ def _draw_edges(ax: Axes, map: TopometricMap, storey: int, places: dict[int, Pla
         ax.plot([p[0] for p in path], [p[1] for p in path], zorder=3, solid_capstyle="round", **look)
         marker = {"marker": style["marker"], "markersize": 4.5, "markerfacecolor": PAPER, "markeredgewidth": 1.0}
         ax.plot([x], [y], linestyle="none", color=style["color"], zorder=4, **marker)
-        if len(here) == 1:
-            other = b if here[0] == a else a
+        other = b if here[0] == a else a
+        if len(here) == 1 and other not in told:
+            told.add(other)
             up = map.rooms["storey"][other] > storey
             text = f"{'up' if up else 'down'} to {other}"
             box = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "edgecolor": "none", "alpha": 0.85}
@@ -154,7 +156,7 @@ def _draw_rooms(ax: Axes, named: dict[int, Place], inches: float) -> None:
     """A node with its number at each room; as large as the room lets it be, within what can be read and looks calm."""
     for room, place in sorted(named.items()):
         digits = 0.32 * len(str(room)) + 0.4  # half the width of the node, of a number one point high
-        size = float(np.clip(place.clear * inches * 72 / digits, 5.0, 8.5))
+        size = float(np.clip(place.clear * inches * 72 / digits, 6.0, 8.5))
         shape = "circle,pad=0.25" if room < 10 else "round,pad=0.3,rounding_size=0.8"
         disc = {"boxstyle": shape, "facecolor": PAPER, "edgecolor": INK, "linewidth": 0.8}
         ax.text(place.x, place.y, str(room), fontsize=size, ha="center", va="center", color=INK, zorder=5, bbox=disc)
@@ -192,7 +194,7 @@ def _title(figure: Figure, map: TopometricMap) -> None:
     figure.text(0.5, 1 - 0.3 / high, text, ha="center", va="center", fontsize=13, color=INK, weight="bold")
     kinds = [kind for kind in LINES if kind in set(map.edges["kind"].tolist())]
     handles = [Line2D([], [], label=kind, linewidth=1.2, markersize=5, markerfacecolor=PAPER, **LINES[kind]) for kind in kinds]
-    square = {"linestyle": "none", "marker": "s", "markersize": 8}
+    square: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 8}
     handles += [Line2D([], [], color=WALL, label="wall", **square), Line2D([], [], color=NO_ROOM, label="no room", **square)]
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=8.5,
                   bbox_to_anchor=(0.5, 0.05 / high))  # fmt: skip
