@@ -52,9 +52,7 @@ def _around(x: float, y: float, dx: float, dy: float, z: float, side: float, h: 
 
 def _shelf(w: float, d: float, h: float) -> list[list[float]]:
     boards = [[0, 0, z, w, d, 0.03] for z in np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))]
-    books = [
-        [0, 0.03, z + 0.14, w * 0.8, d * 0.6, 0.25] for z in np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))[:-1:2]
-    ]
+    books = [[0, 0.03, z + 0.14, w * 0.8, d * 0.6, 0.25] for z in np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))[:-1:2]]
     return [
         [0, d / 2 - 0.01, h / 2, w, 0.02, h],
         [-w / 2, 0, h / 2, 0.03, d, h],
@@ -309,12 +307,8 @@ class Floor:
         item, yaw, out = make_item(kind, self.rng), self.bearing(), []
         turned = np.asarray(self.shape.exterior.coords) @ rotation(-yaw)
         low, high = turned.min(axis=0) + 0.7, turned.max(axis=0) - 0.7
-        xs = np.arange(
-            low[0] + item.size[0] / 2, high[0] - item.size[0] / 2 + 1e-6, item.size[0] + self.rng.uniform(0.5, 0.9)
-        )
-        ys = np.arange(
-            low[1] + item.size[1] / 2, high[1] - item.size[1] / 2 + 1e-6, item.size[1] + self.rng.uniform(0.5, 0.9)
-        )
+        xs = np.arange(low[0] + item.size[0] / 2, high[0] - item.size[0] / 2 + 1e-6, item.size[0] + self.rng.uniform(0.5, 0.9))
+        ys = np.arange(low[1] + item.size[1] / 2, high[1] - item.size[1] / 2 + 1e-6, item.size[1] + self.rng.uniform(0.5, 0.9))
         for spot in ((x, y) for y in ys for x in xs):
             at = np.array(spot) @ rotation(yaw)
             outline = _outline(at, yaw, item.size)

@@ -67,9 +67,7 @@ def staircase(flight: Flight, rise: float) -> Staircase:
         raise InputError(f"flight of kind {flight.kind!r}: straight, dogleg, spiral, ramp or lift are possible")
     parts, (vertices, triangles), path, riser, tread = make(flight.width, flight.length, rise)
     if riser > MAX_RISER + 1e-6 or (riser and tread < MIN_TREAD - 1e-6):
-        raise InputError(
-            f"{flight.kind} stair with riser {riser:.3f} m and tread {tread:.3f} m: too steep, lengthen it"
-        )
+        raise InputError(f"{flight.kind} stair with riser {riser:.3f} m and tread {tread:.3f} m: too steep, lengthen it")
     w, length = flight.width, flight.length
     corners = np.array([[0, 0], [w, 0], [w, length], [0, length]], float)
     shape = shapely.Point(w / 2, w / 2).buffer(w / 2, 8) if flight.kind == "spiral" else shapely.Polygon(corners)
@@ -98,18 +96,14 @@ NOTHING = (np.zeros((0, 3)), np.zeros((0, 3), int))
 Parts = tuple[Array, tuple[Array, Array], Array, float, float]
 
 
-def _steps(
-    x: float, width: float, y: float, tread: float, riser: float, count: int, bottom: float, rail: float
-) -> Array:
+def _steps(x: float, width: float, y: float, tread: float, riser: float, count: int, bottom: float, rail: float) -> Array:
     """Boxes of `count` steps that go up along y (down along it for a negative tread), with a rail at `x + rail`."""
     i = np.arange(count)
     top = bottom + (i + 1) * riser
     thick = np.minimum(top, SLAB + riser)
     middle = y + (i + 0.5) * tread
     whole = np.full(count, 1.0)
-    steps = np.stack(
-        [whole * (x + width / 2), middle, top - thick / 2, whole * width, whole * abs(tread), thick], axis=1
-    )
+    steps = np.stack([whole * (x + width / 2), middle, top - thick / 2, whole * width, whole * abs(tread), thick], axis=1)
     rails = np.stack(
         [whole * (x + rail), middle, top + RAIL, whole * 0.05, whole * abs(tread) * 1.05, whole * (riser + 0.05)],
         axis=1,
