@@ -308,7 +308,7 @@ def test_bars_only_when_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
         bars._timer.join()
         report(2.0, "[odd] name")
     report(1.0)  # a late word after the end does no harm
-    assert "read: [odd] name" in sys.stderr.text  # type: ignore[attr-defined]
+    assert "[odd] name" in sys.stderr.text  # type: ignore[attr-defined]
     assert console.Bars(enabled=False).task("read") is None
 
 

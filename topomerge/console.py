@@ -76,8 +76,7 @@ class Bars:
         for title, (fraction, text) in self._state.items():
             if title not in self._rows:
                 self._rows[title] = self._shown.add_task(title, total=1.0)
-            description = f"{title}: {text}" if text else title
-            self._shown.update(self._rows[title], completed=fraction, description=description)
+            self._shown.update(self._rows[title], completed=fraction, description=text or title)
 
 
 def warn(messages: Iterable[str]) -> None:

@@ -25,7 +25,7 @@ LINES: dict[str, dict[str, Any]] = {
     "stairs": {"color": "#a00060", "linestyle": (0, (1, 1.2)), "marker": "^"},
 }
 PAGE = (15.0, 10.0)  # inches: panels are arranged to fill this
-LARGEST = 40.0  # inches along an axis, of a figure that needs more for its room numbers to be read
+LARGEST = 24.0  # inches along an axis, of a figure that needs more for its room numbers to be read
 MARGIN = (0.6, 0.4, 0.3, 0.4)  # inches around a panel's plan: left, bottom, right, top
 TOP, BOTTOM = 0.55, 0.85  # inches for the title, and for the scale bar with the legend
 NARROWEST = 3.0  # inches of a panel, which must hold its caption
@@ -88,7 +88,7 @@ def _arrange(panels: int, frame: Frame, named: list[dict[int, Place]]) -> tuple[
 
     columns = max(range(1, panels + 1), key=lambda c: inches(c, PAGE))
     clear = sorted(place.clear for of_storey in named for place in of_storey.values())
-    wanted = 0.09 / clear[len(clear) // 8] if clear else 0.0  # a number of 6 points in seven of eight rooms
+    wanted = 0.09 / clear[len(clear) // 4] if clear else 0.0  # a number of 6 points in three of four rooms
     fitting = inches(columns, PAGE)
     return columns, max(fitting, min(wanted, inches(columns, (LARGEST, LARGEST))), 1e-6)
 
