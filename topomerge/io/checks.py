@@ -9,6 +9,7 @@ from topomerge.types import Array
 
 LARGE, HIGH = 2000.0, 500.0  # m, extents beyond any building
 SLAB = 0.1  # m
+STOREY = 4.5  # m
 ENOUGH = 200  # points below which nothing is judged
 
 
@@ -33,32 +34,41 @@ class Sample:
         return np.concatenate(self.parts) if self.parts else np.empty((0, 3))
 
 
-def warn_about(points: Array, up: str) -> list[str]:
-    """What looks wrong with a sample of placed points (n, 3) that were read with axis `up` of the file taken as up."""
+def warn_about(points: Array, up: str | None) -> list[str]:
+    """What looks wrong with a sample of placed points (n, 3).
+
+    Args:
+        points: (n, 3), metres, z up.
+        up: the axis of the file that was taken as up; None where the format states its own unit and up axis.
+    """
     if len(points) < ENOUGH:
         return []
     low, high = np.percentile(points, (1, 99), axis=0)
-    return _unit_warning(high - low) or _up_warning(points, low, high, up)
+    if up is None:
+        return _unit_warning(high - low, ())
+    return _unit_warning(high - low, (("mm", 0.001), ("cm", 0.01))) or _up_warning(points, low, high, up)
 
 
-def _unit_warning(extent: Array) -> list[str]:
+def _unit_warning(extent: Array, units: tuple[tuple[str, float], ...]) -> list[str]:
     size = " x ".join(f"{e:.4g}" for e in extent)
+    check = "check --unit and --scale" if units else "check --scale and --resolution"
     across, tall = float(extent[:2].max()), float(extent[2])
     if across > LARGE or tall > HIGH:
-        for unit, factor in (("mm", 0.001), ("cm", 0.01)):
+        for unit, factor in units:
             if 1.5 <= tall * factor <= 400 and 1.5 <= across * factor <= LARGE:
                 name = {"mm": "millimetres", "cm": "centimetres"}[unit]
                 return [f"coordinates look like {name} (extent {size}): give --unit {unit}"]
-        return [f"extent of {size} m is beyond any building: check --unit and --scale"]
+        return [f"extent of {size} m is beyond any building: {check}"]
     if max(across, tall) < 0.5:
-        return [f"extent of {size} m is smaller than any room: check --unit and --scale"]
+        return [f"extent of {size} m is smaller than any room: {check}"]
     return []
 
 
 def _up_warning(points: Array, low: Array, high: Array, up: str) -> list[str]:
     scores = [flatness(points, axis, low, high) for axis in range(3)]
     best = int(np.argmax(scores))
-    if best == 2 or scores[best] < 0.12 or scores[best] < 1.8 * scores[2]:
+    # A corridor seen without floor and ceiling is flat across its walls too, but it is not taller than a storey.
+    if scores[best] < max(0.12, 1.8 * scores[2]) or high[2] - low[2] < STOREY:
         return []
     axis = "xyz"[int(np.abs(turn(up)[best]).argmax())]
     return [

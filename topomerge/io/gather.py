@@ -54,15 +54,15 @@ class Gatherer:
 
     Args:
         source: path of the file, for the clouds and for errors.
-        up: axis of the file that points up.
+        up: axis of the file that points up; None: the format states its own unit and z is up.
         factor: metres per unit of the file.
         chunk: points a cloud.
         warnings: what is already known to be said about the file.
     """
 
-    def __init__(self, source: str, up: str, factor: float, chunk: int, warnings: list[str]) -> None:
+    def __init__(self, source: str, up: str | None, factor: float, chunk: int, warnings: list[str]) -> None:
         self.source, self.up, self.factor, self.chunk = source, up, factor, chunk
-        self.rotation = frame.turn(up)
+        self.rotation = frame.turn(up or "z")
         self.shift: Array | None = None
         self.warnings = list(warnings)
         self.sample = Sample()

@@ -122,7 +122,7 @@ def read_chunks(
         warnings.append(f"{file_format.name} states its own unit and up axis: --unit and --up are not applied")
         unit = up = None
     factor = frame.UNITS[unit or "m"] * scale
-    up = up or file_format.up
+    up = None if file_format.fixed else up or file_format.up
     options = Options(factor, resolution, extrude, ceiling, spacing, doors)
     return _chunks(path, file_format, options, up, chunk, warnings, progress)
 
@@ -191,7 +191,7 @@ def _pieces(path: Path, file_format: Format, options: Options) -> Iterator[Piece
 
 
 def _chunks(
-    path: Path, file_format: Format, options: Options, up: str, chunk: int, warnings: list[str], progress: Progress | None
+    path: Path, file_format: Format, options: Options, up: str | None, chunk: int, warnings: list[str], progress: Progress | None
 ) -> Iterator[PointCloud]:
     gatherer = Gatherer(str(path), up, options.factor, chunk, warnings)
     for piece in _pieces(path, file_format, options):

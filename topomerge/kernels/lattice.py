@@ -61,9 +61,7 @@ def _walk(triangles, spacing, first, points, owner, fill):  # type: ignore[no-un
     return count
 
 
-def points_on_triangles(
-    triangles: NDArray[Any], spacing: float, first: int = 0
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def points_on_triangles(triangles: NDArray[Any], spacing: float, first: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """(n, 3) points on triangles (m, 3, 3) and the (n,) triangle of each; `first` is the number of the first triangle.
 
     The caller bounds the area: n is about the area over spacing².

@@ -1,0 +1,115 @@
+"""E57: several scans with the poses of their scanner, read in blocks by pye57.
+
+The library trusts what it reads and can take the whole process down with it, so every page's checksum is verified first.
+Source: ASTM E2807 (pages of 1024 bytes, the last four of which are their CRC-32C).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io.pcd import pose
+from topomerge.io.piece import BLOCK, Options, Piece, bytes8, damaged
+from topomerge.kernels.codecs import crc32c
+from topomerge.types import Array
+
+PAGES = 1 << 15  # checked at a time
+CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+COLORS = ("colorRed", "colorGreen", "colorBlue")
+INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+
+
+def read(path: Path, options: Options) -> Iterator[Piece]:
+    """Blocks of the points of all scans, in the file's common frame."""
+    del options
+    _check_pages(path)
+    import pye57
+
+    file = pye57.E57(str(path))
+    try:
+        headers = [file.get_header(i) for i in range(file.scan_count)]
+        if not headers:
+            raise InputError(f"{path}: holds no scans, only images or nothing; export it with its points")
+        poses = np.stack([_pose(h) for h in headers])
+        total = max(sum(h.point_count for h in headers), 1)
+        yield Piece(np.empty((0, 3)), poses=poses)
+        done = 0
+        for number, header in enumerate(headers):
+            for xyz, colors, count in _scan(path, file, header):
+                done += count
+                world = xyz @ poses[number, :3, :3].T + poses[number, :3, 3]
+                yield Piece(world, colors, pose_of=np.full(len(world), number, np.int32), done=done / total)
+    finally:
+        file.close()
+
+
+def _pose(header: Any) -> Array:
+    """(4, 4) pose of a scan; without one its points stand in the common frame already."""
+    if not header.has_pose():
+        return np.eye(4)
+    quaternion = np.asarray(header.rotation, np.float64)
+    norm = float(np.linalg.norm(quaternion))
+    return pose(quaternion / norm if norm > 0 else np.array([1.0, 0, 0, 0]), np.asarray(header.translation, np.float64))
+
+
+def _scan(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | None, int]]:
+    """Blocks of one scan: points in the scanner's frame, colours, and how many rows were read."""
+    fields = set(header.point_fields)
+    axes = next((a for a in (CARTESIAN, SPHERICAL) if fields >= set(a)), None)
+    if axes is None:
+        raise InputError(f"{path}: a scan has neither x y z nor range and angles; export it with coordinates")
+    shades = COLORS if fields >= set(COLORS) else ()
+    flags = [f for f in INVALID if f in fields]
+    data, buffers = file.make_buffers([*axes, *shades, *flags], min(BLOCK, max(header.point_count, 1)))
+    reader = header.points.reader(buffers)
+    left = header.point_count
+    try:
+        while left > 0 and (count := int(reader.read())):
+            left -= count
+            rows = {name: np.array(values[:count]) for name, values in data.items()}
+            valid = np.ones(count, bool)
+            for flag in flags:
+                valid &= rows[flag] == 0
+            xyz = np.stack([rows[a] for a in axes], axis=1)[valid]
+            colors = bytes8(np.stack([rows[c] for c in shades], axis=1)[valid]) if shades else None
+            yield (xyz if axes is CARTESIAN else _cartesian(xyz)), colors, count
+    finally:
+        reader.close()
+
+
+def _cartesian(spherical: Array) -> Array:
+    """(n, 3) x, y, z from range, azimuth and elevation (rad)."""
+    distance, azimuth, elevation = spherical.T
+    flat = distance * np.cos(elevation)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+
+
+def _check_pages(path: Path) -> None:
+    """Refuse a file whose header or any page is damaged."""
+    with path.open("rb") as stream:
+        head = stream.read(48)
+        if head[:8] != b"ASTM-E57":
+            raise InputError(f"{path}: is not an E57 file (it does not start with ASTM-E57); check the file's suffix")
+        if len(head) < 48:
+            raise damaged(path, "an E57 file", "its header is cut short")
+        length, xml, xml_length, page = struct.unpack("<QQQQ", head[16:48])
+        size = path.stat().st_size
+        if size < length:
+            raise InputError(f"{path}: holds {size:,} of {length:,} bytes; the file is cut short, copy it again")
+        if page != 1024 or length % page or length == 0 or xml + xml_length > length:
+            raise damaged(path, "an E57 file", "its header contradicts itself")
+        stream.seek(0)
+        for first in range(0, length // page, PAGES):
+            data = stream.read(min(PAGES, length // page - first) * page)
+            pages = np.frombuffer(data, np.uint8).reshape(-1, page)
+            stored = np.ascontiguousarray(pages[:, -4:]).view(">u4")[:, 0]
+            bad = np.flatnonzero(crc32c(pages[:, :-4]) != stored)
+            if len(bad):
+                raise damaged(path, "an E57 file", f"page {first + int(bad[0])} fails its checksum")

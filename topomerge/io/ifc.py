@@ -1,0 +1,180 @@
+"""IFC building models: elements sampled by area, spaces kept as the true rooms.
+
+Door leaves are left out unless asked for: a leaf is modelled shut, and doors are walked through. ifcopenshell brings every
+model into metres with z up.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io.mesh import sample
+from topomerge.io.piece import Options, Piece, damaged
+from topomerge.types import Array, TrueRoom
+
+# What has a shape but is not built, or is cut out of something else.
+NOT_BUILT = ("IfcSpace", "IfcFeatureElement", "IfcSite", "IfcAnnotation", "IfcGrid", "IfcVirtualElement", "IfcSpatialZone")
+END = b"END-ISO-10303-21"
+WELD = 1e-3  # m, corners closer than this are one
+
+
+def read(path: Path, options: Options) -> Iterator[Piece]:
+    """The true rooms, then points on every built element, in the order of their ids."""
+    import ifcopenshell
+
+    _check_ends(path)
+    try:
+        model = ifcopenshell.open(str(path))
+    except ifcopenshell.Error as error:
+        raise damaged(path, "an IFC model", error) from error
+    built = [p for p in model.by_type("IfcProduct") if p.Representation and _is_built(p, options.doors)]
+    if not built:
+        raise InputError(f"{path}: has no building elements with a shape; export it with its geometry")
+    yield Piece(np.empty((0, 3)), rooms=_rooms(model), done=0.05)
+    shapes: dict[int, tuple[Array, Array]] = {}
+    for number, (element, vertices, faces) in enumerate(_shapes(model, built)):
+        shapes[element] = vertices, faces
+        if number % 50 == 0:
+            yield Piece(np.empty((0, 3)), done=0.05 + 0.75 * number / len(built))
+    first = 0
+    for _, (vertices, faces) in sorted(shapes.items()):  # threads hand the elements over in any order
+        yield Piece(vertices, done=0.8)
+        for piece in sample(path, vertices, faces, options, first=first):
+            yield Piece(piece.points, done=0.9)
+        first += len(faces)
+    lost = len(built) - len(shapes)
+    if lost:
+        yield Piece(np.empty((0, 3)), warnings=(f"{lost} of {len(built)} elements have no usable shape",), done=1.0)
+
+
+def _check_ends(path: Path) -> None:
+    """Refuse what is not IFC, or cut short, before the parser sees it."""
+    with path.open("rb") as stream:
+        start = stream.read(4096)
+        stream.seek(max(0, path.stat().st_size - 4096))
+        end = stream.read()
+    if b"ISO-10303-21" not in start:
+        raise InputError(f"{path}: is not an IFC file (no ISO-10303-21 in its first lines); check the file's suffix")
+    if END not in end:
+        raise InputError(f"{path}: has no end ({END.decode()}); the file is cut short, copy it again")
+
+
+def _is_built(product: Any, doors: bool) -> bool:
+    left_out = NOT_BUILT if doors else (*NOT_BUILT, "IfcDoor")
+    return not any(product.is_a(kind) for kind in left_out)
+
+
+def _shapes(model: Any, products: list[Any]) -> Iterator[tuple[int, Array, Array]]:
+    """(id, vertices (n, 3), faces (m, 3)) of products, in metres in the model's frame."""
+    import ifcopenshell.geom
+
+    settings = ifcopenshell.geom.settings()
+    settings.set("use-world-coords", True)
+    threads = min(4, os.cpu_count() or 1)
+    iterator = ifcopenshell.geom.iterator(settings, model, threads, include=products)
+    if not products or not iterator.initialize():
+        return
+    while True:
+        shape = iterator.get()
+        vertices = np.array(shape.geometry.verts, np.float64).reshape(-1, 3)
+        faces = np.array(shape.geometry.faces, np.int64).reshape(-1, 3)
+        if len(faces):
+            yield int(shape.id), vertices, faces
+        if not iterator.next():
+            return
+
+
+def _rooms(model: Any) -> tuple[TrueRoom, ...]:
+    """Every space with a shape, in the order of its storey and name."""
+    spaces = {s.id(): s for s in model.by_type("IfcSpace") if s.Representation}
+    found = []
+    for element, vertices, faces in _shapes(model, list(spaces.values())):
+        floor, ceiling = float(vertices[:, 2].min()), float(vertices[:, 2].max())
+        found.append((spaces[element], outline(vertices, faces), floor, ceiling))
+    storeys = _storeys([(_storey_of(space), floor) for space, _, floor, _ in found])
+    rooms = [
+        TrueRoom(str(space.Name or ""), polygon, floor, ceiling, storey, str(space.LongName or ""))
+        for (space, polygon, floor, ceiling), storey in zip(found, storeys, strict=True)
+        if len(polygon) >= 3
+    ]
+    return tuple(sorted(rooms, key=lambda r: (r.storey, r.name, r.floor, *r.polygon[0])))
+
+
+def _storey_of(space: Any) -> int:
+    """Id of the IfcBuildingStorey that a space belongs to, 0 where it belongs to none."""
+    parent = space
+    while parent is not None and not parent.is_a("IfcBuildingStorey"):
+        parent = next((r.RelatingObject for r in parent.Decomposes), None)
+    return 0 if parent is None else int(parent.id())
+
+
+def _storeys(spaces: list[tuple[int, float]]) -> list[int]:
+    """Number of the storey of each (storey id, floor height), the lowest storey with spaces being 0."""
+    heights: dict[int, list[float]] = {}
+    for storey, floor in spaces:
+        heights.setdefault(storey, []).append(floor)
+    middle = sorted((float(np.median(v)), storey) for storey, v in heights.items())
+    number = {storey: i for i, (_, storey) in enumerate(middle)}
+    return [number[storey] for storey, _ in spaces]
+
+
+def outline(vertices: Array, faces: Array) -> Array:
+    """(k, 2) float64 outline of a body's floor, counter-clockwise, without its holes.
+
+    The floor is made of the flat faces in the lowest quarter; where they enclose nothing, the convex hull stands in.
+    """
+    corners, index = np.unique(np.round(vertices / WELD).astype(np.int64), axis=0, return_inverse=True)
+    points = corners * WELD
+    triangles = index.reshape(-1)[faces]
+    a, b, c = (points[triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    low, high = points[:, 2].min(), points[:, 2].max()
+    flat = np.abs(normals[:, 2]) > 0.7 * np.linalg.norm(normals, axis=1)
+    floor = flat & ((a + b + c)[:, 2] / 3 < low + (high - low) / 4)
+    turned = np.where(normals[floor, 2:] < 0, triangles[floor][:, ::-1], triangles[floor])  # all seen from above
+    loops = [points[loop, :2] for loop in _loops(turned)]
+    best = max(loops, key=area, default=np.empty((0, 2)))
+    return best if area(best) > 0.01 else _hull(points[:, :2])
+
+
+def _loops(triangles: Array) -> list[list[int]]:
+    """Closed chains of the edges that only one of the triangles has."""
+    edges = {(int(t[i]), int(t[(i + 1) % 3])) for t in triangles for i in range(3)}
+    after: dict[int, list[int]] = {}
+    for start, end in sorted(edges):
+        if (end, start) not in edges and start != end:
+            after.setdefault(start, []).append(end)
+    loops = []
+    while after:
+        start = next(iter(after))
+        loop, at = [], start
+        while at in after:
+            loop.append(at)
+            at_next = after[at].pop()
+            if not after[at]:
+                del after[at]
+            at = at_next
+        if at == start:
+            loops.append(loop)
+    return loops
+
+
+def area(polygon: Array) -> float:
+    """Signed area of a polygon (k, 2), m²; positive where it runs counter-clockwise."""
+    x, y = np.asarray(polygon, np.float64).T
+    return 0.5 * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
+
+
+def _hull(points: Array) -> Array:
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return points[ConvexHull(points).vertices]  # counter-clockwise in 2D
+    except (QhullError, ValueError):
+        return np.empty((0, 2))

@@ -1,0 +1,83 @@
+"""OctoMap .bt: a text header, then an octree of two-byte nodes, depth first.
+
+Occupied leaves become points at the centres of their smallest cells, free leaves the cloud's free space.
+Source: Hornung et al., "OctoMap", Autonomous Robots 2013, and the format's own header.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io.piece import BLOCK, Options, Piece, damaged
+from topomerge.kernels.codecs import FREE, LEAF_LEVEL, OCCUPIED, octree_leaves
+from topomerge.types import Array, VoxelGrid
+
+MAGIC = b"# Octomap OcTree binary file"
+CENTRE = 1 << (LEAF_LEVEL - 1)  # the cell whose lower corner is the origin of coordinates
+MOST = 60_000_000  # smallest cells that leaves may be cut into
+
+
+def read(path: Path, options: Options) -> Iterator[Piece]:
+    """Occupied cells as points, free cells as free space."""
+    del options
+    data = path.read_bytes()
+    resolution, body = _split(path, data)
+    leaves = octree_leaves(body)
+    if leaves is None:
+        raise damaged(path, "an OctoMap", f"its tree does not end where the file ends, after {len(data):,} bytes")
+    keys, depths, states = leaves
+    occupied, free = states == OCCUPIED, states == FREE
+    cells = _smallest(keys[occupied], depths[occupied])
+    if cells is None:
+        raise InputError(f"{path}: has more than {MOST:,} occupied cells; store it at a coarser resolution")
+    space = _smallest(keys[free], depths[free])
+    said = () if space is not None else (f"more than {MOST:,} free cells: free space is left out",)
+    grid = None if space is None else _grid(space, resolution)
+    points = (cells - CENTRE + 0.5) * resolution
+    yield Piece(points[:BLOCK], free=grid, warnings=said, done=0.8)
+    for start in range(BLOCK, len(points), BLOCK):
+        yield Piece(points[start : start + BLOCK], done=0.9)
+
+
+def _split(path: Path, data: bytes) -> tuple[float, Array]:
+    """Resolution (m) and the bytes of the nodes."""
+    if not data.startswith(MAGIC):
+        raise InputError(f"{path}: is not a binary OctoMap (.bt); write it with octomap's writeBinary")
+    header = re.match(rb"(?s)(.{0,10000}?\n)data\r?\n", data)
+    if header is None:
+        raise damaged(path, "an OctoMap", "its header has no end")
+    values = dict(line.split(None, 1) for line in header[1].splitlines() if len(line.split(None, 1)) == 2)
+    try:
+        kind, resolution = values[b"id"].strip(), float(values[b"res"])
+    except (KeyError, ValueError) as error:
+        raise damaged(path, "an OctoMap", "its header has no id or no res") from error
+    if kind != b"OcTree":
+        raise InputError(f"{path}: holds a tree of the kind {kind.decode('latin-1')}; only OcTree is read")
+    if not (math.isfinite(resolution) and resolution > 0):
+        raise damaged(path, "an OctoMap", f"res {resolution}")
+    return resolution, np.frombuffer(data, np.uint8, offset=header.end())
+
+
+def _smallest(keys: Array, depths: Array) -> Array | None:
+    """(n, 3) int32 smallest cells of leaves; None where they are too many."""
+    sides = 1 << (LEAF_LEVEL - depths.astype(np.int64))
+    if (sides**3).sum() > MOST:
+        return None
+    parts = []
+    for side in np.unique(sides):
+        offsets = np.indices((side, side, side), np.int32).reshape(3, -1).T
+        parts.append((keys[sides == side][:, None, :] + offsets).reshape(-1, 3))
+    return np.concatenate(parts) if parts else np.empty((0, 3), np.int32)
+
+
+def _grid(cells: Array, resolution: float) -> VoxelGrid | None:
+    if not len(cells):
+        return None
+    low = cells.min(axis=0)
+    return VoxelGrid.from_cells(cells - low, (low - CENTRE) * resolution, resolution)

@@ -1,0 +1,173 @@
+"""PCD, the format of the Point Cloud Library: ascii, binary (mapped) and binary_compressed.
+
+Source: https://pointclouds.org/documentation/tutorials/pcd_file_format.html
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io import text
+from topomerge.io.piece import BLOCK, Options, Piece, cut_short, damaged
+from topomerge.kernels.codecs import lzf_unpack
+from topomerge.types import Array
+
+LONGEST_HEADER = 1 << 16  # bytes
+BEST_PACKING = 100  # LZF can't shrink more than that
+TYPES = {("F", 4), ("F", 8), ("U", 1), ("U", 2), ("U", 4), ("U", 8), ("I", 1), ("I", 2), ("I", 4), ("I", 8)}
+
+
+@dataclass(frozen=True)
+class Header:
+    """What stands before the points."""
+
+    dtype: np.dtype
+    points: int
+    viewpoint: tuple[float, ...]  # x, y, z and the quaternion w, x, y, z of the sensor
+    kind: str
+    start: int
+    lines: int
+
+
+def read(path: Path, options: Options) -> Iterator[Piece]:
+    """Blocks of points; the viewpoint, where it is not the default, is the pose of all."""
+    del options
+    header = _header(path)
+    names = header.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError(f"{path}: has the fields {' '.join(names)} but not x y z; export it with coordinates")
+    blocks = {"ascii": _ascii, "binary": _binary, "binary_compressed": _packed}[header.kind](path, header)
+    pose = _pose(header.viewpoint)
+    done = 0
+    for rows in blocks:
+        done += len(rows)
+        xyz = np.stack([rows[n] for n in "xyz"], axis=1)
+        pose_of = None if pose is None else np.zeros(len(rows), np.int32)
+        yield Piece(xyz, _colors(rows), poses=pose, pose_of=pose_of, done=done / header.points)
+    if done < header.points:
+        raise cut_short(path, done, header.points)
+
+
+def _header(path: Path) -> Header:
+    with path.open("rb") as stream:
+        head = stream.read(LONGEST_HEADER)
+    end = re.search(rb"(?m)^DATA[ \t]+(\w+)[ \t]*\r?\n", head)
+    if end is None or not re.search(rb"(?m)^(#.*PCD|VERSION|FIELDS)", head[: end.start()]):
+        raise InputError(f"{path}: is not a PCD file, or its header is cut short; check the file's suffix or copy it again")
+    lines = head[: end.end()].decode("latin-1").splitlines()
+    words = {w[0]: w[1:] for line in lines if (w := line.split()) and not line.startswith("#")}
+    try:
+        names = words.get("FIELDS") or words["COLUMNS"]
+        sizes, kinds = [int(v) for v in words["SIZE"]], words["TYPE"]
+        counts = [int(v) for v in words.get("COUNT", ["1"] * len(names))]
+        total = int(words["POINTS"][0]) if "POINTS" in words else int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
+        viewpoint = tuple(float(v) for v in words.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"]))
+        dtype = _dtype(names, sizes, kinds, counts)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise damaged(path, "a PCD file", f"header: {error}") from error
+    kind = end[1].decode("latin-1").lower()
+    if kind not in ("ascii", "binary", "binary_compressed") or total < 0 or len(viewpoint) != 7:
+        raise damaged(path, "a PCD file", f"DATA {kind}, {total} points")
+    size = path.stat().st_size - end.end()
+    if total > size and kind != "binary_compressed":  # a point is at least a byte long
+        raise cut_short(path, 0, total)
+    return Header(dtype, total, viewpoint, kind, end.end(), len(lines))
+
+
+def _dtype(names: list[str], sizes: list[int], kinds: list[str], counts: list[int]) -> np.dtype:
+    """Type of a row. Padding fields are all named "_", so names that repeat get a number."""
+    columns = []
+    for i, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
+        if (kind, size) not in TYPES or not 0 < count <= 1 << 16:
+            raise ValueError(f"field {name} of type {kind}{size} x {count}")
+        unique = name if name != "_" and name not in names[:i] else f"{name}{i}"
+        code = f"<{kind.lower()}{size}"
+        columns.append((unique, code) if count == 1 else (unique, code, (count,)))
+    return np.dtype(columns)
+
+
+def _binary(path: Path, header: Header) -> Iterator[Array]:
+    have = max(path.stat().st_size - header.start, 0) // header.dtype.itemsize
+    if have < header.points:
+        raise cut_short(path, have, header.points)
+    if header.points:
+        rows = np.memmap(path, header.dtype, "r", header.start, (header.points,))
+        for first in range(0, header.points, BLOCK):
+            yield np.asarray(rows[first : first + BLOCK])
+
+
+def _packed(path: Path, header: Header) -> Iterator[Array]:
+    with path.open("rb") as stream:
+        stream.seek(header.start)
+        sizes, data = stream.read(8), np.frombuffer(stream.read(), np.uint8)
+    packed, full = int.from_bytes(sizes[:4], "little"), int.from_bytes(sizes[4:], "little")
+    if len(sizes) < 8 or packed > len(data):
+        raise cut_short(path, len(data), packed, "bytes")
+    if full != header.points * header.dtype.itemsize or full > BEST_PACKING * max(packed, 1):
+        raise damaged(path, "a PCD file", f"{full:,} bytes for {header.points:,} points")
+    unpacked = lzf_unpack(data[:packed], full)
+    if unpacked is None:
+        raise damaged(path, "a PCD file", "its compressed data can't be unpacked")
+    rows, at = np.empty(header.points, header.dtype), 0
+    for name in header.dtype.names or ():  # the columns stand one after the other
+        column = header.dtype[name]
+        length = column.itemsize * header.points
+        rows[name] = unpacked[at : at + length].view(column.base).reshape(header.points, *column.shape)
+        at += length
+    for first in range(0, len(rows), BLOCK):
+        yield rows[first : first + BLOCK]
+
+
+def _ascii(path: Path, header: Header) -> Iterator[Array]:
+    names = header.dtype.names or ()
+    wanted = [n for n in names if n in ("x", "y", "z", "rgb", "rgba", "r", "g", "b") and not header.dtype[n].shape]
+    widths = [int(np.prod(header.dtype[n].shape, dtype=int)) for n in names]
+    columns = tuple(sum(widths[: names.index(n)]) for n in wanted)
+    kind = np.dtype([(n, header.dtype[n]) for n in wanted])
+    with path.open(encoding="latin-1") as stream:
+        for values in text.rows(path, stream, columns, skip=header.lines):
+            rows = np.empty(len(values), kind)
+            for i, name in enumerate(wanted):
+                whole = kind[name].kind in "iu"
+                column = values[:, i]
+                rows[name] = np.nan_to_num(column).clip(0, 2**32 - 1).astype(np.int64) if whole and i > 2 else column
+            yield rows
+
+
+def _colors(rows: Array) -> Array | None:
+    """(n, 3) uint8 from three fields, or from one of four bytes b, g, r, a."""
+    names = rows.dtype.names or ()
+    if {"r", "g", "b"} <= set(names):
+        return np.stack([rows[n] for n in "rgb"], axis=1).astype(np.uint8)
+    name = next((n for n in ("rgb", "rgba") if n in names and rows.dtype[n].itemsize == 4), None)
+    if name is None or rows.dtype[name].shape:
+        return None
+    packed = np.ascontiguousarray(rows[name]).view(np.uint32)
+    return np.stack([(packed >> s) & 255 for s in (16, 8, 0)], axis=1).astype(np.uint8)
+
+
+def _pose(viewpoint: tuple[float, ...]) -> Array | None:
+    """(1, 4, 4) pose of the sensor; None for the default, which says nothing."""
+    norm = float(np.linalg.norm(viewpoint[3:]))
+    if viewpoint == (0, 0, 0, 1, 0, 0, 0) or not np.isfinite(viewpoint).all() or norm == 0:
+        return None
+    return pose(np.array(viewpoint[3:]) / norm, np.array(viewpoint[:3]))[None]
+
+
+def pose(quaternion: Array, translation: Array) -> Array:
+    """(4, 4) pose from a unit quaternion w, x, y, z and a translation."""
+    w, x, y, z = quaternion
+    matrix = np.eye(4)
+    matrix[:3, :3] = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    matrix[:3, 3] = translation
+    return matrix

@@ -1,0 +1,123 @@
+"""Compiled parts of file formats: LZF, CRC-32C and the nodes of an OctoMap. They read what may be damaged, so they check
+every index and answer with -1 instead of failing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+LEAF_LEVEL = 16  # depth of the smallest cells of an OctoMap
+UNKNOWN, FREE, OCCUPIED, INNER = 0, 1, 2, 3
+
+
+@njit(cache=True)
+def _unpack(data, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    i, o = 0, 0
+    while i < len(data):
+        control = int(data[i])
+        i += 1
+        if control < 32:  # a run of control + 1 literal bytes
+            n = control + 1
+            if i + n > len(data) or o + n > len(out):
+                return -1
+            for _ in range(n):
+                out[o] = data[i]
+                i += 1
+                o += 1
+            continue
+        n = control >> 5  # a copy of n + 2 bytes from further back
+        if n == 7:
+            if i >= len(data):
+                return -1
+            n += int(data[i])
+            i += 1
+        if i >= len(data):
+            return -1
+        back = o - (((control & 31) << 8) | int(data[i])) - 1
+        i += 1
+        n += 2
+        if back < 0 or o + n > len(out):
+            return -1
+        for _ in range(n):
+            out[o] = out[back]
+            back += 1
+            o += 1
+    return o
+
+
+def lzf_unpack(data: NDArray[np.uint8], size: int) -> NDArray[np.uint8] | None:
+    """The `size` bytes that LZF data unpacks to, or None where it does not (Lehmann, liblzf: the format)."""
+    out = np.empty(size, np.uint8)
+    return out if int(_unpack(data, out)) == size else None
+
+
+def _crc_table() -> NDArray[np.uint32]:
+    table = np.arange(256, dtype=np.uint32)
+    for _ in range(8):
+        table = np.where(table & 1, (table >> 1) ^ np.uint32(0x82F63B78), table >> 1).astype(np.uint32)
+    return table
+
+
+@njit(cache=True)
+def _crc_pages(pages, table, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    for p in range(pages.shape[0]):
+        crc = np.uint32(0xFFFFFFFF)
+        for k in range(pages.shape[1]):
+            crc = np.uint32(table[(crc ^ pages[p, k]) & np.uint32(0xFF)] ^ (crc >> np.uint32(8)))
+        out[p] = crc ^ np.uint32(0xFFFFFFFF)
+
+
+def crc32c(pages: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """(n,) CRC-32C (Castagnoli, RFC 3720) of each row of (n, k) bytes."""
+    out = np.empty(len(pages), np.uint32)
+    _crc_pages(pages, _crc_table(), out)
+    return out
+
+
+@njit(cache=True)
+def _octree(data, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Walk the nodes; returns (leaves, bytes read), leaves -1 where the tree is broken."""
+    found, at = 0, 0
+    top = 1
+    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, 0, 0
+    while top > 0:
+        top -= 1
+        x, y, z, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
+        if at + 2 > len(data) or depth >= LEAF_LEVEL:
+            return -1, at
+        bits = int(data[at]) | (int(data[at + 1]) << 8)
+        at += 2
+        side = 1 << (LEAF_LEVEL - depth - 1)
+        for child in range(7, -1, -1):  # the stack turns the order around
+            state = (bits >> (2 * child)) & 3
+            if state == UNKNOWN:
+                continue
+            cx, cy, cz = x + (child & 1) * side, y + ((child >> 1) & 1) * side, z + ((child >> 2) & 1) * side
+            if state == INNER:
+                stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = cx, cy, cz, depth + 1
+                top += 1
+                continue
+            keys[found, 0], keys[found, 1], keys[found, 2] = cx, cy, cz
+            depths[found] = depth + 1
+            states[found] = state
+            found += 1
+    return found, at
+
+
+def octree_leaves(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
+    """Leaves of an OctoMap's nodes in depth-first order, or None where they are cut short or broken.
+
+    Returns:
+        (n, 3) int32 smallest cell of each leaf in 0..65535, (n,) int8 depth 1..16 and (n,) int8 FREE or OCCUPIED.
+    """
+    pairs = np.stack([(data >> s) & 3 for s in (0, 2, 4, 6)], axis=1)
+    room = int(((pairs == FREE) | (pairs == OCCUPIED)).sum())
+    keys, depths, states = np.empty((room, 3), np.int32), np.empty(room, np.int8), np.empty(room, np.int8)
+    stack = np.empty((8 * LEAF_LEVEL + 8, 4), np.int32)
+    found, read = _octree(data, keys, depths, states, stack)
+    if found < 0 or read != len(data):
+        return None
+    return keys[:found], depths[:found], states[:found]
