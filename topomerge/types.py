@@ -116,6 +116,7 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         _check(self.edge > 0 and np.isfinite(self.edge), f"edge length must be above 0 m, not {self.edge}")
+        _check(np.shape(self.origin) == (3,) and bool(np.isfinite(self.origin).all()), f"origin must be (3,), not {self.origin}")
         _check(self.cells.ndim == 2 and self.cells.shape[1] == 3, f"cells must be (n, 3), not {self.cells.shape}")
         _check(self.cells.dtype == np.int32, f"cells must be int32, not {self.cells.dtype}")
         _check(all(0 < s <= morton.LIMIT for s in self.shape), f"grid shape {self.shape} is outside 1..{morton.LIMIT}")

@@ -71,12 +71,14 @@ class Kernel:
     def runs(self) -> tuple[Array, Array]:
         """Upright runs of equal weight, nearest column first: (m, 4) int64 dx, dy, lowest, highest dz; (m,) weights."""
         offsets, weights = self.stencil
+        if not len(offsets):
+            return np.empty((0, 4), np.int64), weights
         order = np.lexsort(offsets.T[::-1])
         offsets, weights = offsets[order], weights[order]
         follows = (np.diff(offsets, axis=0) == (0, 0, 1)).all(axis=1) & (np.diff(weights) == 0)
-        first = np.flatnonzero(np.concatenate([np.ones(min(len(offsets), 1), bool), ~follows]))
-        last = np.append(first[1:], len(offsets)) - 1
-        runs = np.column_stack([offsets[first], offsets[last, 2]]).reshape(-1, 4)
+        breaks = np.flatnonzero(~follows) + 1
+        first, last = np.append(0, breaks), np.append(breaks, len(offsets)) - 1
+        runs = np.column_stack([offsets[first], offsets[last, 2]])
         near = np.argsort(np.abs(runs[:, :2]).sum(axis=1), kind="stable")
         return np.ascontiguousarray(runs[near]), weights[first][near]
 

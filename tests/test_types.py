@@ -1,0 +1,172 @@
+"""The nouns: VoxelGrid after the seeds' equations (2.2), Sim3, and what their constructors refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from grids import COMPILED, cell_lists, grids, random_grid
+from hypothesis import given
+from hypothesis import strategies as st
+
+from topomerge.kernels import morton
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, PointCloud, Sim3, TopometricMap, VoxelGrid
+
+LENGTH = st.floats(-50, 50)
+SIMS = st.builds(Sim3, st.floats(-10, 10), st.tuples(LENGTH, LENGTH, LENGTH), st.floats(0.2, 5))
+POINTS = np.random.default_rng(0).uniform(-20, 20, (40, 3))
+
+
+@COMPILED
+@given(grids(min_size=1))
+def test_bounds_and_centroids_as_in_the_seeds(grid):
+    low, high = grid.cell_bounds(grid.cells)
+    for v, v_min, v_max, v_c in zip(grid.cells, low, high, grid.centroids(), strict=True):
+        assert np.allclose(v_min, grid.origin + v * grid.edge, atol=1e-12)
+        assert np.allclose(v_max, grid.origin + (v + 1) * grid.edge, atol=1e-12)
+        assert np.allclose(v_c, (v_min + v_max) * 0.5, atol=1e-12)
+    v_lowest, v_highest = grid.bounds
+    assert np.array_equal(v_lowest, grid.origin)
+    assert np.allclose((v_highest - v_lowest) / grid.edge, grid.shape)
+
+
+@COMPILED
+@given(grids(min_size=1), st.integers(0, 99))
+def test_locate_finds_the_cell_that_holds_the_point(grid, seed):
+    inside = grid.origin + (grid.cells + np.random.default_rng(seed).uniform(0.001, 0.999, (len(grid), 3))) * grid.edge
+    assert np.array_equal(grid.locate(inside), grid.cells)
+    assert np.array_equal(grid.locate(grid.centroids()), grid.cells)
+    assert np.array_equal(grid.rows(grid.locate(inside)), np.arange(len(grid)))
+
+
+def test_locate_is_integer_division_from_v_min():
+    grid = VoxelGrid.from_cells(np.array([[0, 0, 0]]), np.array([1.0, -2.0, 0.5]), 0.25, (8, 8, 8))
+    points = np.array([[1.0, -2.0, 0.5], [1.25, -1.76, 0.74], [0.99, -2.01, 9.0]])
+    assert np.array_equal(grid.locate(points), (points - grid.origin) // grid.edge)
+    assert grid.locate(points).tolist() == [[0, 0, 0], [1, 0, 0], [-1, -1, 34]]
+
+
+@COMPILED
+@given(cell_lists())
+def test_from_cells_sorts_keeps_first_mentions_and_is_idempotent(cells):
+    array = np.array(cells, np.int64).reshape(-1, 3)
+    grid = VoxelGrid.from_cells(array, properties={"mention": np.arange(len(array))})
+    assert {tuple(c) for c in grid.cells.tolist()} == set(cells)
+    assert (np.diff(grid.codes.astype(np.int64)) > 0).all()
+    assert grid.properties["mention"].tolist() == [cells.index(tuple(c)) for c in grid.cells.tolist()]
+    again = VoxelGrid.from_cells(grid.cells, grid.origin, grid.edge, grid.shape, grid.properties)
+    assert np.array_equal(again.cells, grid.cells) and again.shape == grid.shape
+    assert np.array_equal(again.properties["mention"], grid.properties["mention"])
+
+
+def test_from_cells_does_not_depend_on_the_order():
+    grid = random_grid()
+    mixed = VoxelGrid.from_cells(np.random.default_rng(1).permutation(grid.cells), shape=grid.shape)
+    assert np.array_equal(mixed.cells, grid.cells) and np.array_equal(mixed.codes, grid.codes)
+
+
+def test_subset_with_cells_and_with_properties():
+    grid = random_grid().with_properties(height=np.arange(len(random_grid())))
+    part = grid.subset(grid.cells[:, 2] > 3)
+    assert part.shape == grid.shape and (part.properties["height"] == grid.rows(part.cells)).all()
+    more = grid.with_properties(twice=grid.properties["height"] * 2)
+    assert set(more.properties) == {"height", "twice"} and set(grid.properties) == {"height"}
+    assert np.array_equal(more.rows(grid.cells), np.arange(len(grid)))
+    other = grid.with_cells(np.array([[5, 5, 5], [1, 1, 1]]))
+    assert other.cells.tolist() == [[1, 1, 1], [5, 5, 5]] and other.shape == grid.shape and not other.properties
+
+
+CELLS = np.array([[0, 0, 0], [1, 0, 0]], np.int32)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"edge": 0.0}, "edge length"),
+        ({"edge": np.nan}, "edge length"),
+        ({"origin": np.zeros(2)}, "origin"),
+        ({"origin": np.array([0, np.inf, 0])}, "origin"),
+        ({"cells": CELLS.astype(np.int64)}, "int32"),
+        ({"cells": CELLS[:, :2]}, r"\(n, 3\)"),
+        ({"cells": CELLS[::-1]}, "Morton order"),
+        ({"cells": CELLS[[0, 0]]}, "unique"),
+        ({"cells": CELLS - 1}, "outside"),
+        ({"shape": (1, 1, 1)}, "outside"),
+        ({"shape": (2, 0, 1)}, "shape"),
+        ({"shape": (morton.LIMIT + 1, 1, 1)}, "shape"),
+        ({"properties": {"count": np.zeros(3)}}, "count"),
+    ],
+)
+def test_grid_refuses(arguments, message):
+    valid = {"cells": CELLS, "origin": np.zeros(3), "edge": 0.1, "shape": (2, 1, 1)}
+    VoxelGrid(**valid)
+    with pytest.raises(ValueError, match=message):
+        VoxelGrid(**{**valid, **arguments})
+
+
+@pytest.mark.parametrize("cells", [[[0, 0, -1]], [[0, 0, 0], [morton.LIMIT, 0, 0]], [[2**32, 0, 0]], [[0.5, 0, 0]]])
+def test_from_cells_refuses(cells):
+    with pytest.raises(ValueError, match="cells"):
+        VoxelGrid.from_cells(np.array(cells))
+
+
+def test_point_cloud_refuses_wrong_lengths():
+    points = np.zeros((4, 3), np.float32)
+    assert len(PointCloud(points)) == 4
+    for wrong in ({"points": points[:, :2]}, {"colors": np.zeros((3, 3), np.uint8)}, {"labels": np.zeros(5, np.int32)}):
+        with pytest.raises(ValueError):
+            PointCloud(**{"points": points, **wrong})
+
+
+def small_map(**changes):
+    grid = VoxelGrid(CELLS, np.zeros(3), 0.1, (2, 1, 1))
+    rooms, storeys = np.zeros(2, ROOM_DTYPE), np.zeros(1, STOREY_DTYPE)
+    edges = np.zeros(1, EDGE_DTYPE)
+    edges["rooms"] = (0, 1)
+    labels = np.array([0, 1], np.int32)
+    parts = {"grid": grid, "room": labels, "navigable": grid, "navigable_room": labels}
+    return TopometricMap(**{**parts, "rooms": rooms, "edges": edges, "storeys": storeys, **changes})
+
+
+def test_map_refuses_what_does_not_fit_together():
+    assert small_map().storey_of_cells().tolist() == [0, 0]
+    loop, astray, high = np.zeros(1, EDGE_DTYPE), np.zeros(1, EDGE_DTYPE), np.zeros(2, ROOM_DTYPE)
+    astray["rooms"], high["storey"] = (0, 7), 3
+    for changes in (
+        {"room": np.array([0], np.int32)},
+        {"room": np.array([0, 2], np.int32)},
+        {"navigable_room": np.array([-2, 0], np.int32)},
+        {"edges": loop},
+        {"edges": astray},
+        {"rooms": high},
+        {"rooms": np.zeros(2)},
+        {"storeys": np.zeros(1)},
+        {"provenance": np.zeros(1, np.uint32)},
+    ):
+        with pytest.raises(ValueError):
+            small_map(**changes)
+
+
+@COMPILED
+@given(SIMS)
+def test_sim3_inverse(sim):
+    assert np.allclose(sim.inverse().apply(sim.apply(POINTS)), POINTS, atol=1e-8)
+    assert np.allclose((sim @ sim.inverse()).matrix, np.eye(4), atol=1e-8)
+    assert np.allclose(sim.inverse().matrix, np.linalg.inv(sim.matrix), atol=1e-7)
+
+
+@COMPILED
+@given(SIMS, SIMS, SIMS)
+def test_sim3_composition(a, b, c):
+    assert np.allclose((a @ b).apply(POINTS), a.apply(b.apply(POINTS)), atol=1e-7)
+    assert np.allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-7)
+    assert np.allclose(((a @ b) @ c).matrix, (a @ (b @ c)).matrix, atol=1e-6)
+    assert -np.pi <= (a @ b).yaw < np.pi
+
+
+def test_sim3_keeps_gravity_and_refuses():
+    turned = Sim3(np.pi / 2, (1.0, 2.0, 3.0), 2.0)
+    assert np.allclose(turned.apply([[1, 0, 0], [0, 0, 1]]), [[1, 4, 3], [1, 2, 5]])
+    assert Sim3().matrix.tolist() == np.eye(4).tolist()
+    for wrong in ({"scale": 0.0}, {"scale": -1.0}, {"yaw": np.nan}, {"translation": (0.0, np.inf, 0.0)}):
+        with pytest.raises(ValueError, match="similarity"):
+            Sim3(**wrong)
