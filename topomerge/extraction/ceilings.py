@@ -1,7 +1,7 @@
 """Keeping ceilings out of the navigable volume (the thesis' worst fault: findings.md, "Why the thesis fails").
 
-Seen from inside, a ceiling is a sheet with nothing above it: its upper side passes the stick kernel, and it is larger than the floor,
-which furniture interrupts.
+Seen from inside, a ceiling is a sheet with nothing above it: its upper side passes the stick kernel, and it is larger than the
+floor, which furniture interrupts.
 """
 
 from __future__ import annotations
@@ -9,23 +9,24 @@ from __future__ import annotations
 import numpy as np
 
 from topomerge.extraction.components import connected_components
-from topomerge.extraction.convolution import Kernel, any_at, moore
+from topomerge.extraction.convolution import Kernel, any_at, count_at, moore
 from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.kernels.columns import first_occupied
-from topomerge.types import VoxelGrid
+from topomerge.types import Array, VoxelGrid
 
 HEADROOM = 1.2  # m: empty space under a ceiling, above furniture
 STOREY = 8.0  # m: how far above a floor something may be, and how far below a ceiling its floor
 THICKNESS = 0.3  # m: a noisy sheet is this thick
+SOLID = 0.8  # share of the cells below the top of a wall that are occupied
 WALLED = 0.25  # share of a floor's boundary beside which walls rise
 
 
 def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
-    """The standing cells less those on the upper side of a ceiling.
+    """The standing cells less those on the upper side of a ceiling or of a wall.
 
-    A part of the standing cells with nothing above it is a ceiling if below most of it is empty space and then something. The floor
-    of an upper storey whose own ceiling was not scanned looks so, too; but walls rise along its boundary, and along a ceiling's they
-    end.
+    A part of the standing cells with nothing above it is a ceiling if below most of it is empty space and then something. The
+    floor of an upper storey whose own ceiling was not scanned looks so, too; but walls rise along its boundary, and along a
+    ceiling's they end.
     """
     cells = standing.cells.astype(np.int64)
     thick = max(int(np.ceil(THICKNESS / grid.edge)), 1)
@@ -42,7 +43,14 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
     with_wall = np.bincount(component[boundary], walled, minlength=count)
     hollow_share = np.bincount(component[bare], hollow[bare], minlength=count) / np.bincount(component[bare], minlength=count)
     ceiling = (hollow_share > 0.5) & (with_wall < WALLED * np.maximum(on_boundary, 1))
-    return standing.subset(~(bare & ceiling[component]))
+    return standing.subset(~(bare & (ceiling[component] | _on_a_wall(grid, cells))))
+
+
+def _on_a_wall(grid: VoxelGrid, cells: Array) -> Array:
+    """(m,) bool: is nearly everything filled for a metre below?"""
+    depth = -np.arange(1, max(int(1.0 / grid.edge), 1) + 1)
+    below = Kernel.from_offsets(depth[:, None] * (0, 0, 1))
+    return count_at(grid, cells, below) >= SOLID * len(depth)
 
 
 def _beside_and_above(edge: float) -> Kernel:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from scipy import sparse
@@ -68,14 +70,11 @@ def cluster_views(similarity: sparse.csr_array, inflations: Sequence[float] = IN
     """Clusters at the inflation of highest modularity, and that inflation; the smaller one of equals."""
     if not similarity.shape[0]:
         return np.zeros(0, np.int64), float(inflations[0])
-    best: tuple[float, Array, float] | None = None
-    for inflation in inflations:
-        cluster = markov_clusters(similarity, inflation)
-        quality = modularity(similarity, cluster)
-        if best is None or quality > best[0] + 1e-9:
-            best = (quality, cluster, float(inflation))
-    assert best is not None
-    return best[1], best[2]
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # the compiled step lets go of the interpreter
+        clusters = list(pool.map(lambda inflation: markov_clusters(similarity, inflation), inflations))
+    quality = np.round([modularity(similarity, cluster) for cluster in clusters], 9)
+    best = int(np.argmax(quality))
+    return clusters[best], float(inflations[best])
 
 
 def _by_first(labels: Array) -> Array:

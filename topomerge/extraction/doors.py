@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import edt
 import numpy as np
 from scipy import ndimage
@@ -11,6 +13,7 @@ from topomerge.extraction.convolution import sphere
 from topomerge.types import EDGE_DTYPE, Array, VoxelGrid
 
 DOOR_WIDTH = 1.6  # m: what is wider is an opening
+SAME_DOOR = 0.8  # m: passages between the same rooms that are this close are one
 SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
 NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
 
@@ -42,20 +45,29 @@ def find_edges(
     a, b = np.concatenate(first), np.concatenate(second)
     swap = room[a] > room[b]
     a[swap], b[swap] = b[swap], a[swap]
-    edges: list[tuple[object, ...]] = []
+    edges: list[tuple[Any, ...]] = []
     for pair in np.unique(np.column_stack([room[a], room[b]]), axis=0):
         here = (room[a] == pair[0]) & (room[b] == pair[1])
         rows = np.unique(np.concatenate([a[here], b[here]]))
         meeting = navigable.subset(rows)
         contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))
-        for c in range(int(contact.max()) + 1):
-            edges.append(_edge(navigable, room, rows[contact == c], storey_of_room, floor_to_ceiling, body))
+        places = [_edge(navigable, room, rows[contact == c], storey_of_room, floor_to_ceiling, body) for c in range(contact.max() + 1)]
+        edges += _apart(places)
     return np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
+
+
+def _apart(edges: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    """The edges of one pair of rooms, without those that lead through the same door: the widest is kept."""
+    kept: list[tuple[Any, ...]] = []
+    for edge in sorted(edges, key=lambda e: (-e[2], e[1])):
+        if all(np.linalg.norm(np.subtract(edge[1], other[1])) > max(SAME_DOOR, other[2] / 2) for other in kept):
+            kept.append(edge)
+    return sorted(kept)
 
 
 def _edge(
     navigable: VoxelGrid, room: Array, rows: Array, storey_of_room: Array, floor_to_ceiling: Array, body: float
-) -> tuple[object, ...]:
+) -> tuple[Any, ...]:
     """One row of EDGE_DTYPE from the cells (`rows`) of two rooms that touch."""
     pair = np.unique(room[rows])
     cells = navigable.cells[rows]
@@ -112,6 +124,8 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
     sides = []
     for p in pair:
         mine = owner == p
+        if not mine.any():
+            return None
         away_enough = mine & (away >= min(0.6 * reach, away[mine].max()))
         sides.append(np.argmax(np.where(away_enough, clearance, -1.0)))
     if clearance.flat[sides[0]] <= 1 or clearance.flat[sides[1]] <= 1:

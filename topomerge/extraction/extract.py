@@ -18,10 +18,12 @@ from topomerge.extraction.dilation import dilate_upwards
 from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.extraction.floors import floor_components, largest_component
 from topomerge.extraction.gaps import bridge_gaps
+from topomerge.extraction.necks import merge_across_wide_necks
 from topomerge.extraction.propagation import propagate_labels
 from topomerge.extraction.rooms import split_rooms
 from topomerge.extraction.similarity import jaccard_similarity
-from topomerge.extraction.topology import topometric_map
+from topomerge.extraction.storeys import find_storeys
+from topomerge.extraction.topology import floor_to_ceiling, topometric_map
 from topomerge.extraction.unobstructed import unobstructed
 from topomerge.extraction.views import best_of_tiles, local_maxima, raise_views
 from topomerge.extraction.visibility import visible_cells
@@ -55,6 +57,8 @@ class Preset:
     propagation_rounds: int = 10
     least_volume: float = 0.128  # of a room's occupied cells, m3
     absorb: bool = True  # give smaller pieces to the room they touch
+    neck: float = 0.75  # rooms are merged where their connection has this share of the narrower one's width; 0: never
+    opening: float = 1.8  # or where it is wider than this and has no lintel
 
 
 PRESETS = {
@@ -69,6 +73,7 @@ PRESETS = {
         view_clearance=0.0,
         tolerance=0.0,
         absorb=False,
+        neck=0.0,
     ),
 }
 
@@ -114,6 +119,7 @@ def extract(
         labels = vote(visibility, cluster)
         labels = propagate_labels(grid, labels, sphere(p.propagation_radius, grid.edge), p.propagation_rounds)
         room = split_rooms(grid, labels, p.least_volume, p.absorb)
+        room = merge_rooms(grid, room, navigable, p)
     with clock("topology", 0.95):
         result = topometric_map(grid, room, navigable, p.body_width, p.stem_height + p.body_height)
     parameters = {**asdict(p), "voxel_size": grid.edge, "preset": preset if isinstance(preset, str) else "custom"}
@@ -142,10 +148,9 @@ def navigable_volume(grid: VoxelGrid, p: Preset) -> VoxelGrid:
     dilated = dilate_upwards(standing, p.dilation)
     navigable = largest_component(dilated) if p.largest_only else floor_components(dilated)
     if not len(navigable):
-        width = p.body_width
         raise InputError(
-            f"no floor found: nowhere is an area of 1 m2 with {p.stem_height + p.body_height:g} m of space above it and {width:g} m "
-            "around; check --up and --unit, or take larger voxels if the points are sparse"
+            f"no floor found: nowhere is an area of 1 m2 with {p.stem_height + p.body_height:g} m of empty space above it; check "
+            "--up and --unit, or take larger voxels if the points are sparse"
         )
     return navigable
 
@@ -158,6 +163,15 @@ def optimal_views(grid: VoxelGrid, navigable: VoxelGrid, p: Preset) -> Array:
     else:
         rows = local_maxima(navigable, distance, p.view_radius)
     return raise_views(grid, navigable.cells[rows], p.view_height, p.view_clearance or None)
+
+
+def merge_rooms(grid: VoxelGrid, room: Array, navigable: VoxelGrid, p: Preset) -> Array:
+    """Rooms that no door parts are one: not in the thesis."""
+    if not p.neck:
+        return room
+    above = floor_to_ceiling(grid, navigable, p.stem_height + p.body_height)
+    _, storey = find_storeys(navigable, above)
+    return merge_across_wide_necks(grid, room, navigable, storey, above, p.body_width, p.neck, p.opening)
 
 
 def stick_kernel(grid: VoxelGrid, p: Preset) -> Kernel:

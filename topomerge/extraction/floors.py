@@ -26,9 +26,9 @@ def largest_component(grid: VoxelGrid) -> VoxelGrid:
 def floor_components(grid: VoxelGrid) -> VoxelGrid:
     """The connected components that are floors.
 
-    Beyond the thesis, which keeps the largest: a partial map may hold rooms whose connection was not seen, and ten rooms apart are
-    ten rooms. Left out are wall tops (too narrow), scraps (too small) and the tops of furniture (a small area a step above a
-    larger one).
+    Beyond the thesis, which keeps the largest: a partial map may hold rooms whose connection was not seen, and ten rooms apart
+    are ten rooms. Left out are wall tops (too narrow), scraps (too small) and the tops of furniture (a small area a step above
+    a larger one).
     """
     if not len(grid):
         return grid

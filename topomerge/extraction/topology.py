@@ -27,7 +27,7 @@ def topometric_map(grid: VoxelGrid, room: Array, navigable: VoxelGrid, body: flo
         body_height: height (m) of that body: whatever is lower than this above the floor is no ceiling.
     """
     label = navigable_rooms(grid, room, navigable)
-    above = _floor_to_ceiling(grid, navigable, body_height)
+    above = floor_to_ceiling(grid, navigable, body_height)
     storeys, storey = find_storeys(navigable, above)
     used = np.bincount(label[label >= 0], minlength=int(room.max(initial=-1)) + 1) > 0
     number = np.append(np.where(used, np.cumsum(used) - 1, -1), -1).astype(np.int32)
@@ -37,7 +37,7 @@ def topometric_map(grid: VoxelGrid, room: Array, navigable: VoxelGrid, body: flo
     return TopometricMap(grid, room, navigable, label, rooms, edges, storeys)
 
 
-def _floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> Array:
+def floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> Array:
     """(m,) m of empty space between each navigable cell and the first occupied one above it; 0 where there is none."""
     start = max(int(body_height / grid.edge), 1)
     limit = int(HIGHEST_CEILING / grid.edge)

@@ -1,14 +1,12 @@
-"""One step of the Markov cluster algorithm on a sparse column-stochastic matrix, columns in parallel."""
+"""One step of the Markov cluster algorithm on a sparse column-stochastic matrix."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
-
-CHUNKS = 16
+from numba import njit
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def step(indptr, indices, values, inflation, threshold, most):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Expansion (M @ M), inflation, pruning below `threshold` and to the `most` largest entries; also the largest "chaos" of a
     column (its maximum minus its sum of squares: 0 once the column is settled). Columns in CSC form."""
@@ -16,54 +14,53 @@ def step(indptr, indices, values, inflation, threshold, most):  # type: ignore[n
     counts = np.zeros(n, np.int64)
     rows = np.zeros((n, most), np.int32)
     cells = np.zeros((n, most))
-    chaos = np.zeros(CHUNKS)
-    for c in prange(CHUNKS):
-        total = np.zeros(n)
-        touched = np.empty(n, np.int32)
-        for j in range(n * c // CHUNKS, n * (c + 1) // CHUNKS):
-            m = 0
-            for a in range(indptr[j], indptr[j + 1]):
-                k, w = indices[a], values[a]
-                for b in range(indptr[k], indptr[k + 1]):
-                    i = indices[b]
-                    if total[i] == 0.0:
-                        touched[m] = i
-                        m += 1
-                    total[i] += w * values[b]
-            mass, highest, kept = 0.0, 0.0, 0
-            for t in range(m):
-                mass += total[touched[t]] ** inflation
-            cut = threshold
-            for t in range(m):
-                i = touched[t]
-                total[i] = total[i] ** inflation / mass
-                highest = max(highest, total[i])
-                kept += total[i] >= threshold
-            if kept > most:
-                ordered = np.sort(total[touched[:m]])
-                cut = max(threshold, ordered[m - most])
-            cut = min(cut, highest)  # a column never loses its largest entry
-            mass, kept = 0.0, 0
-            found = np.sort(touched[:m])
-            for t in range(m):
-                i = found[t]
-                if total[i] >= cut and kept < most:
-                    rows[j, kept], cells[j, kept] = i, total[i]
-                    mass += total[i]
-                    kept += 1
-                total[i] = 0.0
-            squares, top = 0.0, 0.0
-            for t in range(kept):
-                cells[j, t] /= mass
-                squares += cells[j, t] ** 2
-                top = max(top, cells[j, t])
-            chaos[c] = max(chaos[c], top - squares)
-            counts[j] = kept
+    chaos = 0.0
+    total = np.zeros(n)
+    touched = np.empty(n, np.int32)
+    for j in range(n):
+        m = 0
+        for a in range(indptr[j], indptr[j + 1]):
+            k, w = indices[a], values[a]
+            for b in range(indptr[k], indptr[k + 1]):
+                i = indices[b]
+                if total[i] == 0.0:
+                    touched[m] = i
+                    m += 1
+                total[i] += w * values[b]
+        mass, highest, kept = 0.0, 0.0, 0
+        for t in range(m):
+            mass += total[touched[t]] ** inflation
+        cut = threshold
+        for t in range(m):
+            i = touched[t]
+            total[i] = total[i] ** inflation / mass
+            highest = max(highest, total[i])
+            kept += total[i] >= threshold
+        if kept > most:
+            ordered = np.sort(total[touched[:m]])
+            cut = max(threshold, ordered[m - most])
+        cut = min(cut, highest)  # a column never loses its largest entry
+        mass, kept = 0.0, 0
+        found = np.sort(touched[:m])
+        for t in range(m):
+            i = found[t]
+            if total[i] >= cut and kept < most:
+                rows[j, kept], cells[j, kept] = i, total[i]
+                mass += total[i]
+                kept += 1
+            total[i] = 0.0
+        squares, top = 0.0, 0.0
+        for t in range(kept):
+            cells[j, t] /= mass
+            squares += cells[j, t] ** 2
+            top = max(top, cells[j, t])
+        chaos = max(chaos, top - squares)
+        counts[j] = kept
     out = np.zeros(n + 1, np.int64)
     for j in range(n):
         out[j + 1] = out[j] + counts[j]
     new_indices, new_values = np.empty(out[n], np.int32), np.empty(out[n])
-    for j in prange(n):
+    for j in range(n):
         for t in range(counts[j]):
             new_indices[out[j] + t], new_values[out[j] + t] = rows[j, t], cells[j, t]
-    return out, new_indices, new_values, chaos.max()
+    return out, new_indices, new_values, chaos

@@ -1,7 +1,8 @@
 """Rays from views to cell centroids through a voxel grid, with jumps over empty space.
 
-The digital differential analyser of Amanatides and Woo (1987) visits every cell that a ray enters. Where the nearest occupied cell is
-k cells away (Chebyshev distance), the next k - 1 cells along the ray's main axis are empty whatever the direction: they are jumped.
+The digital differential analyser of Amanatides and Woo (1987) visits every cell that a ray enters. Where the nearest occupied
+cell is k cells away (Chebyshev distance), the next k - 1 cells along the ray's main axis are empty whatever the direction: they
+are jumped.
 """
 
 from __future__ import annotations
