@@ -17,7 +17,7 @@ from topomerge.datasets.draft import Draft, point
 from topomerge.datasets.erect import erect
 from topomerge.datasets.layouts import SHAPES, Core, Layout, Row, Size, draw, make_layout
 from topomerge.datasets.plan import Flight, Plan
-from topomerge.datasets.stairs import length_for
+from topomerge.datasets.stairs import length_for, width_for
 
 from topomerge.errors import InputError
 
@@ -168,8 +168,7 @@ def _add_cores(
     wanted += [(kind, "") for kind in profile.cores]
     for kind, flight in wanted:
         width, depth = _core_size(kind, flight, height, wall, rng)
-        fits = [i for i, r in enumerate(layout.rows) if r.outer or (depth and depth <= min(r.ends)) or kind == "toilets"]
-        for i in sorted(fits, key=lambda i: -_longest(layout.rows[i]) * rng.uniform(0.6, 1.0)):
+        for i in sorted(range(len(layout.rows)), key=lambda i: -_longest(layout.rows[i]) * rng.uniform(0.6, 1.0)):
             row = layout.rows[i]
             a, b = max(row.gaps(), key=lambda g: g[1] - g[0], default=(0.0, 0.0))
             if b - a < width + 0.1:
@@ -177,6 +176,8 @@ def _add_cores(
             spare = b - a - width
             start = a + (0.0 if spare < 4 else float(rng.choice([0.0, spare, max(3.0, min(spare - 3, spare * rng.random()))])))
             core = Core(kind, start, width, depth or float(min(row.ends)), flight)
+            if any(o.intersection(row.outline(start, start + width, core.depth)).area > 1e-3 for o in layout.taken(i)):
+                continue
             layout.rows[i] = replace(row, cores=tuple(sorted([*row.cores, core], key=lambda c: c.start)))
             break
 
@@ -189,7 +190,8 @@ def _core_size(kind: str, flight: str, height: float, wall: float, rng: np.rando
     """Width along the row and depth, m; depth 0: that of the row."""
     if kind == "stairs":
         behind = LANDING if flight == "straight" else 0.02
-        return (2.9 if flight in ("spiral", "ramp") else 2.75) + wall, LANDING + length_for(flight, height) + behind + wall
+        lane = LANDING if flight == "straight" else 0.05  # beside the flight, to walk back on
+        return width_for(flight, height) + lane + wall, LANDING + length_for(flight, height) + behind + wall
     width = round(float(rng.uniform(*WIDTHS[kind])), 2)
     return width, {"lift": 2.4, "hall": round(float(rng.uniform(12, 18)), 2), "atrium": 9.0}.get(kind, 0.0)
 
@@ -265,11 +267,10 @@ def _top(kind: str) -> float:
 
 def _flight(row: Row, core: Core, wall: float, height: float) -> Flight:
     edge = wall / 2 + 0.02
-    wide = {"straight": 1.3, "spiral": 2.6, "lift": 1.0}.get(core.flight, core.width - 2 * edge)
     front = 0.6 if core.flight == "lift" else LANDING + wall / 2
     corner = point(row.place([[core.start + edge, front]])[0])
     length = 1.0 if core.flight == "lift" else length_for(core.flight, height)
-    return Flight(core.flight, corner, row.heading + np.pi / 2, wide, length)
+    return Flight(core.flight, corner, row.heading + np.pi / 2, width_for(core.flight, height), length)
 
 
 def _fill(
@@ -336,7 +337,7 @@ def _ensuite(draft: Draft, row: Row, span: Range, kind: str, corridor: int) -> l
     """A bath beside the entrance; every second room is mirrored, so that baths lie back to back."""
     a, b = span
     mirrored = len(draft.rooms) % 4 >= 2
-    wide, deep = 2.0, 2.2
+    wide, deep = min(2.0, b - a - 1.8), 2.2
     box = row.outline(b - wide, b, deep) if mirrored else row.outline(a, a + wide, deep)
     bath = draft.room(box, "bath")
     room = draft.room(row.outline(a, b).difference(box), kind)

@@ -33,6 +33,7 @@ class Draft:
 
     def room(self, outline: shapely.Polygon, kind: str, ceiling: float = 0.0) -> int:
         """Add a room; returns its index."""
+        outline = snap(outline)
         inner = np.asarray(shapely.orient_polygons(outline.buffer(-self.wall / 2, join_style="mitre")).exterior.coords)[:-1]
         self.outlines.append(outline)
         self.rooms.append(PlanRoom(f"{kind} {len(self.rooms)}", np.round(inner, 3), kind, ceiling))
@@ -104,6 +105,11 @@ class Draft:
     def plan(self, height: float, ceiling: float) -> Plan:
         """The finished plan."""
         return Plan(tuple(self.rooms), tuple(self.walls), tuple(self.openings), tuple(self.flights), None, height, ceiling)
+
+
+def snap(outline: shapely.Geometry) -> shapely.Geometry:
+    """Rounded to a millimetre, so that walls in common are the same numbers."""
+    return shapely.set_precision(outline, 1e-3)
 
 
 def point(p: Array) -> Point:

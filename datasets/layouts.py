@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
-from topomerge.datasets.draft import Draft
+from topomerge.datasets.draft import Draft, snap
 from topomerge.datasets.solids import rotation
 
 from topomerge.types import Array
@@ -42,7 +42,6 @@ class Row:
     Args:
         ends: depth at its start and end; they differ where the outer wall is slanted.
         corridor: index of the corridor that it opens to.
-        outer: its back is an outer wall, so that cores may reach out of it.
     """
 
     start: tuple[float, float]
@@ -50,7 +49,6 @@ class Row:
     length: float
     ends: tuple[float, float]
     corridor: int
-    outer: bool = True
     cores: tuple[Core, ...] = ()
 
     def place(self, points: Array) -> Array:
@@ -81,6 +79,12 @@ class Layout:
     rows: list[Row] = field(default_factory=list)
     ends: list[shapely.Polygon] = field(default_factory=list)  # lounges at a corridor's end, of corridor 0
 
+    def taken(self, row: int) -> list[shapely.Polygon]:
+        """Everything that a core which reaches out of a row must not meet."""
+        rows = [r.outline(0, r.length) for i, r in enumerate(self.rows) if i != row]
+        cores = [r.outline(c.start, c.start + c.width, c.depth) for r in self.rows for c in r.cores]
+        return [*self.corridors, *self.ends, *rows, *cores]
+
 
 @dataclass(frozen=True)
 class Size:
@@ -104,6 +108,7 @@ def make_layout(shape: str, size: Size, rng: np.random.Generator) -> Layout:
         length = max(length, (2 if shape == "U" else 3) * (span + 5.0) - 5.0)
         step = (length - span) / (1 if shape == "U" else 2)
         wings = [d + i * step for i in range(2 if shape == "U" else 3)]
+    wings, length = [round(x, 2) for x in wings], round(length, 2)
     layout = Layout([shapely.box(0, 0, length, w)])
     slant = float(rng.uniform(1.2, 1.5)) if size.curved and rng.random() < 0.5 else 1.0
     layout.rows.append(Row((length, 0.0), np.pi, length, (size.near * slant, size.near), 0))
@@ -112,7 +117,7 @@ def make_layout(shape: str, size: Size, rng: np.random.Generator) -> Layout:
         for a, b in zip(stops[::2], stops[1::2], strict=True):
             layout.rows.append(Row((a, w), 0.0, b - a, (d, d), 0))
     for x in wings:
-        _wing(layout, x, w, d, float(rng.uniform(0.5, 0.8)) * size.length)
+        _wing(layout, x, w, d, round(float(rng.uniform(0.5, 0.8)) * size.length, 2))
     if size.curved and slant == 1.0:
         round_end = shapely.Point(length, w / 2).buffer(rng.uniform(3.0, 4.5), 6)
         layout.ends.append(round_end.intersection(shapely.box(length, -9, length + 9, w + 9)))
@@ -131,8 +136,8 @@ def _wing(layout: Layout, x: float, w: float, d: float, length: float) -> None:
 def _ring(size: Size, rng: np.random.Generator) -> Layout:
     """A corridor around a core of two rows, in two halves that doors part; rooms on its outside."""
     w, d = size.corridor, size.near
-    deep = float(rng.uniform(4.0, 5.0))
-    long, wide = max(size.length - 2 * d, 16.0), 2 * w + 2 * deep
+    deep = round(float(rng.uniform(4.0, 5.0)), 2)
+    long, wide = round(max(size.length - 2 * d, 16.0), 2), round(2 * w + 2 * deep, 2)
     low = shapely.box(0, 0, long - w, w).union(shapely.box(0, 0, w, wide))
     high = shapely.box(w, wide - w, long, wide).union(shapely.box(long - w, 0, long, wide))
     layout = Layout([low, high], [(0, 1)])
@@ -141,8 +146,8 @@ def _ring(size: Size, rng: np.random.Generator) -> Layout:
         Row((w, wide), 0.0, long - w, (d, d), 1),
         Row((0.0, 0.0), np.pi / 2, wide, (size.far, size.far), 0),
         Row((long, wide), -np.pi / 2, wide, (size.far, size.far), 1),
-        Row((w, w), 0.0, long - 2 * w, (deep, deep), 0, outer=False),
-        Row((long - w, wide - w), np.pi, long - 2 * w, (deep, deep), 1, outer=False),
+        Row((w, w), 0.0, long - 2 * w, (deep, deep), 0),
+        Row((long - w, wide - w), np.pi, long - 2 * w, (deep, deep), 1),
     ]
     return layout
 
@@ -153,7 +158,7 @@ def draw(layout: Layout, draft: Draft, kind: str = "corridor", merge: bool = Fal
     Args:
         merge: make one room of corridors that meet, instead of parting them by doors.
     """
-    outlines = list(layout.corridors)
+    outlines = [snap(c) for c in layout.corridors]
     owner = list(range(len(outlines)))
     if merge:
         for a, b in layout.joints:
@@ -169,7 +174,7 @@ def draw(layout: Layout, draft: Draft, kind: str = "corridor", merge: bool = Fal
                 draft.cut(piece, min(width, piece.length - 0.45), "door", 0.5)
     for end in layout.ends:
         lounge = draft.room(end, "lobby")
-        draft.door(rooms[owner[0]], lounge, 1.2, at=0.5)
+        draft.door(rooms[owner[0]], lounge, min(1.2, _width(outlines[0]) - 0.55), at=0.5)
     return [rooms[o] for o in owner]
 
 

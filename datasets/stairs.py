@@ -53,7 +53,13 @@ def length_for(kind: str, rise: float) -> float:
     """m of floor that a flight needs along its heading, landings at its ends not counted."""
     n = risers(rise)
     lengths = {"straight": (n - 1) * TREAD, "dogleg": (n // 2 - 1) * TREAD + LANDING, "ramp": rise / 0.2 + LANDING}
-    return lengths.get(kind, 2.6)
+    return lengths.get(kind, width_for(kind, rise))
+
+
+def width_for(kind: str, rise: float) -> float:
+    """m across that a flight needs; a spiral's treads must be deep enough along its walking line."""
+    spiral = max(2.6, np.ceil((risers(rise) - 1) * 0.265 / TURN * 3 / 2 * 2 * 20) / 20)
+    return {"straight": 1.3, "spiral": float(spiral), "lift": 1.0}.get(kind, 2.5)
 
 
 def staircase(flight: Flight, rise: float) -> Staircase:
