@@ -1,0 +1,278 @@
+"""Scanning a building: a sensor is carried along a walk, its rays are cast, and each point keeps its true room."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+from topomerge.datasets.building import SURFACES, Building
+from topomerge.datasets.sensors import Sensor, get_sensor
+from topomerge.datasets.walk import Walk, draw_floors, plan_walk
+
+from topomerge.errors import InputError
+from topomerge.types import Array, PointCloud, Sim3, TrueRoom
+
+LABEL_CELL = 0.05  # m
+OVERLAP = 1.4  # rays for each point that is kept
+CHUNK = 2_000_000  # rays at a time
+PLAIN = [SURFACES.index(s) for s in ("wall", "floor", "ceiling", "facade")]
+
+
+def scan(
+    building: Building,
+    sensor: Sensor | str = "tls",
+    rooms: Sequence[int] | Array | None = None,
+    seed: int | np.random.Generator = 0,
+    spacing: float | None = None,
+    budget: int | None = None,
+    frame: Sim3 | None = None,
+) -> PointCloud:
+    """A partial map of a building.
+
+    Args:
+        sensor: one of `sensors.SENSORS` or its name.
+        rooms: rooms to visit; None: all but the lifts. Doors and windows show parts of others, too.
+        seed: of the walk, the noise and the drift.
+        spacing: m between points (one point a cube of that size); None: the sensor's. It sets the number of rays.
+        budget: number of rays, where it shall not follow from the spacing.
+        frame: the cloud is given in this frame (it maps the building's coordinates into the cloud's); None: the building's own.
+
+    Returns:
+        points with `labels` (index into `rooms`, which are all rooms of the building, in the cloud's frame), estimated `poses`, `pose_of`.
+
+    Raises:
+        InputError: unknown sensor or room, a spacing that is not positive, a room that cannot be reached.
+    """
+    kind, rng = get_sensor(sensor), np.random.default_rng(seed)
+    if spacing is not None and not 0.005 <= spacing <= 1.0:
+        raise InputError(f"spacing must be 0.005 to 1 m, not {spacing}")
+    spacing = spacing or kind.spacing
+    visited = [i for i, r in enumerate(building.rooms) if r.kind != "lift"] if rooms is None else [int(r) for r in rooms]
+    walk = plan_walk(building, visited, rng)
+    poses, along = _poses(walk, kind, visited, rng)
+    number = budget or (720 * len(poses) if kind.beams == 1 else _rays_for(building, visited, spacing))
+    hits = _cast(building, kind, poses, max(number // len(poses), 8), rng)
+    hits = _degrade(building, poses, hits, kind, rng)
+    labels = _rooms_of(building, poses, hits)
+    estimated = _drift(poses, walk, along, kind, rng)
+    seen = hits.rays * hits.ranges[:, None]
+    points = np.einsum("nij,nj->ni", estimated[hits.pose, :3, :3], seen) + estimated[hits.pose, :3, 3]
+    kept = _thin(points, spacing) if not budget else np.arange(len(points))
+    frame = frame or Sim3()
+    placed = estimated.copy()
+    placed[:, :3, 3] = frame.apply(estimated[:, :3, 3])
+    placed[:, :3, :3] = Sim3(frame.yaw).matrix[:3, :3] @ estimated[:, :3, :3]
+    return PointCloud(
+        frame.apply(points[kept]).astype(np.float32),
+        labels=labels[kept],
+        poses=placed,
+        pose_of=hits.pose[kept].astype(np.int32),
+        rooms=tuple(_moved(r, frame) for r in building.rooms),
+        source=f"{building.name}:{kind.name}",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What rays met: pose, direction in the sensor's frame, range, triangle, |cosine| of incidence; and its place in the image."""
+
+    pose: Array
+    rays: Array
+    ranges: Array
+    triangle: Array
+    cosine: Array
+
+
+def _moved(room: TrueRoom, frame: Sim3) -> TrueRoom:
+    corners = frame.apply(np.column_stack([room.polygon, np.full(len(room.polygon), room.floor)]))
+    top = frame.scale * room.ceiling + frame.translation[2]
+    return replace(room, polygon=corners[:, :2], floor=float(corners[0, 2]), ceiling=float(top))
+
+
+def _rays_for(building: Building, visited: Sequence[int], spacing: float) -> int:
+    """Rays that cover floor, ceiling and walls of the rooms at a spacing."""
+    surface = 0.0
+    for room in (building.rooms[i] for i in visited):
+        x, y = room.polygon.T
+        area = abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
+        around = float(np.hypot(*(np.roll(room.polygon, -1, axis=0) - room.polygon).T).sum())
+        surface += 2 * area + around * (room.ceiling - room.floor)
+    return int(OVERLAP * surface / spacing**2)
+
+
+def _poses(walk: Walk, sensor: Sensor, visited: Sequence[int], rng: np.random.Generator) -> tuple[Array, Array]:
+    """(K, 4, 4) true poses of the sensor, in the order of the walk, and metres walked to each; only in the rooms asked for."""
+    along = walk.along
+    at = list(walk.stops) * sensor.turns
+    turn = [k * 2 * np.pi / sensor.turns for k in range(sensor.turns) for _ in walk.stops]
+    turn = [t + o for t, o in zip(turn, np.tile(rng.uniform(0, 2 * np.pi, len(walk.stops)), sensor.turns), strict=True)]
+    heading = _heading(walk.points)
+    if sensor.step:
+        marks = np.searchsorted(along, np.arange(0, along[-1], sensor.step))
+        marks = marks[walk.free[marks] & (np.isin(walk.room[marks], list(visited)) | (walk.room[marks] < 0))]
+        at += marks.tolist()
+        sway = np.radians(sensor.swing) * 2 * np.sin(np.arange(len(marks)) * 0.9 + rng.uniform(0, 6))
+        turn += (heading[marks] + sway).tolist()
+    order = np.argsort(along[at], kind="stable")
+    index, yaw = np.array(at)[order], np.array(turn)[order]
+    count = len(index)
+    pitch = -np.radians(sensor.pitch + sensor.swing * np.sin(np.arange(count) * 2.4 + rng.uniform(0, 6)))
+    pitch = pitch if sensor.beams != 1 else np.zeros(count)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    c, s, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    poses[:, :3, :3] = np.moveaxis(np.array([[c * cp, -s, c * sp], [s * cp, c, s * sp], [-sp, 0 * s, cp]]), 2, 0)
+    poses[:, :3, 3] = walk.points[index] + [0, 0, sensor.height]
+    if sensor.step and sensor.beams != 1:
+        poses[:, 2, 3] += rng.normal(0, 0.03, count)
+    return poses, along[index]
+
+
+def _heading(points: Array) -> Array:
+    """rad, the way the walk goes at each point, looking 0.5 m ahead."""
+    ahead = np.roll(points, -5, axis=0)[:, :2] - points[:, :2]
+    ahead[-5:] = ahead[-6] if len(points) > 5 else (1.0, 0.0)
+    return np.arctan2(ahead[:, 1], ahead[:, 0])
+
+
+def _scene(vertices: Array, triangles: Array) -> Any:
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(o3d.core.Tensor(np.ascontiguousarray(vertices)), o3d.core.Tensor(triangles.astype(np.uint32)))
+    return scene
+
+
+def _cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np.random.Generator) -> Hits:
+    """Cast the rays of all poses; mixed pixels are made here, while the rays still stand in images."""
+    rays, (rows, columns) = sensor.rays(number)
+    reach = sensor.reach[1]
+    low, high = poses[:, 2, 3].min() - reach, poses[:, 2, 3].max() + reach
+    z = building.vertices[building.triangles, 2]
+    near = np.flatnonzero((z.max(axis=1) > low) & (z.min(axis=1) < high))
+    scene, clear = _scene(building.vertices, building.triangles[near]), None
+    glass = building.labels[near] == SURFACES.index("glass")
+    out = []
+    step = max(CHUNK // len(rays), 1)
+    for first in range(0, len(poses), step):
+        these = poses[first : first + step]
+        spun = rays
+        if sensor.azimuth == 360:  # the raster of a spinning sensor starts anywhere
+            turn = rng.uniform(0, 2 * np.pi / columns)
+            spun = rays @ Sim3(turn).matrix[:3, :3].T
+        world = np.einsum("kij,nj->kni", these[:, :3, :3], spun)
+        origin = np.broadcast_to(these[:, None, :3, 3], world.shape)
+        packed = np.concatenate([origin, world], axis=2).astype(np.float32).reshape(-1, 6)
+        ranges, triangle, cosine = _shoot(scene, packed)
+        through = (triangle >= 0) & glass[triangle] & (rng.random(len(triangle)) >= sensor.glass)
+        if through.any():
+            clear = clear or _scene(building.vertices, building.triangles[near[~glass]])
+            beyond = _shoot(clear, packed[through])
+            ranges[through], cosine[through] = beyond[0], beyond[2]
+            triangle[through] = np.where(beyond[1] >= 0, np.flatnonzero(~glass)[beyond[1]], -1)
+        image = ranges.reshape(-1, rows, columns)
+        ranges = _mix(image, sensor.mixed, rng).ravel()
+        kept = np.flatnonzero((triangle >= 0) & (ranges > sensor.reach[0]) & (ranges < reach))
+        pose = first + kept // len(rays)
+        out.append((pose, spun[kept % len(rays)], ranges[kept], near[triangle[kept]], cosine[kept]))
+    return Hits(*(np.concatenate(column) for column in zip(*out, strict=True)))
+
+
+def _shoot(scene: Any, rays: Array) -> tuple[Array, Array, Array]:
+    """Range, triangle (-1: none) and |cosine| of incidence of rays (n, 6)."""
+    answer = scene.cast_rays(rays_tensor(rays), nthreads=1)
+    ranges = answer["t_hit"].numpy()
+    triangle = answer["primitive_ids"].numpy().astype(np.int64)
+    triangle[~np.isfinite(ranges)] = -1
+    cosine = np.abs(np.einsum("ni,ni->n", answer["primitive_normals"].numpy(), rays[:, 3:]))
+    return ranges, triangle, cosine
+
+
+def rays_tensor(rays: Array) -> Any:
+    """Rays as the tensor that Open3D casts."""
+    import open3d as o3d
+
+    return o3d.core.Tensor(rays)
+
+
+def _mix(image: Array, share: float, rng: np.random.Generator) -> Array:
+    """Ranges between the two surfaces at some of the depth edges along a row."""
+    out = image.copy()
+    if image.shape[2] < 2 or not share:
+        return out
+    finite = np.where(np.isfinite(image), image, 1e6)
+    step = finite[:, :, 1:] - finite[:, :, :-1]
+    edge = (np.abs(step) > 0.15) & (np.abs(step) < 1e5)
+    where = np.nonzero(edge)
+    chosen = rng.random(len(where[0])) < share
+    k, i, j = (w[chosen] for w in where)
+    out[k, i, j] += step[k, i, j] * rng.beta(0.5, 0.5, len(k)) * 0.9
+    return out
+
+
+def _degrade(building: Building, poses: Array, hits: Hits, sensor: Sensor, rng: np.random.Generator) -> Hits:
+    """Lose what returns badly, and add noise to the ranges."""
+    count = len(hits.ranges)
+    thing = building.thing_of[hits.triangle]
+    faint = rng.random(len(building.things) + 1) < sensor.dark
+    chance = np.full(count, 1 - sensor.lost)
+    chance[faint[thing] & (thing >= 0)] *= 0.15
+    chance[hits.cosine < np.sin(np.radians(sensor.grazing))] *= 0.1
+    chance[np.isin(building.labels[hits.triangle], PLAIN)] *= sensor.plain
+    kept = rng.random(count) < chance
+    if sensor.lowest > 0:
+        above = np.einsum("nj,nj->n", poses[hits.pose, 2, :3], hits.rays) * hits.ranges + sensor.height
+        kept &= above > sensor.lowest
+    sigma = sensor.noise[0] + sensor.noise[1] * hits.ranges + sensor.quadratic * hits.ranges**2
+    ranges = np.clip(hits.ranges + rng.normal(size=count) * sigma, 0.01, sensor.reach[1])
+    hits = replace(hits, ranges=ranges)
+    return Hits(*(getattr(hits, name)[kept] for name in ("pose", "rays", "ranges", "triangle", "cosine")))
+
+
+def _rooms_of(building: Building, poses: Array, hits: Hits) -> Array:
+    """(n,) int32 true room of each point: the room on the sensor's side of the surface; -1: outdoors."""
+    floors = draw_floors(building, LABEL_CELL)
+    near = [ndimage.distance_transform_edt(r < 0, return_distances=True, return_indices=True) for r in floors.room]
+    filled = np.stack([np.where(d * LABEL_CELL < 0.3, r[i[0], i[1]], -1) for r, (d, i) in zip(floors.room, near, strict=True)])
+    local = hits.rays * (hits.ranges - 0.08)[:, None]
+    points = np.einsum("nij,nj->ni", poses[hits.pose, :3, :3], local) + poses[hits.pose, :3, 3]
+    storey = np.clip(np.searchsorted(building.storeys["floor"], points[:, 2] + 0.02, side="right") - 1, 0, None)
+    ij = floors.cells(points)
+    return filled[storey, ij[:, 0], ij[:, 1]].astype(np.int32)
+
+
+def _drift(poses: Array, walk: Walk, along: Array, sensor: Sensor, rng: np.random.Generator) -> Array:
+    """The poses as the sensor's own odometry has them: the heading wanders, and the way bends with it; gravity is a little off."""
+    out = poses.copy()
+    if sensor.drift:
+        total = walk.along[-1]
+        knots = np.arange(0, total + 30.0, 15.0)
+        error = np.interp(walk.along, knots, np.radians(sensor.drift) * rng.normal(size=len(knots)))
+        climb = np.interp(walk.along, knots, 0.002 * sensor.drift * rng.normal(size=len(knots)))
+        step = np.diff(walk.points, axis=0)
+        c, s = np.cos(error[1:]), np.sin(error[1:])
+        flat = np.hypot(step[:, 0], step[:, 1])
+        bent = np.stack([c * step[:, 0] - s * step[:, 1], s * step[:, 0] + c * step[:, 1], step[:, 2] + climb[1:] * flat], axis=1)
+        moved = np.concatenate([[walk.points[0]], walk.points[0] + np.cumsum(bent, axis=0)]) - walk.points
+        at = np.searchsorted(walk.along, along)
+        for k, i in enumerate(np.clip(at, 0, len(moved) - 1)):
+            out[k, :3, :3] = Sim3(float(error[i])).matrix[:3, :3] @ poses[k, :3, :3]
+            out[k, :3, 3] = poses[k, :3, 3] + moved[i]
+    if sensor.tilt:
+        a, b = np.radians(sensor.tilt) * rng.normal(size=2)
+        lean = np.array([[1, 0, b], [0, 1, -a], [-b, a, 1]])
+        lean = np.linalg.qr(lean)[0] * np.sign(np.diag(np.linalg.qr(lean)[1]))
+        centre = out[:, :3, 3].mean(axis=0)
+        out[:, :3, 3] = (out[:, :3, 3] - centre) @ lean.T + centre
+        out[:, :3, :3] = lean @ out[:, :3, :3]
+    return out
+
+
+def _thin(points: Array, spacing: float) -> Array:
+    """Rows of one point a cube."""
+    cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
+    size = cells.max(axis=0) + 1
+    key = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    return np.sort(np.unique(key, return_index=True)[1])

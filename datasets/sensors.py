@@ -1,0 +1,112 @@
+"""The sensors: what each sees, how often, how well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.types import Array
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A range sensor and the way it is carried. Angles are in degrees, lengths in metres.
+
+    Args:
+        reach: nearest and farthest range.
+        azimuth: horizontal field of view; 360 spins.
+        elevation: lowest and highest ray.
+        beams: rays above one another; 0: as many as make square pixels.
+        height: above the floor; carried sensors sway by 5 cm.
+        step: metres between poses; 0: only where the surveyor stops.
+        turns: poses at a stop, spread over a full turn.
+        pitch: of the sensor; mobile cameras swing by `swing` about it, and to both sides.
+        spacing: the distance between points that is aimed at.
+        noise: standard deviation of a range at 0 m, and what each metre (laser) adds.
+        quadratic: what each m2 of range adds (triangulating cameras).
+        grazing: rays that meet a surface at less than this angle mostly do not return.
+        dark: share of the things that hardly return anything.
+        lost: share of all rays that return nothing.
+        glass: share of the rays that a pane returns; the others go through.
+        mixed: share of the rays at depth edges that return a range between.
+        drift: degrees by which the heading goes astray (standard deviation), over about 15 m.
+        tilt: degrees by which gravity is misjudged.
+        plain: share of the points on floors, ceilings and walls that are kept (cameras need texture).
+        lowest: points lower than this above the floor are missing.
+        metric: the scale of its maps is known.
+    """
+
+    name: str
+    reach: tuple[float, float]
+    azimuth: float
+    elevation: tuple[float, float]
+    beams: int = 0
+    height: float = 1.6
+    step: float = 0.0
+    turns: int = 1
+    pitch: float = 0.0
+    swing: float = 0.0
+    spacing: float = 0.04
+    noise: tuple[float, float] = (0.002, 0.0001)
+    quadratic: float = 0.0
+    grazing: float = 5.0
+    dark: float = 0.03
+    lost: float = 0.005
+    glass: float = 0.1
+    mixed: float = 0.3
+    drift: float = 0.0
+    tilt: float = 0.0
+    plain: float = 1.0
+    lowest: float = -1.0
+    metric: bool = True
+
+    def rays(self, number: int) -> tuple[Array, tuple[int, int]]:
+        """About `number` directions (rows * columns, 3), x ahead, z up, as an image; and its rows and columns."""
+        low, high = np.radians(self.elevation)
+        wide = np.radians(self.azimuth)
+        rows = self.beams or max(round(float(np.sqrt(number * (high - low) / wide))), 2)
+        columns = max(number // rows, 8)
+        up = np.linspace(high, low, rows) if rows > 1 else np.zeros(1)
+        round_about = (np.arange(columns) + 0.5) / columns * wide - wide / 2
+        a, e = np.meshgrid(round_about, up)
+        rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
+        return rays.reshape(-1, 3), (rows, columns)
+
+
+SENSORS = {
+    s.name: s
+    for s in (
+        Sensor("tls", (0.4, 40), 360, (-62, 88), height=1.7, grazing=3.0),
+        Sensor(
+            "lidar", (0.5, 30), 360, (-45, 45), 32, height=1.4, step=0.4, swing=12, spacing=0.05, noise=(0.012, 0.0004), drift=0.3, tilt=0.2
+        ),
+        Sensor(
+            "depth", (0.4, 5.0), 72, (-28, 28), height=1.45, step=0.35, turns=10, pitch=-4, swing=24, spacing=0.05, noise=(0.003, 0.0),
+            quadratic=0.0025, grazing=12, dark=0.08, lost=0.03, glass=0.02, drift=0.5, tilt=0.4, mixed=0.5,
+        ),
+        Sensor(
+            "mono", (0.6, 8.0), 80, (-30, 30), height=1.5, step=0.5, turns=8, pitch=-4, swing=20, spacing=0.12, noise=(0.01, 0.005),
+            quadratic=0.004, grazing=10, dark=0.1, lost=0.2, glass=0.2, drift=0.8, tilt=0.6, mixed=0.6, plain=0.3, metric=False,
+        ),
+        Sensor("laser2d", (0.1, 20), 270, (0, 0), 1, height=0.3, step=0.25, turns=4, spacing=0.03, noise=(0.01, 0.0005), drift=0.3),
+        Sensor(
+            "tablet", (0.3, 5.0), 62, (-24, 24), height=1.4, step=0.4, turns=10, pitch=24, swing=16, spacing=0.05, noise=(0.006, 0.001),
+            quadratic=0.001, grazing=10, dark=0.05, lost=0.02, glass=0.05, drift=0.5, tilt=0.3, mixed=0.5, lowest=1.0,
+        ),
+    )
+}  # fmt: skip
+
+
+def get_sensor(sensor: Sensor | str) -> Sensor:
+    """The sensor of that name, or the given one.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    if isinstance(sensor, Sensor):
+        return sensor
+    if sensor not in SENSORS:
+        raise InputError(f"sensor {sensor!r}: {', '.join(SENSORS)} are possible")
+    return SENSORS[sensor]
