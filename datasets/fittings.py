@@ -42,7 +42,7 @@ def fit(
         if space.room < 0:
             continue
         _slope(soup, space)
-        taken = _keep_clear(space, doors, stairs)
+        taken = keep_clear(space.room, doors, stairs)
         taken += _columns(soup, things, space, plans[space.storey], taken, difficulty, rng)
         _overhead(soup, things, space, difficulty, rng)
         if difficulty.furniture > 0 or difficulty.clutter > 0:
@@ -118,14 +118,14 @@ def _slope(soup: Soup, space: Space) -> None:
     soup.add(vertices, np.arange(len(vertices)).reshape(-1, 3)[:, ::-1], "ceiling")
 
 
-def _keep_clear(space: Space, doors: Array, stairs: Array) -> list[shapely.Polygon]:
+def keep_clear(room: int, doors: Array, stairs: Array) -> list[shapely.Polygon]:
     """Where nothing may stand: before doors, and on stairs and their landings."""
     out = []
-    for door in doors[(doors["rooms"] == space.room).any(axis=1)]:
+    for door in doors[(doors["rooms"] == room).any(axis=1)]:
         half = np.array([door["thickness"] / 2 + max(door["width"], 0.95) + 0.1, door["width"] / 2 + 0.1])
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
         out.append(shapely.Polygon(corners @ rotation(door["direction"]) + door["centre"][:2]))
-    for stair in stairs[(stairs["rooms"] == space.room).any(axis=1)]:
+    for stair in stairs[(stairs["rooms"] == room).any(axis=1)]:
         out.append(shapely.Polygon(stair["footprint"]).buffer(1.0, join_style="mitre"))
     return out
 

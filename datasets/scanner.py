@@ -56,20 +56,20 @@ def scan(
     number = budget or (720 * len(poses) if kind.beams == 1 else _rays_for(building, visited, spacing))
     hits = _cast(building, kind, poses, max(number // len(poses), 8), rng)
     hits = _degrade(building, poses, hits, kind, rng)
-    labels = _rooms_of(building, poses, hits)
     estimated = _drift(poses, walk, along, kind, rng)
-    seen = hits.rays * hits.ranges[:, None]
-    points = np.einsum("nij,nj->ni", estimated[hits.pose, :3, :3], seen) + estimated[hits.pose, :3, 3]
-    kept = _thin(points, spacing) if not budget else np.arange(len(points))
+    points = _placed(estimated, hits, hits.ranges)
+    if not budget:
+        kept = _thin(points, spacing)
+        points, hits = points[kept], hits.take(kept)
     frame = frame or Sim3()
     placed = estimated.copy()
     placed[:, :3, 3] = frame.apply(estimated[:, :3, 3])
     placed[:, :3, :3] = Sim3(frame.yaw).matrix[:3, :3] @ estimated[:, :3, :3]
     return PointCloud(
-        frame.apply(points[kept]).astype(np.float32),
-        labels=labels[kept],
+        frame.apply(points).astype(np.float32),
+        labels=_rooms_of(building, poses, hits),
         poses=placed,
-        pose_of=hits.pose[kept].astype(np.int32),
+        pose_of=hits.pose.astype(np.int32),
         rooms=tuple(_moved(r, frame) for r in building.rooms),
         source=f"{building.name}:{kind.name}",
     )
@@ -77,13 +77,36 @@ def scan(
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays met: pose, direction in the sensor's frame, range, triangle, |cosine| of incidence; and its place in the image."""
+    """What rays met, row by row.
+
+    Args:
+        pose: (n,) int64 from where.
+        rays: (n, 3) float32 directions in the sensor's frame.
+        ranges: (n,) float32, m.
+        triangle: (n,) int64, of the building.
+        cosine: (n,) float32, |cosine| of the angle of incidence.
+    """
 
     pose: Array
     rays: Array
     ranges: Array
     triangle: Array
     cosine: Array
+
+    def take(self, rows: Array) -> Hits:
+        """Some of the rows."""
+        return Hits(self.pose[rows], self.rays[rows], self.ranges[rows], self.triangle[rows], self.cosine[rows])
+
+
+def _placed(poses: Array, hits: Hits, ranges: Array) -> Array:
+    """(n, 3) float64 points at the given ranges; hits stand in the order of their poses."""
+    points = np.empty((len(ranges), 3))
+    stops = np.searchsorted(hits.pose, np.arange(len(poses) + 1))
+    seen = hits.rays * ranges[:, None].astype(np.float32)
+    for k, pose in enumerate(poses):
+        rows = slice(stops[k], stops[k + 1])
+        points[rows] = seen[rows] @ pose[:3, :3].T + pose[:3, 3]
+    return points
 
 
 def _moved(room: TrueRoom, frame: Sim3) -> TrueRoom:
@@ -148,6 +171,7 @@ def _scene(vertices: Array, triangles: Array) -> Any:
 def _cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np.random.Generator) -> Hits:
     """Cast the rays of all poses; mixed pixels are made here, while the rays still stand in images."""
     rays, (rows, columns) = sensor.rays(number)
+    rays = rays.astype(np.float32)
     reach = sensor.reach[1]
     low, high = poses[:, 2, 3].min() - reach, poses[:, 2, 3].max() + reach
     z = building.vertices[building.triangles, 2]
@@ -161,10 +185,11 @@ def _cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np
         spun = rays
         if sensor.azimuth == 360:  # the raster of a spinning sensor starts anywhere
             turn = rng.uniform(0, 2 * np.pi / columns)
-            spun = rays @ Sim3(turn).matrix[:3, :3].T
-        world = np.einsum("kij,nj->kni", these[:, :3, :3], spun)
-        origin = np.broadcast_to(these[:, None, :3, 3], world.shape)
-        packed = np.concatenate([origin, world], axis=2).astype(np.float32).reshape(-1, 6)
+            spun = rays @ Sim3(turn).matrix[:3, :3].T.astype(np.float32)
+        packed = np.empty((len(these), len(rays), 6), np.float32)
+        packed[..., :3] = these[:, None, :3, 3]
+        packed[..., 3:] = np.matmul(spun, these[:, :3, :3].astype(np.float32).transpose(0, 2, 1))
+        packed = packed.reshape(-1, 6)
         ranges, triangle, cosine = _shoot(scene, packed)
         through = (triangle >= 0) & glass[triangle] & (rng.random(len(triangle)) >= sensor.glass)
         if through.any():
@@ -223,12 +248,10 @@ def _degrade(building: Building, poses: Array, hits: Hits, sensor: Sensor, rng: 
     chance[np.isin(building.labels[hits.triangle], PLAIN)] *= sensor.plain
     kept = rng.random(count) < chance
     if sensor.lowest > 0:
-        above = np.einsum("nj,nj->n", poses[hits.pose, 2, :3], hits.rays) * hits.ranges + sensor.height
-        kept &= above > sensor.lowest
+        kept &= _placed(poses, hits, hits.ranges)[:, 2] - poses[hits.pose, 2, 3] + sensor.height > sensor.lowest
     sigma = sensor.noise[0] + sensor.noise[1] * hits.ranges + sensor.quadratic * hits.ranges**2
     ranges = np.clip(hits.ranges + rng.normal(size=count) * sigma, 0.01, sensor.reach[1])
-    hits = replace(hits, ranges=ranges)
-    return Hits(*(getattr(hits, name)[kept] for name in ("pose", "rays", "ranges", "triangle", "cosine")))
+    return replace(hits, ranges=ranges.astype(np.float32)).take(kept)
 
 
 def _rooms_of(building: Building, poses: Array, hits: Hits) -> Array:
@@ -236,8 +259,7 @@ def _rooms_of(building: Building, poses: Array, hits: Hits) -> Array:
     floors = draw_floors(building, LABEL_CELL)
     near = [ndimage.distance_transform_edt(r < 0, return_distances=True, return_indices=True) for r in floors.room]
     filled = np.stack([np.where(d * LABEL_CELL < 0.3, r[i[0], i[1]], -1) for r, (d, i) in zip(floors.room, near, strict=True)])
-    local = hits.rays * (hits.ranges - 0.08)[:, None]
-    points = np.einsum("nij,nj->ni", poses[hits.pose, :3, :3], local) + poses[hits.pose, :3, 3]
+    points = _placed(poses, hits, hits.ranges - 0.08)
     storey = np.clip(np.searchsorted(building.storeys["floor"], points[:, 2] + 0.02, side="right") - 1, 0, None)
     ij = floors.cells(points)
     return filled[storey, ij[:, 0], ij[:, 1]].astype(np.int32)

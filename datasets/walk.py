@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from PIL import Image, ImageDraw
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
@@ -72,14 +71,31 @@ def draw_floors(building: Building, cell: float) -> Floors:
     corners = np.concatenate([r.polygon for r in building.rooms])
     origin = corners.min(axis=0) - 1.0
     columns, rows = np.ceil((corners.max(axis=0) + 1.0 - origin) / cell).astype(int)
-    images = [Image.new("I", (int(columns), int(rows)), 0) for _ in building.storeys]
-    brushes = [ImageDraw.Draw(image) for image in images]
+    rooms = np.full((len(building.storeys), int(rows), int(columns)), -1, np.int32)
     for i, room in enumerate(building.rooms):
-        outline = [tuple(p) for p in ((room.polygon - origin) / cell - 0.5)]
         for k, floor in enumerate(building.storeys["floor"]):
             if k >= room.storey and floor < room.ceiling - 1.5:
-                brushes[k].polygon(outline, fill=i + 1)
-    return Floors(np.stack([np.asarray(image, np.int32) for image in images]) - 1, origin, cell)
+                fill(rooms[k], (room.polygon - origin) / cell, i)
+    return Floors(rooms, origin, cell)
+
+
+def fill(raster: Array, polygon: Array, value: int) -> None:
+    """Set the cells of a raster whose centres lie in a polygon, given in cells: (k, 2) column and row."""
+    low = np.clip(np.floor(polygon.min(axis=0)).astype(int), 0, None)
+    high = np.clip(np.ceil(polygon.max(axis=0)).astype(int), 0, raster.shape[::-1])
+    if (high <= low).any():
+        return
+    a, b = polygon, np.roll(polygon, -1, axis=0)
+    y = (np.arange(low[1], high[1]) + 0.5)[:, None]
+    crossed = (a[:, 1] <= y) != (b[:, 1] <= y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = a[:, 0] + (y - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
+    row, edge = np.nonzero(crossed)
+    column = np.clip(np.ceil(x[row, edge] - 0.5).astype(int) - low[0], 0, high[0] - low[0])
+    flips = np.zeros((high[1] - low[1], high[0] - low[0] + 1), np.int32)
+    np.add.at(flips, (row, column), 1)
+    inside = np.cumsum(flips, axis=1)[:, :-1] % 2 == 1
+    raster[low[1] : high[1], low[0] : high[0]][inside] = value
 
 
 def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator) -> Walk:
@@ -131,7 +147,7 @@ def _costs(building: Building, floors: Floors, wanted: list[int]) -> tuple[Array
         clear[k] = np.minimum(walls, ndimage.distance_transform_edt(~filled) * CELL)
         cost[k] = 1 + 2 * np.exp(-np.minimum(clear[k], 5) / 0.3)
         cost[k][clear[k] < BODY] += BLOCKED
-        cost[k][walls < 0.5 * BODY] = np.inf
+        cost[k][walls < 1.5 * CELL] = np.inf
     cost[foreign] *= FOREIGN
     return cost, clear
 
@@ -150,11 +166,10 @@ def _filled(things: Array, floors: Floors) -> Array:
 
 
 def _outlines(polygons: Sequence[Array], floors: Floors) -> Array:
-    image = Image.new("1", floors.room.shape[:0:-1], 0)
-    brush = ImageDraw.Draw(image)
+    out = np.zeros(floors.room.shape[1:], bool)
     for polygon in polygons:
-        brush.polygon([tuple(p) for p in ((polygon - floors.origin) / floors.cell - 0.5)], fill=1)
-    return np.asarray(image)
+        fill(out, (polygon - floors.origin) / floors.cell, 1)
+    return out
 
 
 def _graph(building: Building, floors: Floors, cost: Array) -> tuple[coo_array, Array]:
