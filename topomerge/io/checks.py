@@ -67,8 +67,9 @@ def _unit_warning(extent: Array, units: tuple[tuple[str, float], ...]) -> list[s
 def _up_warning(points: Array, low: Array, high: Array, up: str) -> list[str]:
     scores = [flatness(points, axis, low, high) for axis in range(3)]
     best = int(np.argmax(scores))
-    # A corridor seen without floor and ceiling is flat across its walls too, but it is not taller than a storey.
-    if scores[best] < max(0.12, 1.8 * scores[2]) or high[2] - low[2] < STOREY:
+    # A corridor seen without floor and ceiling is flat across its walls too, but it is not taller than a storey; a shaft or
+    # a tower is, but flat across both pairs of its walls.
+    if scores[best] < max(0.12, 1.8 * sorted(scores)[1]) or high[2] - low[2] < STOREY:
         return []
     axis = "xyz"[int(np.abs(turn(up)[best]).argmax())]
     return [

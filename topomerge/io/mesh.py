@@ -1,4 +1,4 @@
-"""Meshes: obj, stl, off, glb and gltf, sampled evenly by area. Vertices are kept too, so nothing small is lost."""
+"""Meshes: obj, stl, glb and gltf, sampled evenly by area. Vertices are kept too, so nothing small is lost."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from topomerge.kernels.lattice import areas, points_on_triangles
 from topomerge.types import Array
 
 SPACING = 0.05  # m between points sampled on surfaces
+LONGEST = 10_000.0  # m, edge of a triangle beyond any building
 
 
 def read(path: Path, options: Options) -> Iterator[Piece]:
@@ -44,20 +45,42 @@ def sample(
         raise damaged(path, "a mesh", "a face names a vertex that does not exist")
     spacing = (options.spacing or SPACING) / options.factor
     triangles = np.asarray(vertices, np.float64)[faces]
-    finite = np.isfinite(triangles).all(axis=(1, 2))
-    triangles, faces = triangles[finite], faces[finite]
-    counts = areas(triangles) / spacing**2
-    total = float(counts.sum())
-    # Beyond the second bound a step of one spacing is lost in rounding.
-    if not total <= LIMIT or np.abs(triangles).max(initial=0.0) > 1e12 * spacing:
-        raise too_many(path, total, spacing * options.factor)
-    ends = np.cumsum(counts)
-    cuts = np.searchsorted(ends, np.arange(BLOCK, max(total, 1), BLOCK))
+    kept = np.flatnonzero(np.isfinite(triangles).all(axis=(1, 2)))
+    _check_size(path, triangles[kept], spacing, options.factor)
+    triangles, kept = _halved(triangles[kept], kept, BLOCK * spacing**2)
+    ends = np.cumsum(areas(triangles)) / spacing**2
+    cuts = np.searchsorted(ends, np.arange(BLOCK, ends[-1] if len(ends) else 0, BLOCK))
     bounds = np.unique(np.concatenate([[0], cuts, [len(triangles)]]))
-    for low, high in itertools.pairwise(bounds):
-        points, owner = points_on_triangles(triangles[low:high], spacing, first + int(low))
-        shades = None if colors is None else colors[faces[low:high][owner]].mean(axis=1).astype(np.uint8)
-        yield Piece(points, shades, done=0.5 + 0.5 * float(high) / len(triangles))
+    for low, high in itertools.pairwise(bounds.tolist()):
+        points, owner = points_on_triangles(triangles[low:high], spacing, first + low)
+        shades = None if colors is None else colors[faces[kept[low:high][owner]]].mean(axis=1).astype(np.uint8)
+        yield Piece(points, shades, done=0.5 + 0.5 * high / len(triangles))
+
+
+def _check_size(path: Path, triangles: Array, spacing: float, factor: float) -> None:
+    """Refuse what no building is: it would take all memory, and steps of one spacing would be lost in rounding."""
+    if not len(triangles):
+        return
+    longest = float(np.ptp(triangles, axis=1).max()) * factor
+    if not longest <= LONGEST or np.abs(triangles).max() > 1e12 * spacing:
+        raise InputError(f"{path}: has a triangle of {longest:.3g} m; check --unit, or export it again")
+    total = float(areas(triangles).sum()) / spacing**2
+    if not total <= LIMIT:
+        raise too_many(path, total, spacing * factor)
+
+
+def _halved(triangles: Array, numbers: Array, largest: float) -> tuple[Array, Array]:
+    """Triangles (m, 3, 3) and their numbers (m,), those above the largest area cut across their longest edges."""
+    while (large := areas(triangles) > largest).any():
+        whole = triangles[large]
+        edge = np.linalg.norm(np.roll(whole, -1, axis=1) - whole, axis=2).argmax(axis=1)
+        each = np.arange(len(whole))
+        a, b, c = (whole[each, (edge + i) % 3] for i in range(3))
+        middle = (a + b) / 2
+        halves = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        triangles = np.concatenate([triangles[~large], halves])
+        numbers = np.concatenate([numbers[~large], numbers[large], numbers[large]])
+    return triangles, numbers
 
 
 def _parts(path: Path) -> list[tuple[Array, Array]]:

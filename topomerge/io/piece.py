@@ -16,7 +16,7 @@ from topomerge.errors import InputError
 from topomerge.types import Array, TrueRoom, VoxelGrid
 
 BLOCK = 1 << 19  # points a reader hands over at a time
-LIMIT = 200_000_000  # points that a sampled or extruded file may become; more is a wrong unit, not a building
+LIMIT = 100_000_000  # points that a sampled or extruded file may become; more is a wrong unit, not a building
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ FORMATS = (
     Format("a NumPy file", "arrays", (".npz", ".npy")),
     Format("a LAS file", "las", (".las", ".laz"), extra="las"),
     Format("an E57 file", "e57", (".e57",), extra="e57"),
-    Format("a mesh", "mesh", (".obj", ".stl", ".off")),
+    Format("a mesh", "mesh", (".obj", ".stl")),
     Format("a glTF mesh", "mesh", (".glb", ".gltf"), up="y"),
     Format("an OctoMap", "octomap", (".bt",)),
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc"),
@@ -198,6 +198,6 @@ def _chunks(
         yield from gatherer.add(piece)
         if progress is not None:
             progress(min(piece.done, 1.0), f"reading {path.name}")
-    yield from gatherer.finish()
     if progress is not None:
         progress(1.0, f"read {path.name}")
+    yield from gatherer.finish()

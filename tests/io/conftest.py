@@ -1,0 +1,14 @@
+"""Fixtures of the tests of readers and writers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from samples import write_all
+
+
+@pytest.fixture(scope="session")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Name -> a small file of every format. Tests copy what they change."""
+    return write_all(tmp_path_factory.mktemp("samples"))
