@@ -9,15 +9,16 @@ from __future__ import annotations
 import numpy as np
 
 from topomerge.extraction.components import connected_components
-from topomerge.extraction.convolution import Kernel, any_at, count_at, moore
+from topomerge.extraction.convolution import Kernel, any_at, moore
 from topomerge.extraction.distance_field import horizontal_distance_field
-from topomerge.kernels.columns import first_occupied
+from topomerge.kernels.columns import first_occupied, hollow_below, levels_below
 from topomerge.types import Array, VoxelGrid
 
 HEADROOM = 1.2  # m: empty space under a ceiling, above furniture
 STOREY = 8.0  # m: how far above a floor something may be, and how far below a ceiling its floor
 THICKNESS = 0.3  # m: a noisy sheet is this thick
-SOLID = 0.8  # share of the cells below the top of a wall that are occupied
+SLAB = 0.8  # m: so far below a ceiling's upper side, or a roof's, its lower side may be
+SOLID = 0.5  # share of the levels in the metre below that are occupied: a slab is thinner, a wall or a shelf is not
 WALLED = 0.25  # share of a floor's boundary beside which walls rise
 
 
@@ -34,7 +35,8 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
     bare = first_occupied(*grid._bricks, cells, thick + 1, 1, far) == 0
     if not bare.any():
         return standing
-    hollow = first_occupied(*grid._bricks, cells, thick + 1, -1, far) * grid.edge >= HEADROOM
+    slab = int(np.ceil(SLAB / grid.edge))
+    hollow = hollow_below(*grid._bricks, cells, 1, slab, int(np.ceil(HEADROOM / grid.edge)), far)
     component = connected_components(standing, moore(), group=np.where(bare, 0, -1))
     count = int(component.max()) + 1
     boundary = np.flatnonzero(bare & (horizontal_distance_field(standing) == 0))
@@ -47,10 +49,9 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
 
 
 def _on_a_wall(grid: VoxelGrid, cells: Array) -> Array:
-    """(m,) bool: is nearly everything filled for a metre below?"""
-    depth = -np.arange(1, max(int(1.0 / grid.edge), 1) + 1)
-    below = Kernel.from_offsets(depth[:, None] * (0, 0, 1))
-    return count_at(grid, cells, below) >= SOLID * len(depth)
+    """(m,) bool: is much of the metre below filled, here or in a neighbouring column?"""
+    depth = max(int(1.0 / grid.edge), 1)
+    return levels_below(*grid._bricks, cells, 1, depth) >= SOLID * depth
 
 
 def _beside_and_above(edge: float) -> Kernel:

@@ -75,10 +75,9 @@ def _edge(
     narrow = _narrowest(navigable, room, pair, cells)
     if narrow is not None and narrow[2] <= span:
         middle, along, span = narrow
-    at_door = np.abs(cells[:, :2] - middle).max(axis=1) <= max(span / 2, 2)
-    rows = rows[at_door] if at_door.any() else rows
+        rows = _under(navigable, middle, cells)
     above = floor_to_ceiling[rows]
-    height = float(above[above > 0].min()) if (above > 0).any() else 0.0
+    height = float(np.quantile(above[above > 0], 0.1, method="nearest")) if (above > 0).any() else 0.0
     levels = np.sort(navigable.cells[rows, 2])
     floor = float(levels[: max(len(levels) // 4, 1)].mean())
     centre = navigable.origin + (np.array([*middle, floor]) + 0.5) * navigable.edge
@@ -89,6 +88,14 @@ def _edge(
         kind = "door" if width <= DOOR_WIDTH else "opening"
     across = float(np.arctan2(along[0], -along[1]) % np.pi)  # the wall's normal
     return (tuple(int(p) for p in pair), tuple(centre.tolist()), width, height, across, kind)
+
+
+def _under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:
+    """Rows of the navigable cells in the middle of a passage, at the height of the contact."""
+    near = (np.abs(navigable.cells[:, :2] - middle) * navigable.edge <= 0.25).all(axis=1)
+    near &= np.abs(navigable.cells[:, 2] - contact[:, 2].mean()) * navigable.edge <= 0.6
+    rows = np.flatnonzero(near)
+    return rows[~navigable.contains(navigable.cells[rows].astype(np.int64) - (0, 0, 1))]  # the floor, not what was dilated
 
 
 def _extent(plan: Array) -> tuple[Array, Array, float]:

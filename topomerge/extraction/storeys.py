@@ -41,10 +41,15 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
         rows = lowest[storey[lowest] == s]
         near = rows[np.abs(navigable.cells[rows, 2] - z) <= 1]
         height = navigable.origin[2] + (navigable.cells[near, 2].mean() + 0.5) * navigable.edge
-        above = floor_to_ceiling[near]
-        ceiling = height + np.median(above[above > 0]) if (above > 0).any() else np.nan
+        ceiling = height + (ceiling_height(floor_to_ceiling[near]) or np.nan)
         storeys[s] = (height, ceiling, len(rows) * navigable.edge**2)
     return storeys, storey
+
+
+def ceiling_height(above: Array) -> float:
+    """Median of the heights above a floor, 0 where less than a third of it has something above: lintels are no ceiling."""
+    seen = above[above > 0]
+    return float(np.median(seen)) if len(seen) * 3 >= len(above) > 0 else 0.0
 
 
 def lowest_of_column(navigable: VoxelGrid) -> Array:

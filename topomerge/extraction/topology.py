@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from topomerge.extraction.doors import find_edges
 from topomerge.extraction.rooms import navigable_rooms
-from topomerge.extraction.storeys import find_storeys, lowest_of_column
+from topomerge.extraction.storeys import ceiling_height, find_storeys, lowest_of_column
 from topomerge.kernels.columns import first_occupied
 from topomerge.types import ROOM_DTYPE, Array, TopometricMap, VoxelGrid
 
@@ -60,8 +60,7 @@ def _measure(
         rooms["storey"][r] = np.bincount(storey[rows]).argmax()
         rooms["centroid"][r] = navigable.centroids(navigable.cells[rows]).mean(axis=0)
         rooms["area"][r] = _area(navigable.cells[rows, :2], navigable.edge, body)
-        seen = above[rows][above[rows] > 0]
-        rooms["height"][r] = np.median(seen) if len(seen) else 0.0
+        rooms["height"][r] = ceiling_height(above[rows])
         rooms["volume"][r] = rooms["area"][r] * rooms["height"][r]
         box = cells if len(cells) else navigable.cells[rows]
         rooms["lo"][r] = grid.origin + box.min(axis=0) * grid.edge
@@ -71,11 +70,13 @@ def _measure(
 
 
 def _area(columns: Array, edge: float, body: float) -> float:
-    """m2 of floor: the navigable columns and the strip along the walls in which the body does not fit."""
+    """m2 of floor: the navigable columns, the strip along the walls in which the body does not fit, and half a cell more along
+    the boundary, because a wall's face lies on average in the middle of its cell."""
     reach = int(np.ceil(body / edge - 1e-6)) // 2
-    low = columns.min(axis=0) - reach
-    plan = np.zeros(columns.max(axis=0) - low + reach + 1, bool)
+    low = columns.min(axis=0) - reach - 1
+    plan = np.zeros(columns.max(axis=0) - low + reach + 2, bool)
     plan[tuple((columns - low).T)] = True
     if reach:
         plan = ndimage.binary_dilation(plan, np.ones((2 * reach + 1, 2 * reach + 1)))
-    return float(plan.sum()) * edge**2
+    boundary = sum(int((plan[1:] != plan[:-1]).sum()) for plan in (plan, plan.T))
+    return (float(plan.sum()) + boundary / 2) * edge**2

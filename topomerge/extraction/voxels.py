@@ -18,6 +18,7 @@ log = logging.getLogger(__name__)
 # A group of points is a stray when it lies this far (m) from every larger group and holds less than this share of the cells.
 STRAY_DISTANCE = 10.0
 STRAY_SHARE = 0.01
+MERGE_AT = 4_000_000  # cells of pending chunks
 LARGE = 2e8  # cells: 200 x 200 x 5 m at 0.1 m; smaller grids cost little whatever is in them
 
 
@@ -69,7 +70,7 @@ def _gather(chunks: Iterable[PointCloud], edge: float) -> tuple[Array, Array]:
     for chunk in chunks:
         base, cells, counts = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), edge)
         pending.append((cells + base, counts))
-        if sum(len(c) for c, _ in pending) > max(len(merged[0]), 4_000_000):
+        if sum(len(c) for c, _ in pending) > max(len(merged[0]), MERGE_AT):
             merged, pending = _merge([merged, *pending]), []
     return _merge([merged, *pending])
 

@@ -1,0 +1,110 @@
+"""Voxelising: against a NumPy twin, in any order, in chunks, with bad and stray points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from topomerge.errors import InputError
+from topomerge.extraction import voxels
+from topomerge.extraction.voxels import voxelise
+from topomerge.kernels import voxelise as kernel
+from topomerge.types import PointCloud
+
+
+def twin(points: np.ndarray, edge: float) -> tuple[set[tuple[int, ...]], dict[tuple[int, ...], int]]:
+    lattice = np.floor(points.astype(np.float64) / edge).astype(int)
+    cells, counts = np.unique(lattice, axis=0, return_counts=True)
+    keys = [tuple(c) for c in cells.tolist()]
+    return set(keys), dict(zip(keys, counts.tolist(), strict=True))
+
+
+def lattice_of(grid) -> list[tuple[int, ...]]:
+    base = np.rint(grid.origin / grid.edge).astype(int)
+    return [tuple(c) for c in (grid.cells + base).tolist()]
+
+
+def test_equals_numpy_twin():
+    points = np.random.default_rng(1).normal(0, 2, (5000, 3)).astype(np.float32)
+    grid = voxelise(points, 0.13)
+    cells, counts = twin(points, 0.13)
+    assert set(lattice_of(grid)) == cells
+    assert dict(zip(lattice_of(grid), grid.properties["count"].tolist(), strict=True)) == counts
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 6))
+def test_order_and_chunks_do_not_matter(seed, parts):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-3, 3, (300, 3)).astype(np.float32)
+    whole = voxelise(points)
+    chunks = [PointCloud(p) for p in np.array_split(rng.permutation(points), parts)]
+    again = voxelise(iter(chunks))
+    assert (whole.cells == again.cells).all() and (whole.origin == again.origin).all()
+    assert (whole.properties["count"] == again.properties["count"]).all()
+
+
+def test_many_chunks_are_merged_on_the_way(monkeypatch):
+    points = np.random.default_rng(3).uniform(0, 4, (4000, 3)).astype(np.float32)
+    monkeypatch.setattr(voxels, "MERGE_AT", 500)
+    grid = voxelise([PointCloud(p) for p in np.array_split(points, 40)])
+    assert int(grid.properties["count"].sum()) == 4000
+    assert (grid.cells == voxelise(points).cells).all()
+
+
+def test_shift_moves_the_origin_exactly():
+    points = np.random.default_rng(0).uniform(0, 5, (1000, 3)).astype(np.float32)
+    near, far = voxelise(PointCloud(points)), voxelise(PointCloud(points, np.array([85_000.0, 447_000.0, 0.0])))
+    assert (near.cells == far.cells).mean() > 0.99
+    np.testing.assert_allclose(far.origin - near.origin, (85_000, 447_000, 0), atol=1e-6)
+
+
+def test_points_that_are_not_finite_are_left_out():
+    points = np.array([[0, 0, 0], [np.nan, 1, 1], [1, np.inf, 1], [0.5, 0.5, 0.5]], np.float32)
+    assert len(voxelise(points)) == 2
+    with pytest.raises(InputError, match="no finite point"):
+        voxelise(np.full((3, 3), np.nan, np.float32))
+    with pytest.raises(InputError, match="no finite point"):
+        voxelise(np.zeros((0, 3), np.float32))
+
+
+@pytest.mark.parametrize("distance", [1e3, 1e5, 1e8])
+def test_a_stray_point_is_dropped_and_reported(distance):
+    points = np.random.default_rng(0).uniform(0, 20, (20_000, 3)).astype(np.float32) * (1, 1, 0.15)
+    stray = np.array([[distance, -distance, distance]])
+    warnings: list[str] = []
+    grid = voxelise(np.concatenate([points, stray]).astype(np.float32), 0.1, warnings)
+    assert max(grid.shape) < 400
+    assert len(warnings) == 1 and warnings[0].startswith("1 stray point")
+    assert int(grid.properties["count"].sum()) == 20_000
+
+
+def test_a_thinly_scanned_wing_is_no_stray():
+    rng = np.random.default_rng(0)
+    hall, wing = rng.uniform(0, 20, (20_000, 3)), rng.uniform(0, 3, (50, 3)) + (60, 0, 0)
+    warnings: list[str] = []
+    grid = voxelise((np.concatenate([hall, wing]) * (1, 1, 0.15)).astype(np.float32), 0.1, warnings)
+    assert not warnings and int(grid.properties["count"].sum()) == 20_050
+
+
+def test_an_extent_that_no_building_has_is_refused():
+    points = np.random.default_rng(0).uniform(-1e7, 1e7, (500, 3)).astype(np.float32)
+    with pytest.raises(InputError, match="--unit"):
+        voxelise(points, 0.1)
+
+
+@pytest.mark.parametrize("edge", [0.0, -1.0, float("nan"), 1e-5, 50.0])
+def test_absurd_voxel_size_is_refused(edge):
+    with pytest.raises(InputError, match="voxel size"):
+        voxelise(np.zeros((1, 3), np.float32), edge)
+
+
+def test_table_and_sorting_agree(monkeypatch):
+    points = np.random.default_rng(2).uniform(-5, 5, (3000, 3)).astype(np.float32)
+    base, cells, counts = kernel.occupied(points, np.zeros(3), 0.1)
+    other_base, other_cells, other_counts = kernel._split(points, np.zeros(3), 0.1)
+    order, other = np.lexsort((cells + base).T), np.lexsort((other_cells + other_base).T)
+    assert ((cells + base)[order] == (other_cells + other_base)[other]).all()
+    assert (counts[order] == other_counts[other]).all()
