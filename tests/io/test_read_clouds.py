@@ -131,7 +131,7 @@ def test_npz_keeps_all_that_a_cloud_has(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["ascii.ply", "little.ply", "binary.pcd", "table.xyz", "array.npy", "cloud.laz", "cloud.e57"])
-@pytest.mark.parametrize("chunk", [1, 100, 600, 10_000])
+@pytest.mark.parametrize("chunk", [7, 100, 600, 10_000])
 def test_chunks_join_to_the_whole(samples: dict[str, Path], name: str, chunk: int) -> None:
     whole = read_points(samples[name])
     chunks = list(read_chunks(samples[name], chunk=chunk))
@@ -143,3 +143,29 @@ def test_chunks_join_to_the_whole(samples: dict[str, Path], name: str, chunk: in
     if whole.pose_of is not None:
         np.testing.assert_array_equal(np.concatenate([c.pose_of for c in chunks if c.pose_of is not None]), whole.pose_of)
         assert all(np.array_equal(c.poses, whole.poses) for c in chunks)
+
+
+@pytest.mark.parametrize(
+    "name", [*COLORED, "cloud.laz", "cloud.e57", "table.xyz", "array.npy", "tree.bt", "mesh.obj", "plan.yaml"]
+)
+def test_blocks_join_to_the_whole(samples: dict[str, Path], name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = read_points(samples[name])
+    from topomerge.io import arrays, e57, grid, las, mesh, octomap, pcd, ply, text
+
+    for module in (arrays, e57, grid, las, mesh, octomap, pcd, ply):
+        monkeypatch.setattr(module, "BLOCK", 77)
+    monkeypatch.setattr(text, "LINES", 77)
+    parts = read_points(samples[name])
+    if name == "mesh.obj":  # smaller blocks cut its large triangles, and each part has a lattice of its own
+        assert len(parts) == pytest.approx(len(whole), rel=0.05)
+        return
+    np.testing.assert_array_equal(parts.points, whole.points)
+    for values in ("colors", "pose_of"):
+        np.testing.assert_array_equal(getattr(parts, values), getattr(whole, values))
+
+
+def test_e57_range_and_angles() -> None:
+    from topomerge.io.e57 import _cartesian
+
+    spherical = np.array([[2, 0, 0], [2, np.pi / 2, 0], [2, 0, np.pi / 2]])
+    np.testing.assert_allclose(_cartesian(spherical), [[2, 0, 0], [0, 2, 0], [0, 0, 2]], atol=1e-12)

@@ -118,6 +118,7 @@ def boasts(samples: dict[str, Path]) -> dict[str, bytes]:
         "b.las": bytes(las_records),
         "a.laz": bytes(laz),
         "a.stl": bytes(stl),
+        "a.gltf": samples["mesh.gltf"].read_bytes().replace(b'"count":', f'"count":{MANY}'.encode(), 1),
     }
 
 
@@ -150,6 +151,13 @@ def test_meshes_whose_faces_name_no_vertex(samples: dict[str, Path], tmp_path: P
     (tmp_path / "a.obj").write_text(data)
     with pytest.raises(InputError, match=r"a\.obj: damaged"):
         read_points(tmp_path / "a.obj")
+
+
+def test_compressed_scenes_say_so(samples: dict[str, Path], tmp_path: Path) -> None:
+    needs = b'{"extensionsRequired":["KHR_draco_mesh_compression"],'
+    (tmp_path / "a.gltf").write_bytes(samples["mesh.gltf"].read_bytes().replace(b"{", needs, 1))
+    with pytest.raises(InputError, match="KHR_draco_mesh_compression, which is not read"):
+        read_points(tmp_path / "a.gltf")
 
 
 def test_e57_pages_are_checked_before_the_library_sees_them(samples: dict[str, Path], tmp_path: Path) -> None:

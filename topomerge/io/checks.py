@@ -65,7 +65,7 @@ def _unit_warning(extent: Array, units: tuple[tuple[str, float], ...]) -> list[s
 
 
 def _up_warning(points: Array, low: Array, high: Array, up: str) -> list[str]:
-    scores = [flatness(points, axis, low, high) for axis in range(3)]
+    scores = flatness(points, low, high)
     best = int(np.argmax(scores))
     # A corridor seen without floor and ceiling is flat across its walls too, but it is not taller than a storey; a shaft or
     # a tower is, but flat across both pairs of its walls.
@@ -78,9 +78,11 @@ def _up_warning(points: Array, low: Array, high: Array, up: str) -> list[str]:
     ]
 
 
-def flatness(points: Array, axis: int, low: Array, high: Array) -> float:
-    """Share of the surface that lies in the strongest slab across `axis`."""
+def flatness(points: Array, low: Array, high: Array) -> list[float]:
+    """Share of the surface that lies in the strongest slab across x, y and z; the surface is counted in occupied cells."""
     inside = points[((points >= low - SLAB) & (points <= high + SLAB)).all(axis=1)]
-    cells = np.unique(np.floor(inside / SLAB).astype(np.int64), axis=0)
-    counts = np.bincount(cells[:, axis] - cells[:, axis].min())
-    return float(np.convolve(counts, (1, 1)).max() / len(cells))
+    cells = np.floor((inside - inside.min(axis=0)) / SLAB).astype(np.int64)
+    ny, nz = (int(n) for n in cells.max(axis=0)[1:] + 1)
+    codes = np.unique((cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2])
+    slabs = (codes // (ny * nz), codes // nz % ny, codes % nz)
+    return [float(np.convolve(np.bincount(s), (1, 1)).max() / len(codes)) for s in slabs]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,10 @@ from topomerge.errors import InputError
 from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
 from topomerge.types import Array
 
+LASZIP = b"laszip encoded"
+LARGEST_HEAD = 64 << 20  # bytes searched for the record of the compression
+SMALLEST_CHUNK = 20  # bytes: a compressed chunk starts with one point as it is
+
 
 def read(path: Path, options: Options) -> Iterator[Piece]:
     """Blocks of points with their colours."""
@@ -19,7 +24,8 @@ def read(path: Path, options: Options) -> Iterator[Piece]:
     del options
     _check_head(path)
     done = 0
-    with laspy.open(path) as reader:
+    # The parallel decoder believes the table of chunks and ends the process where a damaged one asks for too much memory.
+    with laspy.open(path, laz_backend=[laspy.LazBackend.Lazrs]) as reader:
         header = reader.header
         promised, size = header.point_count, header.point_format.size
         room = path.stat().st_size - header.offset_to_point_data
@@ -53,3 +59,34 @@ def _check_head(path: Path) -> None:
     size = path.stat().st_size
     if start > size or records * 54 > size:
         raise damaged(path, "a LAS file", f"{records:,} records before point data at byte {start:,} of {size:,}")
+    if head[104] & 0x80:  # compressed
+        _check_table(path, start, size)
+        _check_items(path, start, int.from_bytes(head[105:107], "little"))
+
+
+def _check_items(path: Path, start: int, record: int) -> None:
+    """Refuse a LAZ file whose compressed fields don't add up to a point of `record` bytes; the decoder would allocate them."""
+    with path.open("rb") as stream:
+        before = stream.read(min(start, LARGEST_HEAD))
+    at = before.find(LASZIP) + 52  # of the record's data: the name stands 2 bytes into a record head of 54
+    count = int.from_bytes(before[at + 32 : at + 34], "little")
+    items = before[at + 34 : at + 34 + 6 * count]  # kind, size and version of two bytes each
+    if at < 52 or len(items) < 6 * count or sum(struct.unpack("<" + "2xH2x" * count, items)) != record:
+        raise damaged(path, "a LAZ file", f"its fields do not add up to {record} bytes")
+
+
+def _check_table(path: Path, start: int, size: int) -> None:
+    """Refuse a LAZ file whose table of chunks promises more than the file can hold; the decoder would allocate for it.
+
+    The first 8 bytes of the point data say where the table is, or -1: the last 8 bytes of the file do.
+    """
+    with path.open("rb") as stream:
+        stream.seek(start)
+        (at,) = struct.unpack("<q", stream.read(8).ljust(8, b"\0"))
+        if at == -1:
+            stream.seek(max(size - 8, 0))
+            (at,) = struct.unpack("<q", stream.read(8).ljust(8, b"\0"))
+        stream.seek(max(at, 0))
+        chunks = int.from_bytes(stream.read(8)[4:], "little")
+    if not start < at < size or chunks * SMALLEST_CHUNK > size:
+        raise damaged(path, "a LAZ file", f"table of {chunks:,} chunks at byte {at:,} of {size:,}")

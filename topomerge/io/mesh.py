@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
 import logging
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -95,10 +97,14 @@ def _parts(path: Path) -> list[tuple[Array, Array]]:
         wanted |= {"skip_materials": True, "split_object": False, "group_material": False}
     if kind in ("glb", "gltf"):
         wanted |= {"skip_materials": True, "merge_primitives": False}
-    with path.open("rb") as stream:
-        data = io.BytesIO(stream.read())
+    data = io.BytesIO(path.read_bytes())
     resolver = trimesh.resolvers.FilePathResolver(str(path)) if kind == "gltf" else None
-    scene = trimesh.load_scene(data, file_type=kind, resolver=resolver, **wanted)
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            scene = trimesh.load_scene(data, file_type=kind, resolver=resolver, **wanted)
+    except OSError as error:
+        raise InputError(f"{path}: damaged, or a file that it names is missing ({error}); export it as one glb") from error
     parts = []
     for name in scene.graph.nodes_geometry:
         matrix, geometry = scene.graph[name]
@@ -109,17 +115,37 @@ def _parts(path: Path) -> list[tuple[Array, Array]]:
 
 
 def _check_start(path: Path, kind: str) -> None:
-    """What the library would trust: magic, and the counts of binary files against the file's size."""
+    """What the library would trust: magic, and counts against the file's size."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(1024)
-    if kind == "glb":
-        length = int.from_bytes(head[8:12], "little")
-        if head[:4] != b"glTF":
-            raise InputError(f"{path}: is not a binary glTF file; check the file's suffix")
-        if length > size:
-            raise damaged(path, "a glTF file", f"{size:,} of {length:,} bytes")
     if kind == "stl" and head.lstrip()[:5].lower() != b"solid":
         count = int.from_bytes(head[80:84], "little")
         if 84 + 50 * count > size or size < 84:
             raise damaged(path, "an STL file", f"{count:,} triangles promised in {size:,} bytes")
+    if kind == "glb":
+        if head[:4] != b"glTF":
+            raise InputError(f"{path}: is not a binary glTF file; check the file's suffix")
+        length, text = int.from_bytes(head[8:12], "little"), int.from_bytes(head[12:16], "little")
+        if max(length, 20 + text) > size:
+            raise damaged(path, "a glTF file", f"{size:,} of {max(length, 20 + text):,} bytes")
+        with path.open("rb") as stream:
+            stream.seek(20)
+            _check_gltf(path, stream.read(text))
+    if kind == "gltf":
+        _check_gltf(path, path.read_bytes())
+
+
+def _check_gltf(path: Path, text: bytes) -> None:
+    """Refuse a scene that is compressed, or promises more numbers than any building has."""
+    try:
+        tree = json.loads(text)
+        needed = set(tree.get("extensionsRequired", ()))
+        largest = max((int(a["count"]) for a in tree.get("accessors", ())), default=0)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise damaged(path, "a glTF file", error) from error
+    packed = [name for name in needed if "compression" in name]
+    if packed:
+        raise InputError(f"{path}: is compressed with {packed[0]}, which is not read; export it without")
+    if largest > LIMIT:
+        raise damaged(path, "a glTF file", f"{largest:,} values promised")

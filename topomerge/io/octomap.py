@@ -20,7 +20,7 @@ from topomerge.types import Array, VoxelGrid
 
 MAGIC = b"# Octomap OcTree binary file"
 CENTRE = 1 << (LEAF_LEVEL - 1)  # the cell whose lower corner is the origin of coordinates
-MOST = 60_000_000  # smallest cells that leaves may be cut into
+MOST = 30_000_000  # smallest cells that leaves may be cut into
 
 
 def read(path: Path, options: Options) -> Iterator[Piece]:
