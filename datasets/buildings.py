@@ -1,13 +1,14 @@
 """Procedural buildings: plans of a kind from a seed, erected.
 
-A building is a layout of corridors (`layouts`) whose rows of rooms are cut up by the kind's deck of rooms. Corridors, stairs, lifts,
-halls and atria go through all storeys; the rest repeats or differs from storey to storey.
+A building is a layout of corridors (`layouts`) whose rows of rooms are cut up by the kind's deck of rooms. Corridors, stairs,
+lifts, halls and atria go through all storeys; the rest repeats or differs from storey to storey.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -53,12 +54,14 @@ PROFILES = {
         ("single", "double", "double", "ring", "L", "T", "U", "comb"), (24, 42), (4.8, 6.4), (1.6, 2.2),
         ("office",) * 6 + ("meeting", "storage", "office", "kitchen"),
     ),
-    "openplan": Profile(("ring", "double", "double"), (28, 40), (6.5, 9.0), (1.6, 2.2), ("openplan", "openplan", "meeting", "office")),
+    "openplan": Profile(
+        ("ring", "double", "double"), (28, 40), (6.5, 9.0), (1.6, 2.2), ("openplan", "openplan", "meeting", "office")
+    ),
     "apartment": Profile(
         ("double", "single", "L"), (18, 32), (8.6, 9.8), (1.4, 1.8), ("flat",), cores=(), height=(2.8, 3.0), stairs=("dogleg",)
     ),
     "hotel": Profile(
-        ("double", "double", "L", "U", "ring"), (30, 48), (6.4, 7.2), (1.5, 1.9), ("hotel",), cores=("storage",), same=True,
+        ("double", "double", "L", "U", "T"), (30, 48), (6.4, 7.2), (1.5, 1.9), ("hotel",), cores=("storage",), same=True,
         height=(2.9, 3.2), stairs=("dogleg", "straight"),
     ),
     "hospital": Profile(
@@ -85,9 +88,29 @@ WIDTHS: dict[str, Range] = {
     "cloakroom": (3.0, 4.5), "lab": (5.4, 9.5), "living": (4.2, 6.5), "bath": (2.0, 2.6), "bedroom": (2.9, 4.4),
     "toilets": (3.0, 4.5), "nurses": (4.5, 6.5), "hall": (12.0, 16.0), "atrium": (7.0, 10.0), "lift": (2.1, 2.5),
 }  # fmt: skip
+INNER = ("storage", "meeting", "kitchen", "storage", "office", "toilets")  # what lies in a building's middle
 DARK = {"storage", "lift", "bath", "toilets", "corridor", "void"}  # no windows, or small ones
 LANDING = 1.35  # m before a flight
 TRIES = 20
+
+
+class Deck:
+    """Kinds of rooms in a shuffled order, dealt again when all are out, so that shares hold even in small buildings."""
+
+    def __init__(self, kinds: Sequence[str], style: int | None, rng: np.random.Generator) -> None:
+        self.kinds, self.rng = kinds, rng
+        self.left: list[str] = []
+        fixed = np.random.default_rng(style)
+        self.widths = {} if style is None else {k: float(fixed.uniform(*WIDTHS[k])) for k in sorted(set(kinds))}
+
+    def draw(self, most: float) -> tuple[str, float]:
+        """The next kind that fits into a width, and its own width; an office or a store where none fits."""
+        for _ in range(2 * len(self.kinds)):
+            self.left = self.left or self.rng.permutation(np.array(self.kinds)).tolist()
+            kind = self.left.pop()
+            if WIDTHS[kind][0] * 0.85 <= most:
+                return kind, self.widths.get(kind) or float(self.rng.uniform(*WIDTHS[kind]))
+        return ("storage" if most < 2.8 or "flat" in self.kinds else "office"), most
 
 
 def make_building(
@@ -162,7 +185,8 @@ def _add_cores(
     if storeys > 1:
         total = sum(r.length for r in layout.rows)
         number = 1 if total < 45 else 2
-        wanted += [("stairs", str(rng.choice(profile.stairs))) for _ in range(number)]
+        drawn = [str(rng.choice(profile.stairs)) for _ in range(number)]
+        wanted += [("stairs", "dogleg" if i and kind == "ramp" else kind) for i, kind in enumerate(drawn)]
         wanted += [("lift", "lift")] if profile.lift and (storeys > 2 or rng.random() < 0.5) else []
         wanted += [("atrium", "")] if profile.lift and rng.random() < difficulty.atria else []
     wanted += [(kind, "") for kind in profile.cores]
@@ -211,12 +235,14 @@ def _storey(
     draft = Draft(wall, rng)
     corridors = draw(layout, draft, "corridor", merge)
     fronts: list[tuple[int, int]] = []  # rooms and their corridors
+    deck = Deck(profile.upper if k and profile.upper else profile.rooms, seeds[1] if profile.same else None, rng)
+    inner = Deck(INNER, None, rng)
     for row in layout.rows:
         for core in row.cores:
             fronts += _core(draft, row, core, corridors[row.corridor], k, storeys, height)
-        deck = profile.upper if k and profile.upper else profile.rooms
         for a, b in row.gaps():
-            fronts += _fill(draft, row, (a, b), deck, profile.same, seeds[1], corridors[row.corridor], rng)
+            cards = inner if row.inner else deck
+            fronts += _fill(draft, row, (a, b), cards, corridors[row.corridor], rng)
     if k == 0:
         draft.entrance(corridors[0], 1.5) or draft.entrance(corridors[0], 1.0)
     for room, corridor in fronts:
@@ -277,29 +303,26 @@ def _fill(
     draft: Draft,
     row: Row,
     gap: Range,
-    deck: Sequence[str],
-    same: bool,
-    style: int,
+    deck: Deck,
     corridor: int,
     rng: np.random.Generator,
 ) -> list[tuple[int, int]]:
     """Cut a stretch of a row into rooms, each with a door to the corridor."""
-    fixed = np.random.default_rng(style)
-    widths = {kind: float(fixed.uniform(*WIDTHS[kind])) for kind in sorted(set(deck))}
     kinds, drawn, length = [], [], gap[1] - gap[0]
     while sum(drawn) < length:
-        cards = rng.permutation(np.array(deck)).tolist()
-        kinds += cards
-        drawn += [widths[c] if same else float(rng.uniform(*WIDTHS[c])) for c in cards]
+        kind, width = deck.draw(length)
+        if drawn and sum(drawn) + width / 2 > length:  # better stretch the others than squeeze this one in
+            break
+        kinds.append(kind)
+        drawn.append(width)
     ends = np.cumsum(drawn)
-    number = max(int(np.argmin(np.abs(ends - length))) + 1, 1)
-    cuts = np.round(gap[0] + np.concatenate([[0.0], ends[:number]]) * length / ends[number - 1], 2)
+    cuts = np.round(gap[0] + np.concatenate([[0.0], ends]) * length / ends[-1], 2)
     cuts[-1] = gap[1]
     out = []
     for kind, a, b in zip(kinds, cuts[:-1], cuts[1:], strict=False):
         out += _row_room(draft, row, (float(a), float(b)), kind, corridor, rng)
     rooms = [r for r, _ in out]
-    for left, right in zip(rooms[:-1], rooms[1:], strict=True):
+    for left, right in pairwise(rooms):
         if {draft.rooms[left].kind, draft.rooms[right].kind} <= {
             "office",
             "meeting",

@@ -1,7 +1,7 @@
 """Storeys with corridors: where the corridors run, where rooms lie along them, and where stairs and lifts go.
 
-A layout is drawn twice: once for the whole building (corridors and cores, the same on every storey) and once a storey (how the rows
-between the cores are cut into rooms).
+A layout is drawn twice: once for the whole building (corridors and cores, the same on every storey) and once a storey (how the
+rows between the cores are cut into rooms).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from topomerge.datasets.solids import rotation
 
 from topomerge.types import Array
 
+MOST = 140.0  # m2; larger corridors are parted by fire doors
 SHAPES = ("single", "double", "ring", "L", "T", "U", "comb")
 
 
@@ -42,6 +43,7 @@ class Row:
     Args:
         ends: depth at its start and end; they differ where the outer wall is slanted.
         corridor: index of the corridor that it opens to.
+        inner: its back is no outer wall: no place for rooms that need daylight.
     """
 
     start: tuple[float, float]
@@ -49,6 +51,7 @@ class Row:
     length: float
     ends: tuple[float, float]
     corridor: int
+    inner: bool = False
     cores: tuple[Core, ...] = ()
 
     def place(self, points: Array) -> Array:
@@ -146,8 +149,8 @@ def _ring(size: Size, rng: np.random.Generator) -> Layout:
         Row((w, wide), 0.0, long - w, (d, d), 1),
         Row((0.0, 0.0), np.pi / 2, wide, (size.far, size.far), 0),
         Row((long, wide), -np.pi / 2, wide, (size.far, size.far), 1),
-        Row((w, w), 0.0, long - 2 * w, (deep, deep), 0),
-        Row((long - w, wide - w), np.pi, long - 2 * w, (deep, deep), 1),
+        Row((w, w), 0.0, long - 2 * w, (deep, deep), 0, True),
+        Row((long - w, wide - w), np.pi, long - 2 * w, (deep, deep), 1, True),
     ]
     return layout
 
@@ -163,7 +166,7 @@ def draw(layout: Layout, draft: Draft, kind: str = "corridor", merge: bool = Fal
     if merge:
         for a, b in layout.joints:
             union = outlines[a].union(outlines[b])
-            if union.geom_type == "Polygon" and not union.interiors:
+            if union.geom_type == "Polygon" and not union.interiors and union.area < MOST:
                 outlines[a], owner[b] = union, a
     rooms = {i: draft.room(outlines[i].simplify(1e-3), kind) for i in sorted(set(owner))}
     for a, b in layout.joints:

@@ -123,9 +123,7 @@ def check_plan(plan: Plan, name: str = "plan") -> None:
     if not plan.rooms:
         raise InputError(f"{name}: no rooms")
     if not 1.8 <= plan.ceiling <= plan.height - 0.1:
-        raise InputError(
-            f"{name}: ceiling at {plan.ceiling} m: give 1.8 m to {plan.height - 0.1:.2f} m (storey less 0.1 m)"
-        )
+        raise InputError(f"{name}: ceiling at {plan.ceiling} m: give 1.8 m to {plan.height - 0.1:.2f} m (storey less 0.1 m)")
     shapes = [_shape(room, name) for room in plan.rooms]
     first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
     for i, j in zip(first.tolist(), second.tolist(), strict=True):

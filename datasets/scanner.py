@@ -41,7 +41,7 @@ def scan(
         frame: the cloud is given in this frame (it maps the building's coordinates into the cloud's); None: the building's own.
 
     Returns:
-        points with `labels` (index into `rooms`, which are all rooms of the building, in the cloud's frame), estimated `poses`, `pose_of`.
+        points with `labels` (index into `rooms`: all rooms of the building, in the cloud's frame), estimated `poses` and `pose_of`.
 
     Raises:
         InputError: unknown sensor or room, a spacing that is not positive, a room that cannot be reached.
@@ -266,7 +266,7 @@ def _rooms_of(building: Building, poses: Array, hits: Hits) -> Array:
 
 
 def _drift(poses: Array, walk: Walk, along: Array, sensor: Sensor, rng: np.random.Generator) -> Array:
-    """The poses as the sensor's own odometry has them: the heading wanders, and the way bends with it; gravity is a little off."""
+    """The poses as odometry has them: the heading wanders, and the way bends with it; gravity is a little off."""
     out = poses.copy()
     if sensor.drift:
         total = walk.along[-1]

@@ -80,20 +80,25 @@ SENSORS = {
     for s in (
         Sensor("tls", (0.4, 40), 360, (-62, 88), height=1.7, grazing=3.0),
         Sensor(
-            "lidar", (0.5, 30), 360, (-45, 45), 32, height=1.4, step=0.4, swing=12, spacing=0.05, noise=(0.012, 0.0004), drift=0.3, tilt=0.2
+            "lidar", (0.5, 30), 360, (-45, 45), 32, height=1.4, step=0.4, swing=12, spacing=0.05, noise=(0.012, 0.0004),
+            drift=0.3, tilt=0.2,
         ),
         Sensor(
-            "depth", (0.4, 5.0), 72, (-28, 28), height=1.45, step=0.35, turns=10, pitch=-4, swing=24, spacing=0.05, noise=(0.003, 0.0),
-            quadratic=0.0025, grazing=12, dark=0.08, lost=0.03, glass=0.02, drift=0.5, tilt=0.4, mixed=0.5,
+            "depth", (0.4, 5.0), 72, (-28, 28), height=1.45, step=0.35, turns=10, pitch=-4, swing=24, spacing=0.05,
+            noise=(0.003, 0.0), quadratic=0.0025, grazing=12, dark=0.08, lost=0.03, glass=0.02, mixed=0.5, drift=0.5, tilt=0.4,
         ),
         Sensor(
-            "mono", (0.6, 8.0), 80, (-30, 30), height=1.5, step=0.5, turns=8, pitch=-4, swing=20, spacing=0.12, noise=(0.01, 0.005),
-            quadratic=0.004, grazing=10, dark=0.1, lost=0.2, glass=0.2, drift=0.8, tilt=0.6, mixed=0.6, plain=0.3, metric=False,
+            "mono", (0.6, 8.0), 80, (-30, 30), height=1.5, step=0.5, turns=8, pitch=-4, swing=20, spacing=0.12,
+            noise=(0.01, 0.005), quadratic=0.004, grazing=10, dark=0.1, lost=0.2, glass=0.2, mixed=0.6, drift=0.8, tilt=0.6,
+            plain=0.3, metric=False,
         ),
-        Sensor("laser2d", (0.1, 20), 270, (0, 0), 1, height=0.3, step=0.25, turns=4, spacing=0.03, noise=(0.01, 0.0005), drift=0.3),
         Sensor(
-            "tablet", (0.3, 5.0), 62, (-24, 24), height=1.4, step=0.4, turns=10, pitch=24, swing=16, spacing=0.05, noise=(0.006, 0.001),
-            quadratic=0.001, grazing=10, dark=0.05, lost=0.02, glass=0.05, drift=0.5, tilt=0.3, mixed=0.5, lowest=1.0,
+            "laser2d", (0.1, 20), 270, (0, 0), 1, height=0.3, step=0.25, turns=4, spacing=0.03, noise=(0.01, 0.0005), drift=0.3
+        ),
+        Sensor(
+            "tablet", (0.3, 5.0), 62, (-24, 24), height=1.4, step=0.4, turns=10, pitch=24, swing=16, spacing=0.05,
+            noise=(0.006, 0.001), quadratic=0.001, grazing=10, dark=0.05, lost=0.02, glass=0.05, mixed=0.5, drift=0.5, tilt=0.3,
+            lowest=1.0,
         ),
     )
 }  # fmt: skip

@@ -50,7 +50,13 @@ def session(building: Building, difficulty: Difficulty | None = None, rng: np.ra
     things = _people(building, mesh, things, outlines[~gone], difficulty, rng)
     vertices, triangles, labels, thing_of = mesh
     return replace(
-        building, vertices=vertices.astype(np.float32), triangles=triangles, labels=labels, thing_of=thing_of, things=things, doors=doors
+        building,
+        vertices=vertices.astype(np.float32),
+        triangles=triangles,
+        labels=labels,
+        thing_of=thing_of,
+        things=things,
+        doors=doors,
     )
 
 

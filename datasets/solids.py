@@ -128,9 +128,9 @@ class Faces:
 def boundary(prisms: Sequence[Prism]) -> Faces:
     """The surfaces around the union of prisms.
 
-    Rooms, doorways, windows, stair wells and the world outside are all prisms of free space; everything else is solid. Between two
-    neighbouring heights at which a prism starts or ends, the union has one plan; walls stand on its outline, and floors and
-    ceilings lie where it differs from the plan below or above.
+    Rooms, doorways, windows, stair wells and the world outside are all prisms of free space; everything else is solid. Between
+    two neighbouring heights at which a prism starts or ends, the union has one plan; walls stand on its outline, and floors
+    and ceilings lie where it differs from the plan below or above.
     """
     levels = np.unique(np.round([z for p in prisms for z in (p.bottom, p.top)], 3))
     shapes = shapely.set_precision(np.array([p.polygon for p in prisms], object), GRID)

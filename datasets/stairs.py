@@ -92,7 +92,12 @@ def _placing(flight: Flight):  # type: ignore[no-untyped-def]
 
 
 def _resample(path: Array, count: int = 16) -> Array:
-    """Points spread evenly along a polyline."""
+    """`count` points along a polyline; its corners are kept where it has fewer."""
+    while len(path) < count:
+        longest = int(np.argmax(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+        path = np.insert(path, longest + 1, path[longest : longest + 2].mean(axis=0), axis=0)
+    if len(path) == count:
+        return path
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     at = np.linspace(0, along[-1], count)
     return np.stack([np.interp(at, along, path[:, k]) for k in range(3)], axis=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy import ndimage
@@ -101,8 +102,8 @@ def fill(raster: Array, polygon: Array, value: int) -> None:
 def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator) -> Walk:
     """A walk into all the given rooms, from one of them.
 
-    The way follows one shortest-path tree, so the surveyor returns through the corridors as people do. Shut doors are opened in passing;
-    rooms that were not asked for are crossed only where there is no other way.
+    The way follows one shortest-path tree, so the surveyor returns through the corridors as people do. Shut doors are opened in
+    passing; rooms that were not asked for are crossed only where there is no other way.
 
     Raises:
         InputError: no rooms, a room that does not exist, or one that cannot be reached.
@@ -125,7 +126,13 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
     way, halts = _tour(start, stops, before, reach)
     room = np.append(floors.room.ravel(), np.full(len(places) - floors.room.size, -1))[way]
     price = np.append(cost.ravel(), np.ones(len(places) - cost.size))[way]
-    return Walk(_smooth(places[way]), room.astype(np.int32), np.array(halts), price < BLOCKED)
+    step = np.linalg.norm(np.diff(places[way], axis=0), axis=1)
+    first = np.concatenate([[0], np.cumsum(np.maximum(np.ceil(step / (1.5 * CELL)), 1))])  # stairs have few nodes
+    at = np.arange(first[-1] + 1)
+    points = np.stack([np.interp(at, first, places[way][:, k]) for k in range(3)], axis=1)
+    nearest = np.clip(np.searchsorted(first, at), 0, len(way) - 1)
+    halts = first[halts].astype(np.int64)
+    return Walk(_smooth(points), room[nearest].astype(np.int32), halts, price[nearest] < BLOCKED)
 
 
 def _costs(building: Building, floors: Floors, wanted: list[int]) -> tuple[Array, Array]:
@@ -245,7 +252,7 @@ def _tour(start: int, stops: list[int], before: Array, reach: Array) -> tuple[Ar
 
 def _order(stops: list[int], trunks: dict[int, list[int]], reach: Array) -> list[int]:
     """Stops in the order of a depth-first walk over the tree, near branches first."""
-    edges = np.array([(a, b) for t in trunks.values() for a, b in zip(t[:-1], t[1:], strict=True)]).reshape(-1, 2)
+    edges = np.array([(a, b) for t in trunks.values() for a, b in pairwise(t)]).reshape(-1, 2)
     nodes, inverse = np.unique(np.append(edges.ravel(), stops), return_inverse=True)
     del inverse
     children: dict[int, list[int]] = {int(n): [] for n in nodes}
