@@ -93,7 +93,7 @@ def test_wrong_units_are_noticed(tmp_path: Path, factor: float, unit: str) -> No
     assert read_points(path, unit=unit).warnings == ()
 
 
-@pytest.mark.parametrize("size", [(8, 6, 2.7), (30, 2, 2.7), (2, 30, 2.7), (3, 3, 30), (60, 40, 3.2)])
+@pytest.mark.parametrize("size", [(8, 6, 2.7), (30, 2, 2.7), (2, 30, 2.7), (3, 3, 30), (60, 40, 3.2), (20, 15, 6), (30, 30, 12)])
 def test_ordinary_rooms_raise_no_warning(size: tuple[float, float, float]) -> None:
     points = room(*size)
     assert warn_about(points, "z") == []
