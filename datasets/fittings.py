@@ -9,7 +9,8 @@ import numpy as np
 import shapely
 from topomerge.datasets.building import SURFACES, THING_DTYPE
 from topomerge.datasets.difficulty import Difficulty
-from topomerge.datasets.furniture import Floor, Item, furnish
+from topomerge.datasets.furnish import Floor, furnish
+from topomerge.datasets.furniture import Item
 from topomerge.datasets.plan import Plan
 from topomerge.datasets.solids import Soup, boxes, column, flat, rotation
 

@@ -1,4 +1,4 @@
-"""Furniture: what it is made of, which rooms hold what, and where it can stand."""
+"""Furniture: what it is made of, and which rooms hold what."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ import shapely
 from topomerge.datasets.solids import rotation
 
 from topomerge.types import Array
-
-TRIES = 10
-BODY = 0.28  # m, half of what a person needs to pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +27,7 @@ class Item:
     @property
     def outline(self) -> shapely.Polygon:
         """Its footprint."""
-        return _outline(self.at, self.yaw, self.size)
+        return shapely.Polygon(footprints(self.at[None], np.array([self.yaw]), self.size)[0])
 
 
 def _table(w: float, d: float, h: float = 0.74) -> list[list[float]]:
@@ -234,9 +231,11 @@ ROOMS: dict[str, list[tuple[str, str, int, float]]] = {
 }
 
 
-def _outline(at: Array, yaw: float, size: Sequence[float]) -> shapely.Polygon:
+def footprints(at: Array, yaw: Array, size: Sequence[float]) -> Array:
+    """(n, 4, 2) corners of rectangles of one size at (n, 2) places, turned by (n,) radians."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size[:2]) / 2
-    return shapely.Polygon(corners @ rotation(yaw) + at)
+    turn = np.moveaxis(rotation(np.asarray(yaw)), 2, 0)
+    return corners @ turn + np.asarray(at)[:, None]
 
 
 def make_item(kind: str, rng: np.random.Generator) -> Item:
@@ -247,111 +246,3 @@ def make_item(kind: str, rng: np.random.Generator) -> Item:
     size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
     label = kind if kind in ("clutter", "person") else "furniture"
     return Item(kind, parts, np.zeros(2), 0.0, size, kind not in FIXED, label)
-
-
-@dataclass(eq=False)
-class Floor:
-    """A room while it is being furnished."""
-
-    shape: shapely.Polygon
-    taken: list[shapely.Polygon]
-    rng: np.random.Generator
-    height: float = 2.5
-
-    def put(self, item: Item, where: str) -> Item | None:
-        """The item at a place that is free, or None when none was found."""
-        for _ in range(TRIES):
-            at, yaw = self._by_wall(item) if where == WALL else self._in_middle(item)
-            outline = _outline(at, yaw, item.size)
-            if self.fits(outline):
-                return self._place(item, at, yaw, outline)
-        return None
-
-    def fits(self, outline: shapely.Polygon) -> bool:
-        """Does a footprint lie within the room and clear of everything?"""
-        return bool(self.shape.contains(outline)) and not any(outline.intersects(t) for t in self.taken)
-
-    def _place(self, item: Item, at: Array, yaw: float, outline: shapely.Polygon) -> Item:
-        self.taken.append(outline.buffer(0.02, join_style="mitre"))
-        return Item(item.kind, item.parts, at, yaw, item.size, item.movable, item.label)
-
-    def _by_wall(self, item: Item) -> tuple[Array, float]:
-        ring = np.asarray(self.shape.exterior.coords)
-        steps = np.diff(ring, axis=0)
-        lengths = np.hypot(steps[:, 0], steps[:, 1])
-        weight = np.maximum(lengths - item.size[0], 0) + 1e-9
-        k = int(self.rng.choice(len(weight), p=weight / weight.sum()))
-        along = steps[k] / lengths[k]
-        spare = max(lengths[k] - item.size[0], 0.0)
-        inward = np.array([-along[1], along[0]])  # the ring is counter-clockwise
-        # half of the things go into a corner, as people put them
-        offset = self.rng.choice([0.04, spare - 0.04, *self.rng.uniform(0, spare, 2)])
-        at = ring[k] + along * (item.size[0] / 2 + offset) + inward * (item.size[1] / 2 + 0.03)
-        return at, float(np.arctan2(-inward[1], -inward[0]) - np.pi / 2)
-
-    def _in_middle(self, item: Item) -> tuple[Array, float]:
-        low, high = np.array(self.shape.bounds).reshape(2, 2)
-        yaw = self.bearing() + float(self.rng.integers(4)) * np.pi / 2
-        if item.kind in ("clutter", "person", "armchair", "plant"):
-            yaw = float(self.rng.uniform(0, 2 * np.pi))
-        return self.rng.uniform(low, high), yaw
-
-    def bearing(self) -> float:
-        """rad, direction of the longest wall."""
-        steps = np.diff(np.asarray(self.shape.exterior.coords), axis=0)
-        longest = steps[np.argmax(np.hypot(steps[:, 0], steps[:, 1]))]
-        return float(np.arctan2(longest[1], longest[0]))
-
-    def rows(self, kind: str, count: int) -> list[Item]:
-        """Up to `count` items of one make on a grid in the room's middle, with aisles."""
-        item, yaw, out = make_item(kind, self.rng), self.bearing(), []
-        turned = np.asarray(self.shape.exterior.coords) @ rotation(-yaw)
-        low, high = turned.min(axis=0) + 0.7, turned.max(axis=0) - 0.7
-        xs = np.arange(low[0] + item.size[0] / 2, high[0] - item.size[0] / 2 + 1e-6, item.size[0] + self.rng.uniform(0.5, 0.9))
-        ys = np.arange(low[1] + item.size[1] / 2, high[1] - item.size[1] / 2 + 1e-6, item.size[1] + self.rng.uniform(0.5, 0.9))
-        for spot in ((x, y) for y in ys for x in xs):
-            at = np.array(spot) @ rotation(yaw)
-            outline = _outline(at, yaw, item.size)
-            if len(out) < count and self.fits(outline):
-                out.append(self._place(item, at, yaw, outline))
-        return out
-
-
-def furnish(floor: Floor, kind: str, density: float, clutter: float, doors: Array) -> list[Item]:
-    """Things for a room of a kind.
-
-    Args:
-        floor: the room, with what is taken already (door swings, stairs, columns).
-        kind: of the room; an unknown one gets the furniture of an office.
-        density: 1 is usual.
-        clutter: things on the floor of 10 m2.
-        doors: (d, 2) where people stand when they enter; all must stay reachable from each other.
-    """
-    area, out = floor.shape.area, []
-    wanted = ROOMS.get(kind, [] if kind in ("stairs", "lift", "shaft", "balcony") else ROOMS["office"])
-    for name, where, least, every in wanted:
-        count = (least + (area / every if every else 0.0)) * density
-        number = int(count) + int(floor.rng.random() < count % 1)
-        if where == ROWS:
-            out += floor.rows(name, number)
-            continue
-        placed = (floor.put(make_item(name, floor.rng), where) for _ in range(number))
-        out += [item for item in placed if item is not None]
-    number = int(floor.rng.poisson(clutter * area / 10 * min(density, 1)))
-    if kind not in ("lift", "shaft"):
-        strewn = (floor.put(make_item("clutter", floor.rng), MIDDLE) for _ in range(number))
-        out += [item for item in strewn if item is not None]
-    out = [item for item in out if item.size[2] < floor.height]
-    while out and not passable(floor.shape, out, doors):
-        out = out[: len(out) * 2 // 3]
-    return out
-
-
-def passable(shape: shapely.Polygon, items: list[Item], doors: Array) -> bool:
-    """Can a person get from every door to every other one, and some way into the room?"""
-    blocked = shapely.union_all([i.outline for i in items if i.kind != "board"]).buffer(BODY, 4)
-    parts = shapely.get_parts(shape.buffer(0.1).buffer(-0.1 - BODY * 0.9).difference(blocked))
-    if not len(doors):
-        return True
-    near = shapely.distance(parts[:, None], shapely.points(doors)[None]) < 0.45
-    return bool((near.all(axis=1) & (shapely.area(parts) > 0.15 * shape.area * (shape.area > 8))).any())

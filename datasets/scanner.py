@@ -17,6 +17,7 @@ from topomerge.types import Array, PointCloud, Sim3, TrueRoom
 
 LABEL_CELL = 0.05  # m
 OVERLAP = 1.4  # rays for each point that is kept
+LINE = 540  # rays of a pose of a sensor that sees a line only
 CHUNK = 2_000_000  # rays at a time
 PLAIN = [SURFACES.index(s) for s in ("wall", "floor", "ceiling", "facade")]
 
@@ -41,7 +42,7 @@ def scan(
         frame: the cloud is given in this frame (it maps the building's coordinates into the cloud's); None: the building's own.
 
     Returns:
-        points with `labels` (index into `rooms`: all rooms of the building, in the cloud's frame), estimated `poses` and `pose_of`.
+        points with `labels` (index into `rooms`: all of the building's, in the cloud's frame), estimated `poses` and `pose_of`.
 
     Raises:
         InputError: unknown sensor or room, a spacing that is not positive, a room that cannot be reached.
@@ -53,7 +54,7 @@ def scan(
     visited = [i for i, r in enumerate(building.rooms) if r.kind != "lift"] if rooms is None else [int(r) for r in rooms]
     walk = plan_walk(building, visited, rng)
     poses, along = _poses(walk, kind, visited, rng)
-    number = budget or (720 * len(poses) if kind.beams == 1 else _rays_for(building, visited, spacing))
+    number = budget or (LINE * len(poses) if kind.beams == 1 else _rays_for(building, visited, spacing))
     hits = _cast(building, kind, poses, max(number // len(poses), 8), rng)
     hits = _degrade(building, poses, hits, kind, rng)
     estimated = _drift(poses, walk, along, kind, rng)

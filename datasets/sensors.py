@@ -93,7 +93,7 @@ SENSORS = {
             plain=0.3, metric=False,
         ),
         Sensor(
-            "laser2d", (0.1, 20), 270, (0, 0), 1, height=0.3, step=0.25, turns=4, spacing=0.03, noise=(0.01, 0.0005), drift=0.3
+            "laser2d", (0.1, 20), 270, (0, 0), 1, height=0.3, step=0.35, turns=2, spacing=0.03, noise=(0.01, 0.0005), drift=0.3
         ),
         Sensor(
             "tablet", (0.3, 5.0), 62, (-24, 24), height=1.4, step=0.4, turns=10, pitch=24, swing=16, spacing=0.05,

@@ -10,7 +10,7 @@ from topomerge.datasets.building import SURFACES, Building
 from topomerge.datasets.difficulty import Difficulty
 from topomerge.datasets.erect import draw_state
 from topomerge.datasets.fittings import SWING, keep_clear, leaf_yaw
-from topomerge.datasets.furniture import make_item
+from topomerge.datasets.furniture import footprints, make_item
 from topomerge.datasets.solids import boxes, rotation
 
 from topomerge.types import Array
@@ -61,8 +61,7 @@ def session(building: Building, difficulty: Difficulty | None = None, rng: np.ra
 
 
 def _outline(thing: Array) -> shapely.Polygon:
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * thing["size"][:2] / 2
-    return shapely.Polygon(corners @ rotation(thing["yaw"]) + thing["centre"][:2])
+    return shapely.Polygon(footprints(thing["centre"][None, :2], thing["yaw"][None], thing["size"])[0])
 
 
 def _move(building: Building, things: Array, outlines: Array, gone: Array, i: int, near: bool, rng: np.random.Generator) -> None:

@@ -57,8 +57,8 @@ class Soup:
         return vertices, triangles[kept], np.concatenate(self.labels)[kept], np.concatenate(self.things)[kept]
 
 
-def rotation(yaw: float) -> Array:
-    """(2, 2) matrix that turns row vectors: `points @ rotation(yaw)`."""
+def rotation(yaw: float | Array) -> Array:
+    """(2, 2) matrix that turns row vectors: `points @ rotation(yaw)`; (2, 2, n) for n angles."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, s], [-s, c]])
 
