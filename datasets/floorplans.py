@@ -10,8 +10,9 @@
 | `locations.yaml`, `*_gt_segmentation.png` | robot grids with true rooms: UTexas BWI, IPA | `plan_grid` |
 | `*.ifc` | building models with spaces | `plan_ifc` |
 
-Reasons of refusals start with: not closed, crosses itself, overlapping rooms, zero-width doors, no doors, absurd scale, no scale, too few
-rooms, disconnected, missing file, wrong version, bad line, damaged ..., absurd size, not read, not a ... plan.
+Reasons of refusals start with: not closed, crosses itself, overlapping rooms, zero-width doors, no doors, no walls, absurd
+scale, no scale, too few rooms, disconnected, missing file, wrong version, bad line, damaged ..., absurd size, not read, not a
+... plan.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Schools and offices of Luperto et al. (generativeCMLgraphs): one XML file a storey.
 
 Every ``space`` has a label, a ``bounding_polygon`` in pixels, y down, and portals that name the two spaces they join. Portals
-have no length: doors get a usual width where the two outlines face each other. ``scale`` gives centimetres for some pixels, measured
-on one small door: it is compared with usual sizes of the labelled rooms, and replaced where it can't be right. Outlines run along the
-walls' faces or centre lines, as each draughtsman liked: all are set in by `INSET`.
+have no length: doors get a usual width where the two outlines face each other. ``scale`` gives centimetres for some pixels,
+measured on one small door: it is compared with usual sizes of the labelled rooms, and replaced where it can't be right.
+Outlines run along the walls' faces or centre lines, as each draughtsman liked: all are set in by `INSET`.
 """
 
 from __future__ import annotations

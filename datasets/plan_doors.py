@@ -64,6 +64,8 @@ def facing(a: shapely.Polygon, b: shapely.Polygon, reach: float) -> list[Array]:
     """
     ring = np.asarray(shapely.orient_polygons(a).exterior.coords)[:, :2]
     rings = [ring, *(np.asarray(r.coords)[:, :2] for r in shapely.orient_polygons(a).interiors)]
+    low, high = np.array(a.bounds).reshape(2, 2) + [[-reach - 1], [reach + 1]]
+    b = shapely.intersection(b, shapely.box(*low, *high))  # b may be a hall that is much larger
     near = b.buffer(reach + STEP)
     runs = []
     for corners in rings:

@@ -104,18 +104,13 @@ def finish(draft: Draft) -> tuple[Plan, list[str]]:
 
 def outline(shape: shapely.Polygon) -> Array:
     """(k, 2) outline, counter-clockwise, not closed; holes are joined to it by a slit that is too thin to see."""
-    centre = shape.centroid
-    holes = sorted(shape.interiors, key=lambda ring: -ring.distance(centre))
-    for ring in holes:
-        solid = shapely.Polygon(ring)
-        others = shapely.union_all([shape.exterior, *(r for r in shape.interiors if not solid.covers(r))])
-        slit = shapely.shortest_line(solid, others)
-        cut = _cut(shape, slit)
-        if cut is None:
+    while shape.interiors:
+        ring = shape.interiors[0]
+        others = shapely.union_all([shape.exterior, *list(shape.interiors)[1:]])
+        cut = _cut(shape, shapely.shortest_line(shapely.Polygon(ring), others))
+        if cut is None or len(cut.interiors) >= len(shape.interiors):
             raise InputError("room with a hole: it cannot be cut open")
         shape = cut
-        if not shape.interiors:
-            break
     return np.asarray(shapely.orient_polygons(shape).exterior.coords)[:-1, :2].copy()
 
 
