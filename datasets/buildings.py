@@ -6,8 +6,7 @@ lifts, halls and atria go through all storeys; the rest repeats or differs from 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,99 +17,13 @@ from topomerge.datasets.draft import Draft, point
 from topomerge.datasets.erect import erect
 from topomerge.datasets.layouts import SHAPES, Core, Layout, Row, Size, draw, make_layout
 from topomerge.datasets.plan import Flight, Plan
+from topomerge.datasets.profiles import DARK, INNER, KINDS, PROFILES, WIDTHS, Deck, Profile, Range
 from topomerge.datasets.stairs import length_for, width_for
 
 from topomerge.errors import InputError
 
-Range = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Profile:
-    """What a kind of building is drawn from; lengths in metres.
-
-    Args:
-        rooms: deck of row rooms on the ground floor; a kind's share is how often it is named.
-        upper: deck of the other storeys, empty: the same.
-        cores: kinds that every storey has at one place.
-        same: all row rooms of a kind have one width, as in hotels and hospitals.
-    """
-
-    shapes: tuple[str, ...]
-    length: Range
-    depth: Range
-    corridor: Range
-    rooms: tuple[str, ...]
-    upper: tuple[str, ...] = ()
-    cores: tuple[str, ...] = ("toilets",)
-    stairs: tuple[str, ...] = ("dogleg", "dogleg", "straight", "spiral")
-    height: Range = (3.1, 3.6)
-    same: bool = False
-    lift: bool = True
-
-
-PROFILES = {
-    "office": Profile(
-        ("single", "double", "double", "ring", "L", "T", "U", "comb"), (24, 42), (4.8, 6.4), (1.6, 2.2),
-        ("office",) * 6 + ("meeting", "storage", "office", "kitchen"),
-    ),
-    "openplan": Profile(
-        ("ring", "double", "double"), (28, 40), (6.5, 9.0), (1.6, 2.2), ("openplan", "openplan", "meeting", "office")
-    ),
-    "apartment": Profile(
-        ("double", "single", "L"), (18, 32), (8.6, 9.8), (1.4, 1.8), ("flat",), cores=(), height=(2.8, 3.0), stairs=("dogleg",)
-    ),
-    "hotel": Profile(
-        ("double", "double", "L", "U", "T"), (30, 48), (6.4, 7.2), (1.5, 1.9), ("hotel",), cores=("storage",), same=True,
-        height=(2.9, 3.2), stairs=("dogleg", "straight"),
-    ),
-    "hospital": Profile(
-        ("double", "ring", "T", "comb"), (32, 50), (6.2, 7.0), (2.2, 3.0), ("ward",) * 7 + ("office", "storage"),
-        cores=("nurses", "toilets", "storage"), same=True, stairs=("dogleg", "dogleg", "ramp"),
-    ),
-    "school": Profile(
-        ("single", "double", "L", "U", "T"), (34, 52), (7.0, 8.0), (2.4, 3.0),
-        ("classroom",) * 7 + ("office", "cloakroom", "storage", "library"), cores=("hall", "toilets"), height=(3.4, 3.9),
-    ),
-    "lab": Profile(
-        ("double", "ring", "L"), (28, 44), (6.0, 7.5), (1.8, 2.4), ("lab", "lab", "lab", "office", "office", "storage"),
-        height=(3.4, 3.9),
-    ),
-    "house": Profile(
-        ("double",), (7.5, 10.5), (3.5, 4.6), (1.4, 1.9), ("living", "kitchen", "bath", "office"),
-        upper=("bedroom", "bedroom", "bath", "bedroom"), cores=(), height=(2.8, 3.0), stairs=("dogleg", "spiral"), lift=False,
-    ),
-}  # fmt: skip
-KINDS = tuple(PROFILES)
-WIDTHS: dict[str, Range] = {
-    "office": (2.6, 4.6), "meeting": (4.0, 7.0), "storage": (1.9, 3.0), "kitchen": (2.8, 4.0), "openplan": (9.0, 16.0),
-    "flat": (7.6, 9.4), "hotel": (3.5, 4.1), "ward": (3.8, 4.6), "classroom": (7.2, 9.4), "library": (9.0, 13.0),
-    "cloakroom": (3.0, 4.5), "lab": (5.4, 9.5), "living": (4.2, 6.5), "bath": (2.0, 2.6), "bedroom": (2.9, 4.4),
-    "toilets": (3.0, 4.5), "nurses": (4.5, 6.5), "hall": (12.0, 16.0), "atrium": (7.0, 10.0), "lift": (2.1, 2.5),
-}  # fmt: skip
-INNER = ("storage", "meeting", "kitchen", "storage", "office", "toilets")  # what lies in a building's middle
-DARK = {"storage", "lift", "bath", "toilets", "corridor", "void"}  # no windows, or small ones
 LANDING = 1.35  # m before a flight
 TRIES = 20
-
-
-class Deck:
-    """Kinds of rooms in a shuffled order, dealt again when all are out, so that shares hold even in small buildings."""
-
-    def __init__(self, kinds: Sequence[str], style: int | None, rng: np.random.Generator) -> None:
-        self.kinds, self.rng = kinds, rng
-        self.left: list[str] = []
-        fixed = np.random.default_rng(style)
-        self.widths = {} if style is None else {k: float(fixed.uniform(*WIDTHS[k])) for k in sorted(set(kinds))}
-
-    def draw(self, most: float) -> tuple[str, float]:
-        """The next kind that fits into a width, and its own width; an office or a store where none fits."""
-        for _ in range(2 * len(self.kinds)):
-            self.left = self.left or self.rng.permutation(np.array(self.kinds)).tolist()
-            kind = self.left.pop()
-            if WIDTHS[kind][0] * 0.85 <= most:
-                return kind, self.widths.get(kind) or float(self.rng.uniform(*WIDTHS[kind]))
-        return ("storage" if most < 2.8 or "flat" in self.kinds else "office"), most
 
 
 def make_building(
@@ -242,7 +155,10 @@ def _storey(
             fronts += _core(draft, row, core, corridors[row.corridor], k, storeys, height)
         for a, b in row.gaps():
             cards = inner if row.inner else deck
-            fronts += _fill(draft, row, (a, b), cards, corridors[row.corridor], rng)
+            rooms = _fill(draft, row, (a, b), cards, corridors[row.corridor], rng)
+            fronts += rooms
+            if row.behind >= 0:
+                _through(draft, [r for r, _ in rooms], corridors[row.behind])
     if k == 0:
         draft.entrance(corridors[0], 1.5) or draft.entrance(corridors[0], 1.0)
     for room, corridor in fronts:
@@ -251,6 +167,15 @@ def _storey(
             draft.glaze(room, corridor)
     _windows(draft, np.random.default_rng(seeds[1]))
     return draft.plan(height, ceiling)
+
+
+def _through(draft: Draft, rooms: list[int], corridor: int) -> None:
+    """Second doors, for rooms that lie between two corridors."""
+    for room in rooms:
+        if draft.rooms[room].kind == "lounge":
+            draft.door(room, corridor, 2.4, "opening")
+        elif draft.rooms[room].kind == "meeting":
+            draft.door(room, corridor, 0.9)
 
 
 def _windows(draft: Draft, rng: np.random.Generator) -> None:
@@ -350,6 +275,8 @@ def _row_room(draft: Draft, row: Row, span: Range, kind: str, corridor: int, rng
         kind, float(rng.choice([0.8, 0.85, 0.9, 1.0]))
     )
     opening = "opening" if kind in ("openplan", "living") and rng.random() < 0.5 else "door"
+    if kind == "lounge":
+        wide, opening = 2.4, "opening"
     draft.door(room, corridor, min(wide, b - a - 0.6), opening)
     if b - a > 8.5:
         draft.door(room, corridor, min(wide, 1.0))
@@ -379,7 +306,7 @@ def _flat(draft: Draft, row: Row, span: Range, corridor: int, rng: np.random.Gen
         u, v = (b - x1, b - x0) if mirrored else (a + x0, a + x1)
         return shapely.Polygon(np.round(row.place([[u, y0], [v, y0], [v, y1], [u, y1]]), 3))
 
-    width, side, hall = b - a, round(float(rng.uniform(2.7, 3.4)), 2), 1.35
+    width, side, hall = b - a, round(float(rng.uniform(2.7, 3.4)), 2), 1.4
     bath, kitchen, back = 2.3, round(float(rng.uniform(2.6, 3.0)), 2), round(depth * float(rng.uniform(0.52, 0.6)), 2)
     entry = draft.room(box(side, 0, side + hall, back), "corridor")
     rooms = [

@@ -182,6 +182,7 @@ ROOMS: dict[str, list[tuple[str, str, int, float]]] = {
         ("plant", WALL, 1, 30),
     ],
     "atrium": [("sofa", MIDDLE, 1, 60), ("lowtable", MIDDLE, 1, 60), ("plant", WALL, 2, 40), ("dining", MIDDLE, 0, 60)],
+    "lounge": [("sofa", MIDDLE, 1, 30), ("lowtable", MIDDLE, 1, 40), ("plant", WALL, 1, 30), ("shelf", WALL, 0, 30)],
     "kitchen": [("kitchen", WALL, 1, 0), ("dining", MIDDLE, 1, 0), ("cabinet", WALL, 0, 15)],
     "living": [
         ("sofa", WALL, 1, 25),

@@ -44,6 +44,7 @@ class Row:
         ends: depth at its start and end; they differ where the outer wall is slanted.
         corridor: index of the corridor that it opens to.
         inner: its back is no outer wall: no place for rooms that need daylight.
+        behind: index of the corridor at its back, to which lounges open, too; -1: none.
     """
 
     start: tuple[float, float]
@@ -52,6 +53,7 @@ class Row:
     ends: tuple[float, float]
     corridor: int
     inner: bool = False
+    behind: int = -1
     cores: tuple[Core, ...] = ()
 
     def place(self, points: Array) -> Array:
@@ -137,10 +139,11 @@ def _wing(layout: Layout, x: float, w: float, d: float, length: float) -> None:
 
 
 def _ring(size: Size, rng: np.random.Generator) -> Layout:
-    """A corridor around a core of two rows, in two halves that doors part; rooms on its outside."""
+    """A corridor around a core of one or two rows, in two halves that doors part; rooms on its outside."""
     w, d = size.corridor, size.near
+    back_to_back = bool(rng.random() < 0.5)
     deep = round(float(rng.uniform(4.0, 5.0)), 2)
-    long, wide = round(max(size.length - 2 * d, 16.0), 2), round(2 * w + 2 * deep, 2)
+    long, wide = round(max(size.length - 2 * d, 16.0), 2), round(2 * w + (1 + back_to_back) * deep, 2)
     low = shapely.box(0, 0, long - w, w).union(shapely.box(0, 0, w, wide))
     high = shapely.box(w, wide - w, long, wide).union(shapely.box(long - w, 0, long, wide))
     layout = Layout([low, high], [(0, 1)])
@@ -149,9 +152,10 @@ def _ring(size: Size, rng: np.random.Generator) -> Layout:
         Row((w, wide), 0.0, long - w, (d, d), 1),
         Row((0.0, 0.0), np.pi / 2, wide, (size.far, size.far), 0),
         Row((long, wide), -np.pi / 2, wide, (size.far, size.far), 1),
-        Row((w, w), 0.0, long - 2 * w, (deep, deep), 0, True),
-        Row((long - w, wide - w), np.pi, long - 2 * w, (deep, deep), 1, True),
+        Row((w, w), 0.0, long - 2 * w, (deep, deep), 0, True, -1 if back_to_back else 1),
     ]
+    if back_to_back:
+        layout.rows.append(Row((long - w, wide - w), np.pi, long - 2 * w, (deep, deep), 1, True))
     return layout
 
 

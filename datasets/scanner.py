@@ -62,18 +62,27 @@ def scan(
     if not budget:
         kept = _thin(points, spacing)
         points, hits = points[kept], hits.take(kept)
-    frame = frame or Sim3()
-    placed = estimated.copy()
-    placed[:, :3, 3] = frame.apply(estimated[:, :3, 3])
-    placed[:, :3, :3] = Sim3(frame.yaw).matrix[:3, :3] @ estimated[:, :3, :3]
-    return PointCloud(
-        frame.apply(points).astype(np.float32),
+    cloud = PointCloud(
+        points.astype(np.float32),
         labels=_rooms_of(building, poses, hits),
-        poses=placed,
+        poses=estimated,
         pose_of=hits.pose.astype(np.int32),
-        rooms=tuple(_moved(r, frame) for r in building.rooms),
+        rooms=building.rooms,
         source=f"{building.name}:{kind.name}",
     )
+    return moved(cloud, frame) if frame else cloud
+
+
+def moved(cloud: PointCloud, frame: Sim3) -> PointCloud:
+    """The same cloud in another frame: points, poses and rooms."""
+    poses = None
+    if cloud.poses is not None:
+        poses = cloud.poses.copy()
+        poses[:, :3, 3] = frame.apply(poses[:, :3, 3])
+        poses[:, :3, :3] = Sim3(frame.yaw).matrix[:3, :3] @ poses[:, :3, :3]
+    points = frame.apply(cloud.points.astype(np.float64) + cloud.shift).astype(np.float32)
+    rooms = tuple(_moved(room, frame) for room in cloud.rooms)
+    return replace(cloud, points=points, shift=np.zeros(3), poses=poses, rooms=rooms)
 
 
 @dataclass(frozen=True, eq=False)
