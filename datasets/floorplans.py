@@ -26,7 +26,7 @@ from importlib import import_module
 from pathlib import Path
 
 from topomerge.datasets.plan import Plan
-from topomerge.datasets.plan_draft import Draft, finish
+from topomerge.datasets.plan_sketch import Sketch, finish
 
 from topomerge.errors import InputError
 
@@ -43,7 +43,7 @@ READERS = (  # what a file's name matches, and the module that reads it
 )
 NOT_PLANS = re.compile(r"(^|/)(NOTE|README|LICENSE[^/]*)\.txt$|\.vectormap\.txt$|\.navigation\.txt$|(^|/)package\.xml$")
 
-Maker = Callable[[], Draft]
+Maker = Callable[[], Sketch]
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _read(path: Path, only: str = "") -> Iterator[tuple[str, Plan | Refusal]]:
     if not module:
         yield path.stem, Refusal(path.stem, f"not a known format: {path.name}")
         return
-    items: Iterator[tuple[str, Maker]] = import_module(f"topomerge.datasets.{module}").drafts(path)
+    items: Iterator[tuple[str, Maker]] = import_module(f"topomerge.datasets.{module}").sketches(path)
     while True:
         try:
             name, make = next(items)

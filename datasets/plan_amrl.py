@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
-from topomerge.datasets.plan_draft import Draft
 from topomerge.datasets.plan_raster import add_contacts, add_rooms, contacts, flood, guess_kinds
+from topomerge.datasets.plan_sketch import Sketch
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -27,14 +27,14 @@ CAVITY = 0.5  # m; narrower space lies within the walls
 MAX_BYTES, MAX_CELLS = 50 << 20, 50_000_000
 
 
-def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
+def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of the one storey."""
     if path.stat().st_size > MAX_BYTES:
         raise InputError(f"absurd size: {path.stat().st_size} bytes for one storey")
-    yield path.name.removesuffix(".vectormap.json"), partial(draft, path.read_bytes())
+    yield path.name.removesuffix(".vectormap.json"), partial(sketch, path.read_bytes())
 
 
-def draft(text: bytes) -> Draft:
+def sketch(text: bytes) -> Sketch:
     """One storey.
 
     Raises:
@@ -47,7 +47,7 @@ def draft(text: bytes) -> Draft:
     seeds = ndimage.label(free & (distance > GAP / 2))[0].astype(np.int32)
     labels = flood(seeds, free, np.round(distance / CELL))
     labels[np.isin(labels, _outdoor(labels, free, wall))] = 0
-    result = Draft(height=3.6, ceiling=2.8, inset=0.02)
+    result = Sketch(height=3.6, ceiling=2.8, inset=0.02)
     index = add_rooms(result, labels, {}, CELL, origin, SMALLEST, CAVITY / 2)
     if not index:
         raise InputError("not closed: the walls enclose no room")

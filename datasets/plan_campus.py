@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 import shapely.affinity
 from topomerge.datasets.plan_doors import place_door
-from topomerge.datasets.plan_draft import Draft, overlaps
+from topomerge.datasets.plan_sketch import Sketch, overlaps
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -69,14 +69,14 @@ class _NoDoctype(ElementTree.TreeBuilder):
         raise InputError("not read: XML with a DOCTYPE")
 
 
-def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
+def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of the one storey of a file."""
     if path.stat().st_size > MAX_BYTES:
         raise InputError(f"absurd size: {path.stat().st_size} bytes for one plan")
-    yield path.stem.removesuffix("_updated"), partial(draft, path.read_bytes())
+    yield path.stem.removesuffix("_updated"), partial(sketch, path.read_bytes())
 
 
-def draft(text: bytes) -> Draft:
+def sketch(text: bytes) -> Sketch:
     """One storey.
 
     Raises:
@@ -89,7 +89,7 @@ def draft(text: bytes) -> Draft:
     spaces = root.findall("floor/spaces/space")
     if root.tag != "building" or not spaces:
         raise InputError("not a campus plan: expected building/floor/spaces/space")
-    result = Draft(inset=INSET, height=3.6, ceiling=3.0)
+    result = Sketch(inset=INSET, height=3.6, ceiling=3.0)
     shapes = {space.get("id", ""): _shape(space, result) for space in spaces}
     scale = _scale(root, spaces, shapes, result)
     indices: dict[str, int] = {}
@@ -114,7 +114,7 @@ def _points(element: ElementTree.Element, path: str) -> Array:
     return np.array(found, float).reshape(-1, 2)
 
 
-def _shape(space: ElementTree.Element, result: Draft) -> shapely.Polygon | None:
+def _shape(space: ElementTree.Element, result: Sketch) -> shapely.Polygon | None:
     """Outline in pixels; None for helpers without one."""
     points = _points(space, "bounding_polygon/point")
     label = space.findtext("labels/label")
@@ -136,7 +136,7 @@ def _shape(space: ElementTree.Element, result: Draft) -> shapely.Polygon | None:
 
 
 def _scale(
-    root: ElementTree.Element, spaces: list[ElementTree.Element], shapes: dict[str, shapely.Polygon | None], result: Draft
+    root: ElementTree.Element, spaces: list[ElementTree.Element], shapes: dict[str, shapely.Polygon | None], result: Sketch
 ) -> float:
     """m per pixel: that of the file, or that of usual rooms where they are more than `TRUSTED` apart."""
     real, drawn = (float(root.findtext(f"scale/{w}_distance/value") or "nan") for w in ("real", "represented"))
@@ -157,7 +157,7 @@ def _scale(
     return stated * factor
 
 
-def _tidy(result: Draft, indices: dict[str, int], helper: dict[str, bool]) -> None:
+def _tidy(result: Sketch, indices: dict[str, int], helper: dict[str, bool]) -> None:
     """Unlabelled helpers that overlap a labelled room go; of two rooms that overlap a little, the larger one gives way."""
     keys = {i: key for key, i in indices.items()}
     for i, j, share in overlaps(result.shapes):
@@ -182,7 +182,7 @@ def _tidy(result: Draft, indices: dict[str, int], helper: dict[str, bool]) -> No
     indices.update({key: order[i] for key, i in indices.items()})
 
 
-def _doors(result: Draft, spaces: list[ElementTree.Element], indices: dict[str, int], scale: float) -> None:
+def _doors(result: Sketch, spaces: list[ElementTree.Element], indices: dict[str, int], scale: float) -> None:
     """One door for each portal; marks of the same door from both sides count once."""
     marks: dict[tuple[int, int], list[tuple[Array, str, float]]] = {}
     for space in spaces:

@@ -18,8 +18,8 @@ import yaml
 from PIL import Image, ImageDraw
 from scipy import ndimage
 from topomerge.datasets.plan_doors import doorway, place_door
-from topomerge.datasets.plan_draft import Draft
 from topomerge.datasets.plan_raster import SPARE, add_contacts, add_rooms, contacts, flood, guess_kinds
+from topomerge.datasets.plan_sketch import Sketch
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -35,7 +35,7 @@ APART = 1.0  # m between an opening of the map and a door of the list
 MAX_PIXELS = 100_000_000
 
 
-def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
+def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of the one storey."""
     if path.suffix == ".yaml":
         yield path.parent.name, partial(bwi, path)
@@ -43,7 +43,7 @@ def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
         yield path.stem.removesuffix("_gt_segmentation"), partial(ipa, path)
 
 
-def ipa(path: Path) -> Draft:
+def ipa(path: Path) -> Sketch:
     """Rooms of a segmentation image and doorways where its lines cross free space of the scan beside it.
 
     Raises:
@@ -63,7 +63,7 @@ def ipa(path: Path) -> Draft:
     labels[np.isin(labels, np.flatnonzero(sizes < SMALLEST / IPA_CELL**2))] = 0
     labels = _without_outside(labels, free)
     labels = flood(labels, free | (labels > 0))
-    result = Draft(height=3.2, ceiling=2.7, inset=0.02)
+    result = Sketch(height=3.2, ceiling=2.7, inset=0.02)
     origin = np.zeros(2)
     index = add_rooms(result, labels, {}, IPA_CELL, origin, SMALLEST, CAVITY / 2)
     add_contacts(result, contacts(labels, IPA_CELL, origin), index, "door")
@@ -71,7 +71,7 @@ def ipa(path: Path) -> Draft:
     return result
 
 
-def bwi(path: Path) -> Draft:
+def bwi(path: Path) -> Sketch:
     """Rooms of `locations.yaml`, doors of `doors.yaml`, and openings where the map is free between two rooms.
 
     The image `locations.png` is not read: on floor 3 its numbers are not those of the list.
@@ -87,7 +87,7 @@ def bwi(path: Path) -> Draft:
         raise InputError("missing file: doors.yaml")
     grid, resolution, origin = _map(path.parent)
     labels = _painted(polygons, grid.shape)
-    result = Draft(height=3.6, ceiling=2.8, inset=0.05)
+    result = Sketch(height=3.6, ceiling=2.8, inset=0.05)
     index = add_rooms(result, labels, dict(enumerate(map(str, names), 1)), resolution, origin, SMALLEST, CAVITY / 2)
     known = {str(name): index.get(k, -1) for k, name in enumerate(names, 1)}
     _listed_doors(result, _yaml(path.with_name("doors.yaml")), known)
@@ -115,7 +115,7 @@ def _painted(polygons: list[list[float]], shape: tuple[int, ...]) -> Array:
     return np.flipud(np.asarray(image, np.int32)).copy()
 
 
-def _listed_doors(result: Draft, doors: Any, known: dict[str, int]) -> None:
+def _listed_doors(result: Sketch, doors: Any, known: dict[str, int]) -> None:
     if not isinstance(doors, list):
         raise InputError("not a grid plan: doors.yaml holds no list")
     for door in doors:
@@ -130,7 +130,7 @@ def _listed_doors(result: Draft, doors: Any, known: dict[str, int]) -> None:
         result.add_opening(replace(placed, kind="door"), (ends[0], ends[1]))  # also double ones have leaves here
 
 
-def _connected(result: Draft, neighbours: Any, known: dict[str, int]) -> None:
+def _connected(result: Sketch, neighbours: Any, known: dict[str, int]) -> None:
     """Openings for rooms that `connectivity.yaml` calls neighbours and that have none yet."""
     done = {frozenset(ends) for ends in result.ends}
     for name, others in sorted(neighbours.items()) if isinstance(neighbours, dict) else []:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import shapely
 from topomerge.datasets.plan_doors import doorway, place_door, sides, window
-from topomerge.datasets.plan_draft import Draft
+from topomerge.datasets.plan_sketch import Sketch
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -50,7 +50,7 @@ PASSAGE = 4.0  # m, widest opening between spaces that touch
 HEIGHTS = (2.4, 8.0)  # m, of a storey
 
 
-def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
+def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of every storey that has spaces, lowest first.
 
     Raises:
@@ -80,7 +80,7 @@ def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
         element: Any = model.by_id(storey) if storey else None
         name = getattr(element, "Name", None) or f"storey {k}"
         above = floors[k + 1] if k + 1 < len(floors) else floors[k] + 3.2
-        yield f"{path.stem}/{name}", partial(draft, storeys[storey], holes, floors[k], above)
+        yield f"{path.stem}/{name}", partial(sketch, storeys[storey], holes, floors[k], above)
 
 
 class Solids:
@@ -106,11 +106,11 @@ class Solids:
         return triangles if len(triangles) else None
 
 
-def draft(rooms: list[tuple[Any, Array]], holes: list[tuple[str, Array, Array]], floor: float, above: float) -> Draft:
+def sketch(rooms: list[tuple[Any, Array]], holes: list[tuple[str, Array, Array]], floor: float, above: float) -> Sketch:
     """One storey from its spaces and the model's holes."""
     height = float(np.clip(above - floor, *HEIGHTS))
     tops = [float(t[..., 2].max() - t[..., 2].min()) for _, t in rooms]
-    result = Draft(height=height, ceiling=float(np.clip(np.median(tops), 2.0, height - 0.2)))
+    result = Sketch(height=height, ceiling=float(np.clip(np.median(tops), 2.0, height - 0.2)))
     for space, triangles in rooms:
         name = " ".join(str(part) for part in (space.Name, space.LongName) if part)
         kind = next((kind for word, kind in KINDS.items() if word in name.lower()), "")
@@ -188,7 +188,7 @@ def _hole(kind: str, triangles: Array) -> tuple[str, Array, Array]:
     return kind, ends, np.array([triangles[..., 2].min(), triangles[..., 2].max()])
 
 
-def _open_sides(result: Draft) -> None:
+def _open_sides(result: Sketch) -> None:
     """Openings where two spaces touch for at least 0.8 m."""
     shapes = np.array(result.shapes, object)
     first, second = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=TOUCHING)

@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 import shapely.geometry
 from topomerge.datasets.plan_doors import place_door
-from topomerge.datasets.plan_draft import Draft, overlaps
+from topomerge.datasets.plan_sketch import Sketch, overlaps
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -41,14 +41,14 @@ DEGREE = 111_320.0  # m
 MAX_BYTES = 50 << 20
 
 
-def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
+def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name (of the folder) and maker of the one storey."""
     if path.stat().st_size > MAX_BYTES:
         raise InputError(f"absurd size: {path.stat().st_size} bytes for one storey")
-    yield path.parent.name, partial(draft, path)
+    yield path.parent.name, partial(sketch, path)
 
 
-def draft(path: Path) -> Draft:
+def sketch(path: Path) -> Sketch:
     """One storey; its origin is the nearest tenth of a degree, so that the storeys of a mall lie over each other.
 
     Raises:
@@ -60,7 +60,7 @@ def draft(path: Path) -> Draft:
     origin = np.round(shapely.get_coordinates(shapely.geometry.shape(features[0]["geometry"])).mean(axis=0), 1)
     floor = _metric(features[0], origin)
     _check_size(floor, path.with_name("floor_info.json"))
-    result = Draft(inset=INSET, height=5.0, ceiling=3.6)
+    result = Sketch(inset=INSET, height=5.0, ceiling=3.6)
     closed = []
     for feature in features[1:]:
         shape = _largest(_metric(feature, origin))
@@ -112,7 +112,7 @@ def _kind(name: str) -> str:
     return next((kind for word, kind in KINDS.items() if word in name), "shop")
 
 
-def _once(result: Draft) -> None:
+def _once(result: Sketch) -> None:
     """Many rooms are in the file twice, and small ones lie within larger ones: the smaller one stays."""
     gone: set[int] = set()
     for i, j, share in overlaps(result.shapes):
@@ -128,7 +128,7 @@ def _once(result: Draft) -> None:
         setattr(result, name, [v for k, v in enumerate(getattr(result, name)) if k not in gone])
 
 
-def _halls(result: Draft, floor: shapely.Geometry, closed: list[shapely.Polygon]) -> None:
+def _halls(result: Sketch, floor: shapely.Geometry, closed: list[shapely.Polygon]) -> None:
     """Add what is left of the floor, and a door from each room to it."""
     rooms = list(result.shapes)
     rest = floor.difference(shapely.union_all([*rooms, *closed]))

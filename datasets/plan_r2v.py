@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 from topomerge.datasets.plan import Wall
 from topomerge.datasets.plan_doors import doorway, sides, window
-from topomerge.datasets.plan_draft import Draft
+from topomerge.datasets.plan_sketch import Sketch
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -49,7 +49,7 @@ MAX_MEMBERS, MAX_BYTES = 100_000, 1 << 20  # of an archive, of one plan
 Rows = list[tuple[Array, str, str]]  # (2, 2) px, category, type
 
 
-def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
+def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of every plan of a text file or a tar archive, whose members are read in memory only.
 
     Raises:
@@ -58,7 +58,7 @@ def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
     if path.suffix == ".txt":
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"absurd size: {path.stat().st_size} bytes for one plan")
-        yield path.stem, partial(draft, path.read_bytes())
+        yield path.stem, partial(sketch, path.read_bytes())
         return
     try:
         with tarfile.open(path, "r:*") as archive:
@@ -72,16 +72,16 @@ def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
                     yield name, partial(_refuse, f"absurd size: {member.size} bytes for one plan")
                     continue
                 stream = archive.extractfile(member)
-                yield name, partial(draft, stream.read() if stream else b"")
+                yield name, partial(sketch, stream.read() if stream else b"")
     except (tarfile.TarError, EOFError, lzma.LZMAError, zlib.error) as error:
         raise InputError(f"damaged archive: {error}") from error
 
 
-def _refuse(reason: str) -> Draft:
+def _refuse(reason: str) -> Sketch:
     raise InputError(reason)
 
 
-def draft(text: bytes) -> Draft:
+def sketch(text: bytes) -> Sketch:
     """One apartment.
 
     Raises:
@@ -96,7 +96,7 @@ def draft(text: bytes) -> Draft:
     faces = _faces(walls, SNAP * scale)
     kinds = _kinds(faces, rows, scale)
     _check_seeds(faces, rows, scale)
-    result = Draft(height=2.9, ceiling=2.4)
+    result = Sketch(height=2.9, ceiling=2.4)
     rooms = np.full(len(faces) + 1, -1)  # the last one is the answer to index -1: outside
     for i, (face, kind) in enumerate(zip(faces, kinds, strict=True)):
         if kind not in OUTSIDE:
@@ -174,7 +174,7 @@ def _check_seeds(faces: list[shapely.Polygon], rows: Rows, scale: float) -> None
         raise InputError(f"not closed: no walls around {open_} of {len(seeds)} bedrooms, living rooms and kitchens")
 
 
-def _openings(result: Draft, rows: Rows, scale: float, faces: list[shapely.Polygon], rooms: Array, walls: Array) -> None:
+def _openings(result: Sketch, rows: Rows, scale: float, faces: list[shapely.Polygon], rooms: Array, walls: Array) -> None:
     """Doors between rooms and at the entrance; other openings to outside are windows, wide ones down to the floor."""
     ends = np.array([ends * scale for ends, category, _ in rows if category == "door" and np.ptp(ends, axis=0).max() > 0])
     if not len(ends):

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from scipy import ndimage
 from topomerge.datasets.plan_doors import doorway
-from topomerge.datasets.plan_draft import Draft
+from topomerge.datasets.plan_sketch import Sketch
 
 from topomerge.types import Array
 
@@ -108,7 +108,7 @@ def _line(points: Array) -> Array:
 
 
 def add_rooms(
-    result: Draft,
+    result: Sketch,
     labels: Array,
     names: dict[int, str],
     resolution: float,
@@ -128,14 +128,14 @@ def add_rooms(
     return index
 
 
-def add_contacts(result: Draft, found: list[tuple[int, int, Array]], index: dict[int, int], kind: str) -> None:
+def add_contacts(result: Sketch, found: list[tuple[int, int, Array]], index: dict[int, int], kind: str) -> None:
     """Add a doorway for each contact of two rooms."""
     for a, b, ends in found:
         if a in index and b in index and np.hypot(*(ends[1] - ends[0])) >= NARROW:
             result.add_opening(doorway(kind, ends[0], ends[1], SPARE), (index[a], index[b]))
 
 
-def guess_kinds(result: Draft, usual: str) -> None:
+def guess_kinds(result: Sketch, usual: str) -> None:
     """Rooms with many doors are corridors, the others `usual`."""
     doors = np.bincount(np.array([e for ends in result.ends for e in ends if e >= 0], int), minlength=len(result.shapes))
     result.kinds = ["corridor" if n >= BUSY else usual for n in doors]

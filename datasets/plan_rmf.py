@@ -16,7 +16,7 @@ import shapely
 import yaml
 from topomerge.datasets.plan import Flight, Wall
 from topomerge.datasets.plan_doors import doorway, sides
-from topomerge.datasets.plan_draft import Draft
+from topomerge.datasets.plan_sketch import Sketch
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -50,7 +50,7 @@ MAX_BYTES = 20 << 20
 Level = dict[str, Any]
 
 
-def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
+def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of every level, lowest first.
 
     Raises:
@@ -69,10 +69,10 @@ def drafts(path: Path) -> Iterator[tuple[str, Callable[[], Draft]]]:
     stem = path.name.removesuffix(".building.yaml")
     order = sorted(site["levels"], key=lambda name: float(site["levels"][name].get("elevation", 0)))
     for k, name in enumerate(order):
-        yield f"{stem}/{name}", partial(draft, site, order, k, stem)
+        yield f"{stem}/{name}", partial(sketch, site, order, k, stem)
 
 
-def draft(site: dict[str, Any], order: list[str], k: int, stem: str = "") -> Draft:
+def sketch(site: dict[str, Any], order: list[str], k: int, stem: str = "") -> Sketch:
     """Level k of a building, in the frame of its lowest level.
 
     Raises:
@@ -88,7 +88,7 @@ def draft(site: dict[str, Any], order: list[str], k: int, stem: str = "") -> Dra
     walls = np.concatenate([walls, *(np.stack([c, np.roll(c, -1, axis=0)], axis=1) for c in shafts)])
     gaps = _gaps(np.concatenate([walls, doors]), walls)
     faces = _faces(np.concatenate([walls, doors, gaps]), level, points, shafts)
-    result = Draft(inset=THICKNESS / 2, height=_height(site, order, k), ceiling=CEILING)
+    result = Sketch(inset=THICKNESS / 2, height=_height(site, order, k), ceiling=CEILING)
     for face in faces:
         result.add_room(f"room {len(result.shapes)}", "", face)
     result.walls = [Wall((a[0], a[1]), (b[0], b[1]), THICKNESS) for a, b in walls.tolist()]
@@ -220,7 +220,7 @@ def _height(site: dict[str, Any], order: list[str], k: int) -> float:
     return above - here if STOREYS[0] <= above - here <= STOREYS[1] else STOREY
 
 
-def _name(result: Draft, level: Level, points: Array, shafts: list[Array], stem: str) -> None:
+def _name(result: Sketch, level: Level, points: Array, shafts: list[Array], stem: str) -> None:
     """Names from the waypoints in each room; kinds from words in them, from the lifts, and from the number of doors."""
     tree = shapely.STRtree(result.shapes)
     for vertex, point in zip(level.get("vertices", []), points, strict=True):

@@ -1,6 +1,6 @@
 """What every reader of plans ends with: shapes, walls and openings in metres, y up, made into a checked `Plan`.
 
-A reader collects a `Draft`; `finish` insets the rooms where walls have no lines of their own, cuts holes open, keeps the
+A reader collects a `Sketch`; `finish` insets the rooms where walls have no lines of their own, cuts holes open, keeps the
 largest part that doors connect, and refuses what no building could have. The reason of a refusal starts with a few fixed
 words and a colon, so that refusals can be counted.
 """
@@ -29,7 +29,7 @@ MIN_SHARE = 0.5  # of the floor that the largest connected part must hold
 
 
 @dataclass(eq=False)
-class Draft:
+class Sketch:
     """A storey while it is being read.
 
     Args:
@@ -66,22 +66,22 @@ class Draft:
             self.ends.append(ends)
 
 
-def finish(draft: Draft) -> tuple[Plan, list[str]]:
+def finish(sketch: Sketch) -> tuple[Plan, list[str]]:
     """A checked plan and notes on what was changed.
 
     Raises:
         InputError: for the reasons listed in `floorplans`.
     """
-    notes = list(draft.notes)
-    shapes = [_solid(shape, name) for shape, name in zip(draft.shapes, draft.names, strict=True)]
-    _check_overlap(shapes, draft.names)
-    if draft.inset:
-        shapes = [_largest(shape.buffer(-draft.inset, join_style="mitre")) for shape in shapes]
+    notes = list(sketch.notes)
+    shapes = [_solid(shape, name) for shape, name in zip(sketch.shapes, sketch.names, strict=True)]
+    _check_overlap(shapes, sketch.names)
+    if sketch.inset:
+        shapes = [_largest(shape.buffer(-sketch.inset, join_style="mitre")) for shape in shapes]
     shapes = [_largest(shape.simplify(TOLERANCE)) for shape in shapes]
-    passable = _check_doors(draft) & _verified(draft, shapes)
-    kept = _connected(draft, shapes, passable)
-    stays = np.array([_stays(ends, kept) for ends in draft.ends], bool)
-    walked = np.array([opening.kind != "window" for opening in draft.openings], bool)
+    passable = _check_doors(sketch) & _verified(sketch, shapes)
+    kept = _connected(sketch, shapes, passable)
+    stays = np.array([_stays(ends, kept) for ends in sketch.ends], bool)
+    walked = np.array([opening.kind != "window" for opening in sketch.openings], bool)
     lost = int((stays & walked & ~passable).sum())
     if lost:
         notes.append(f"left out {lost} doors that are too narrow or too wide or do not lead where they should")
@@ -90,11 +90,11 @@ def finish(draft: Draft) -> tuple[Plan, list[str]]:
     _check_scale([shape for shape, keep in zip(shapes, kept, strict=True) if keep])
     rooms = tuple(
         PlanRoom(name, outline(shape), kind)
-        for name, kind, shape, keep in zip(draft.names, draft.kinds, shapes, kept, strict=True)
+        for name, kind, shape, keep in zip(sketch.names, sketch.kinds, shapes, kept, strict=True)
         if keep
     )
-    openings = tuple(o for o, good in zip(draft.openings, stays & (passable | ~walked), strict=True) if good)
-    plan = Plan(rooms, tuple(draft.walls), openings, tuple(draft.flights), height=draft.height, ceiling=draft.ceiling)
+    openings = tuple(o for o, good in zip(sketch.openings, stays & (passable | ~walked), strict=True) if good)
+    plan = Plan(rooms, tuple(sketch.walls), openings, tuple(sketch.flights), height=sketch.height, ceiling=sketch.ceiling)
     try:
         check_plan(plan, "check")
     except InputError as error:
@@ -164,10 +164,10 @@ def _check_overlap(shapes: Sequence[shapely.Polygon], names: Sequence[str]) -> N
         raise InputError(f"overlapping rooms: {names[i]!r} and {names[j]!r} share {share:.0%} of the smaller")
 
 
-def _check_doors(draft: Draft) -> Array:
+def _check_doors(sketch: Sketch) -> Array:
     """(n,) bool: can one walk through the opening? Refuses a plan whose doors have no width or an absurd one."""
-    walked = np.array([o.kind in ("door", "opening") for o in draft.openings], bool)
-    width = np.array([np.hypot(o.end[0] - o.start[0], o.end[1] - o.start[1]) for o in draft.openings])
+    walked = np.array([o.kind in ("door", "opening") for o in sketch.openings], bool)
+    width = np.array([np.hypot(o.end[0] - o.start[0], o.end[1] - o.start[1]) for o in sketch.openings])
     if not walked.any():
         raise InputError("no doors: nothing joins the rooms")
     if (width[walked] < 0.01).all():
@@ -184,14 +184,14 @@ def _check_scale(shapes: Sequence[shapely.Polygon]) -> None:
         raise InputError(f"absurd scale: rooms of {total:.1f} m2 together, not {MIN_TOTAL:g} to {MAX_TOTAL:g} m2")
 
 
-def _connected(draft: Draft, shapes: Sequence[shapely.Polygon], passable: Array) -> Array:
+def _connected(sketch: Sketch, shapes: Sequence[shapely.Polygon], passable: Array) -> Array:
     """(R,) bool: rooms of the largest part that doors join; ties go to the larger area."""
     count = len(shapes)
     if count < 2:
         raise InputError(f"too few rooms: {count}")
     areas = np.array([shape.area for shape in shapes])
     large = areas >= MIN_AREA
-    ends = np.array(draft.ends, np.int64).reshape(-1, 2)[passable]
+    ends = np.array(sketch.ends, np.int64).reshape(-1, 2)[passable]
     ends = ends[(ends >= 0).all(axis=1)]
     ends = ends[large[ends].all(axis=1)]
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -206,15 +206,15 @@ def _connected(draft: Draft, shapes: Sequence[shapely.Polygon], passable: Array)
     return kept
 
 
-def _verified(draft: Draft, shapes: Sequence[shapely.Polygon]) -> Array:
+def _verified(sketch: Sketch, shapes: Sequence[shapely.Polygon]) -> Array:
     """(n,) bool: does one find the two rooms of an opening on its two sides?"""
     found = sides(
-        np.array([o.start for o in draft.openings]),
-        np.array([o.end for o in draft.openings]),
+        np.array([o.start for o in sketch.openings]),
+        np.array([o.end for o in sketch.openings]),
         shapes,
-        np.array([o.thickness / 2 + 0.3 for o in draft.openings]),
+        np.array([o.thickness / 2 + 0.3 for o in sketch.openings]),
     )
-    wanted = np.array(draft.ends, np.int64).reshape(-1, 2)
+    wanted = np.array(sketch.ends, np.int64).reshape(-1, 2)
     good: Array = (np.sort(found, axis=1) == np.sort(wanted, axis=1)).all(axis=1)
     return good
 
