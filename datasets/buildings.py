@@ -190,22 +190,22 @@ def _windows(draft: Draft, rng: np.random.Generator) -> None:
 
 def _core(draft: Draft, row: Row, core: Core, corridor: int, k: int, storeys: int, height: float) -> list[tuple[int, int]]:
     """Draw a core on storey k."""
-    outline = row.outline(core.start, core.start + core.width, core.depth)
+    end = core.start + core.width
+    outline = row.outline(core.start, end, core.depth)
+    front = shapely.LineString(np.round(row.place([[core.start, 0], [end, 0]]), 3))  # stairs must be entered at their foot
     tall = core.kind in ("atrium", "hall")
     if tall and k == 1:
-        void = draft.room(outline, "void", height - 0.4)
-        draft.door(void, corridor, core.width - 1.0, "gallery", 0.5, bottom=1.0, top=2.3)
+        draft.room(outline, "void", height - 0.4)
+        draft.cut(front, core.width - 1.0, "gallery", 0.5, bottom=1.0, top=2.3)
         return []
     kind = core.kind if not tall or k == 0 else "openplan"
     ceiling = (2 * height - 0.4 if storeys > 1 else 4.8) if tall and k == 0 else 0.0
     room = draft.room(outline, kind, ceiling)
     width = {"lift": 1.0, "hall": 1.6, "atrium": 2.4, "stairs": 1.0, "nurses": 2.4}.get(kind, 0.9)
     opening = "opening" if kind in ("atrium", "nurses") else "door"
-    draft.door(
-        room, corridor, width, opening, 0.5 if kind != "hall" else 0.3, state="shut" if kind == "lift" else "", top=_top(kind)
-    )
+    draft.cut(front, width, opening, 0.3 if kind == "hall" else 0.5, state="shut" if kind == "lift" else "", top=_top(kind))
     if kind == "hall":
-        draft.door(room, corridor, width, opening, 0.8)
+        draft.cut(front, width, opening, 0.8)
     if core.flight and k + 1 < storeys:
         draft.flights.append(_flight(row, core, draft.wall, height))
     return [(room, corridor)] if kind not in ("stairs", "lift") else []

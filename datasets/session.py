@@ -110,11 +110,13 @@ def _people(
         shape = shapely.Polygon(room.polygon)
         low, high = np.array(shape.bounds).reshape(2, 2)
         for _ in range(int(rng.poisson(difficulty.people)) if room.kind != "lift" else 0):
-            item = make_item("person", rng)
-            at, yaw = rng.uniform(low, high), float(rng.uniform(0, 2 * np.pi))
-            body = shapely.Point(at).buffer(0.3)
-            if not shape.contains(body) or len(tree.query(body, "intersects")) or any(body.intersects(s) for s in stairs):
+            item, yaw = make_item("person", rng), float(rng.uniform(0, 2 * np.pi))
+            bodies = shapely.points(rng.uniform(low, high, (TRIES, 2)))
+            bodies = bodies[shapely.contains(shape, bodies) & (shapely.distance(shape.exterior, bodies) > 0.3)]
+            bodies = [b for b in bodies if not len(tree.query(b, "dwithin", 0.3)) and all(b.distance(s) > 0.3 for s in stairs)]
+            if not bodies:
                 continue
+            at = shapely.get_coordinates(bodies[0])[0]
             vertices, triangles = boxes(item.parts, np.array([*at, room.floor]), yaw)
             mesh[1] = np.concatenate([mesh[1], (triangles + len(mesh[0])).astype(np.int32)])
             mesh[0] = np.concatenate([mesh[0], vertices])
