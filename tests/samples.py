@@ -67,8 +67,11 @@ def write_e57(path: Path, scans: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
     file.close()
 
 
-def write_ifc(path: Path) -> None:
-    """Two rooms of 4 x 3 m side by side, one above the first; a wall with a door leaf standing in it; millimetres."""
+def write_ifc(path: Path, slab: bool = False) -> None:
+    """Two rooms of 4 x 3 m side by side, one above the first; a wall with a door leaf standing in it; millimetres.
+
+    No room has a floor, unless a slab lies under the lower two.
+    """
     import ifcopenshell
     from ifcopenshell import guid
 
@@ -104,6 +107,8 @@ def write_ifc(path: Path) -> None:
     make("IfcRelAggregates", guid.new(), RelatingObject=lower, RelatedObjects=[office, hall])
     make("IfcRelAggregates", guid.new(), RelatingObject=upper, RelatedObjects=[attic])
     product("IfcWall", "wall", rectangle(4000, 0, 200, 3000), 0, 2500)
+    if slab:
+        product("IfcSlab", "slab", rectangle(0, 0, 8200, 3000), -200, 200)
     product("IfcDoor", "door", rectangle(4000, 4000, 200, 900), 0, 2000)
     model.write(str(path))
 

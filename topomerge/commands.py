@@ -70,6 +70,8 @@ READING = (
     option("--resolution", type=_above_zero, metavar="R", help="m a pixel, of a plain image of a floor plan"),
     option("--extrude", type=_above_zero, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
     option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
+    option("--spacing", type=_above_zero, metavar="D", help="m between points on surfaces of meshes, models and 2D maps"),
+    option("--doors", action="store_true", help="keep the door leaves of building models: a leaf is modelled shut"),
 )
 
 
@@ -81,7 +83,7 @@ def extract_command(args: argparse.Namespace) -> int:
         from topomerge.extraction.extract import extract
         from topomerge.io.points import read_chunks
 
-        reading = _given(args, "up", "unit", "scale", "resolution", "extrude", "ceiling")
+        reading = _given(args, "up", "unit", "scale", "resolution", "extrude", "ceiling", "spacing", "doors")
         chunks = read_chunks(args.input, **reading, progress=bars.task("read"))
         choices = _given(args, "voxel_size", "preset")
         found = extract(chunks, **choices, name=args.input, progress=bars.task("extract"))

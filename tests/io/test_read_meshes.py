@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from samples import write_ifc
 
 from topomerge.errors import InputError
 from topomerge.io import read_points
@@ -112,10 +113,14 @@ def test_outline_of_a_body_with_a_hole_and_of_one_without_floor() -> None:
 
 def test_ifc_rooms_walls_and_doors(samples: dict[str, Path]) -> None:
     cloud = read_points(samples["model.ifc"], spacing=0.1)
-    np.testing.assert_allclose(cloud.points.min(axis=0), (4, 0, 0), atol=1e-4)
-    np.testing.assert_allclose(cloud.points.max(axis=0), (4.2, 3, 2.5), atol=1e-4)
+    built = cloud.points[(cloud.points[:, 0] > 3.999) & (cloud.points[:, 0] < 4.201)]
+    np.testing.assert_allclose(built.min(axis=0), (4, 0, 0), atol=1e-4)
+    np.testing.assert_allclose(built.max(axis=0), (4.2, 3, 2.5), atol=1e-4)
     wall = 2 * (0.2 * 3 + 0.2 * 2.5 + 3 * 2.5)
-    assert len(cloud) == pytest.approx(wall / 0.1**2, rel=0.1)
+    assert len(built) == pytest.approx(wall / 0.1**2, rel=0.1)
+    assert any("no floors under 3 of its spaces" in w for w in cloud.warnings)
+    floors = [int((np.abs(cloud.points[:, 2] - z) < 1e-3).sum()) for z in (0.0, 2.8)]
+    assert floors == pytest.approx([(12 + 9) / 0.1**2, 12 / 0.1**2], rel=0.1)
     rooms = [(r.name, r.kind, r.storey, round(r.floor, 3), round(r.ceiling, 3)) for r in cloud.rooms]
     assert rooms == [("1", "Office", 0, 0, 2.5), ("2", "Hall", 0, 0, 2.5), ("3", "Attic", 1, 2.8, 4.8)]
     assert [area(r.polygon) for r in cloud.rooms] == pytest.approx([12, 9, 12], rel=1e-3)
@@ -123,3 +128,10 @@ def test_ifc_rooms_walls_and_doors(samples: dict[str, Path]) -> None:
     shut = read_points(samples["model.ifc"], spacing=0.1, doors=True)
     assert shut.points[:, 1].max() == pytest.approx(4.9, abs=1e-4)
     np.testing.assert_array_equal(read_points(samples["model.ifc"], spacing=0.1).points, cloud.points)
+
+
+def test_ifc_floors_are_made_only_where_no_slab_is(tmp_path: Path) -> None:
+    write_ifc(tmp_path / "slab.ifc", slab=True)
+    cloud = read_points(tmp_path / "slab.ifc", spacing=0.1)
+    assert any("no floors under 1 of its spaces" in w for w in cloud.warnings)
+    assert int((np.abs(cloud.points[:, 2]) < 1e-3).sum()) == pytest.approx(8.2 * 3 / 0.1**2, rel=0.1)

@@ -14,6 +14,7 @@ from topomerge.types import EDGE_DTYPE, Array, VoxelGrid
 
 DOOR_WIDTH = 1.6  # m: what is wider is an opening
 SAME_DOOR = 0.8  # m: passages between the same rooms that are this close are one
+HEIGHT = 0.6  # m: what is higher or lower is another level
 SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
 NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
 
@@ -51,8 +52,8 @@ def find_edges(
         rows = np.unique(np.concatenate([a[here], b[here]]))
         meeting = navigable.subset(rows)
         contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))
-        places = [_edge(navigable, room, rows[contact == c], storey_of_room, floor_to_ceiling, body) for c in range(contact.max() + 1)]
-        edges += _apart(places)
+        parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
+        edges += _apart([_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts])
     return np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
 
 
@@ -92,9 +93,11 @@ def _edge(
 
 def _under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:
     """Rows of the navigable cells in the middle of a passage, at the height of the contact."""
-    near = (np.abs(navigable.cells[:, :2] - middle) * navigable.edge <= 0.25).all(axis=1)
-    near &= np.abs(navigable.cells[:, 2] - contact[:, 2].mean()) * navigable.edge <= 0.6
-    rows = np.flatnonzero(near)
+    reach, rise = int(0.25 / navigable.edge), int(HEIGHT / navigable.edge)
+    low = np.rint([*middle, contact[:, 2].mean()]).astype(np.int64) - (reach, reach, rise)
+    window = np.argwhere(np.ones((2 * reach + 1, 2 * reach + 1, 2 * rise + 1), bool)) + low
+    rows = navigable.rows(window)
+    rows = rows[rows >= 0]
     return rows[~navigable.contains(navigable.cells[rows].astype(np.int64) - (0, 0, 1))]  # the floor, not what was dilated
 
 
@@ -115,13 +118,7 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
     reach = int(np.ceil(SEARCH / navigable.edge))
     low = contact[:, :2].min(axis=0) - reach
     size = contact[:, :2].max(axis=0) + reach + 1 - low
-    z = contact[:, 2].mean()
-    at = navigable.cells
-    near = np.flatnonzero(
-        ((at[:, :2] >= low) & (at[:, :2] < low + size)).all(axis=1) & (np.abs(at[:, 2] - z) * navigable.edge <= 0.6)
-    )
-    owner = np.full(size, -1, np.int64)
-    owner[tuple((at[near, :2] - low).T)] = room[near]
+    owner = _owners(navigable, room, low, size, contact)
     free = np.pad(owner >= 0, 1)
     clearance = np.sqrt(edt.edtsq(free.view(np.uint8), parallel=1))[1:-1, 1:-1]
     # Each room is represented by its widest place away from the border, which may lie on the wrong side of the door.
@@ -151,6 +148,18 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
         return None
     saddle = _between(apart, parts == a)
     return None if saddle is None else _across(owner >= 0, clearance, saddle, low)
+
+
+def _owners(navigable: VoxelGrid, room: Array, low: Array, size: Array, contact: Array) -> Array:
+    """(size) room of each column of a window at `low`, at the height of the contact; -1 where nobody can stand."""
+    reach = int(HEIGHT / navigable.edge)
+    middle = round(float(contact[:, 2].mean()))
+    levels = np.arange(middle - reach, middle + reach + 1)
+    columns = np.argwhere(np.ones(size, bool)) + low
+    cells = np.column_stack([np.tile(columns, (len(levels), 1)), np.repeat(levels, len(columns))])
+    row = navigable.rows(cells)
+    label = np.where(row >= 0, room[np.maximum(row, 0)], -1)
+    return label.reshape(len(levels), *size).max(axis=0)
 
 
 def _between(apart: Array, way: Array) -> Array | None:

@@ -1,7 +1,7 @@
 """Rooms that no neck parts are one room (beyond the thesis: findings.md, "What worked").
 
-The range of the views cuts corridors and halls into pieces, and modularity knows nothing of doors. The floor does: between two rooms
-it is narrow, within one it is not.
+The range of the views cuts corridors and halls into pieces, and modularity knows nothing of doors. The floor does: between two
+rooms it is narrow, within one it is not.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from topomerge.extraction.convolution import moore
 from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.extraction.rooms import navigable_rooms
+from topomerge.extraction.storeys import ceiling_height
 from topomerge.kernels import saddle as kernel
 from topomerge.types import Array, VoxelGrid
 
@@ -20,14 +21,11 @@ LINTEL = 0.25  # m: a passage this much lower than the rooms on both sides is a 
 
 
 @dataclass
-class _Rooms:
-    """The state of the merging: what belongs together, and the measures of each room."""
+class _Passage:
+    """The widest connection of two rooms."""
 
-    label: Array  # (m,) room of each navigable cell
-    clearance: Array  # (m,) m, half the width that is free at a cell
-    height: Array  # (m,) m of empty space above, 0 unknown
-    storey: Array  # (R,)
-    rows: dict[int, Array]  # cells of a room, widest first
+    half_width: float  # m, at its narrowest; 0 if there is none
+    lintel: bool
 
 
 def merge_across_wide_necks(
@@ -57,35 +55,62 @@ def merge_across_wide_necks(
     """
     label = navigable_rooms(grid, room, navigable)
     count = int(room.max(initial=-1)) + 1
-    clearance = (horizontal_distance_field(navigable) + 0.5) * navigable.edge + body / 2
-    by_room = _rows_by_room(label, clearance, count)
-    of_room = np.array([np.bincount(storey[by_room[r]]).argmax() if len(by_room[r]) else -1 for r in range(count)])
-    state = _Rooms(label, clearance, floor_to_ceiling, of_room, by_room)
-    into = np.arange(count)
-    offsets = moore().stencil[0]
+    half_width = (horizontal_distance_field(navigable) + 0.5) * navigable.edge + body / 2
+    rows = _rows_by_room(label, half_width, count)
+    peak = np.array([half_width[r[0]] if len(r) else 0.0 for r in rows])
+    level = [np.bincount(storey[r]).argmax() if len(r) else -1 for r in rows]
+    heights = [ceiling_height(floor_to_ceiling[r]) for r in rows]
     scratch = np.full(len(navigable), -1, np.int64)
-    pairs = {p: _score(navigable, state, p, offsets, scratch, width) for p in _neighbours(navigable, label)}
-    while pairs:
-        best = max(pairs, key=lambda p: (pairs[p], p))
-        if pairs[best] < ratio:
-            break
-        keep, gone = best
-        into[into == gone] = keep
-        state.label[state.rows[gone]] = keep
-        joined = np.concatenate([state.rows[keep], state.rows.pop(gone)])
-        state.rows[keep] = joined[np.argsort(-clearance[joined], kind="stable")]
-        touched = {tuple(sorted((keep if r == gone else r) for r in p)) for p in pairs if keep in p or gone in p} - {(keep, keep)}
-        pairs = {p: s for p, s in pairs.items() if keep not in p and gone not in p}
-        pairs |= {p: _score(navigable, state, p, offsets, scratch, width) for p in touched}  # type: ignore[arg-type]
+    passages: dict[tuple[int, int], _Passage] = {}
+    for a, b in _neighbours(navigable, label):
+        if level[a] == level[b]:
+            lowest_ceiling = min(heights[a], heights[b])
+            passages[a, b] = _passage(navigable, half_width, rows[a], rows[b], scratch, floor_to_ceiling, lowest_ceiling)
+    into = _merge(count, peak, passages, ratio, width)
     kept = np.unique(into)
     number = np.append(np.searchsorted(kept, into), -1).astype(np.int32)
     return number[room]
 
 
-def _rows_by_room(label: Array, clearance: Array, count: int) -> dict[int, Array]:
-    order = np.lexsort((-clearance, label))
-    parts = np.split(order, np.searchsorted(label[order], np.arange(count + 1)))[1:-1]
-    return dict(enumerate(parts))
+def _merge(count: int, peak: Array, passages: dict[tuple[int, int], _Passage], ratio: float, width: float) -> Array:
+    """(count,) the room that each ends up in."""
+    into = np.arange(count)
+    peak = peak.copy()
+
+    def score(pair: tuple[int, int]) -> float:
+        passage = passages[pair]
+        wide = 2 * passage.half_width >= width and not passage.lintel
+        return max(passage.half_width / min(peak[pair[0]], peak[pair[1]]), 1.0 if wide else 0.0)
+
+    scores = {pair: score(pair) for pair in passages}
+    while scores:
+        pair = max(scores, key=lambda p: (scores[p], p))
+        if scores[pair] < ratio:
+            break
+        keep, gone = pair
+        between = passages.pop(pair)
+        larger = keep if peak[keep] >= peak[gone] else gone
+        into[into == gone] = keep
+        peak[keep] = max(peak[keep], peak[gone])
+        del scores[pair]
+        for old in [p for p in passages if keep in p or gone in p]:
+            mine = keep if keep in old else gone
+            other = old[0] if old[1] == mine else old[1]
+            passage = passages.pop(old)
+            scores.pop(old, None)
+            if mine != larger and between.half_width < passage.half_width:
+                passage = between  # the widest place of the two is reached through both passages
+            new = (min(keep, other), max(keep, other))
+            if new not in passages or passage.half_width > passages[new].half_width:
+                passages[new] = passage
+            scores[new] = score(new)
+    return into
+
+
+def _rows_by_room(label: Array, half_width: Array, count: int) -> list[Array]:
+    """Navigable cells of each room, widest place first."""
+    order = np.lexsort((-half_width, label))
+    return np.split(order, np.searchsorted(label[order], np.arange(count + 1)))[1:-1]
 
 
 def _neighbours(navigable: VoxelGrid, label: Array) -> list[tuple[int, int]]:
@@ -99,33 +124,19 @@ def _neighbours(navigable: VoxelGrid, label: Array) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in np.unique(np.concatenate(found), axis=0)]
 
 
-def _score(
-    navigable: VoxelGrid, state: _Rooms, pair: tuple[int, int], offsets: Array, scratch: Array, width: float
-) -> float:
-    """How little of a neck there is between two rooms: 1 for none."""
-    a, b = pair
-    if state.storey[a] != state.storey[b] or not len(state.rows[a]) or not len(state.rows[b]):
-        return 0.0
-    rows = np.concatenate([state.rows[a], state.rows[b]])
-    rows = rows[np.argsort(-state.clearance[rows], kind="stable")]
-    ends = state.rows[a][0], state.rows[b][0]
-    at = kernel.saddle(
-        navigable.cells, *navigable._bricks, offsets, state.clearance, rows, ends[0], ends[1], scratch
-    )
+def _passage(
+    navigable: VoxelGrid, half_width: Array, first: Array, second: Array, scratch: Array, above: Array, ceiling: float
+) -> _Passage:
+    """The narrowest place on the widest way between two rooms, given by their cells, widest place first."""
+    rows = np.concatenate([first, second])
+    rows = rows[np.argsort(-half_width[rows], kind="stable")]
+    offsets = moore().stencil[0]
+    at = kernel.saddle(navigable.cells, *navigable._bricks, offsets, rows, first[0], second[0], scratch)
     if at < 0:
-        return 0.0
-    narrow = float(state.clearance[at])
-    score = narrow / min(float(state.clearance[e]) for e in ends)
-    if 2 * narrow >= width and not _has_lintel(navigable, state, pair, int(at)):
-        return max(score, 1.0)
-    return score
-
-
-def _has_lintel(navigable: VoxelGrid, state: _Rooms, pair: tuple[int, int], at: int) -> bool:
-    """Is the passage lower than the rooms on both sides?"""
-    near = np.abs(navigable.cells - navigable.cells[at]).max(axis=1) * navigable.edge <= 0.4
-    passage = state.height[near][state.height[near] > 0]
-    rooms = [state.height[state.rows[p]] for p in pair]
-    if not len(passage) or any((h > 0).mean() < 0.5 for h in rooms):
-        return False
-    return float(passage.min()) <= min(float(np.median(h[h > 0])) for h in rooms) - LINTEL
+        return _Passage(0.0, False)
+    steps = np.arange(-int(0.4 / navigable.edge), int(0.4 / navigable.edge) + 1)
+    window = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    near = navigable.rows(navigable.cells[at] + window)
+    height = above[near[near >= 0]]
+    lintel = ceiling > 0 and bool((height > 0).any()) and float(height[height > 0].min()) <= ceiling - LINTEL
+    return _Passage(float(half_width[at]), lintel)

@@ -1,6 +1,7 @@
 """Floor plans from robots: a ROS map_server yaml with its image, or a plain image with a resolution.
 
-Occupied pixels become walls, free pixels a floor at z = 0; unknown ones give nothing. The frame is map_server's: x right and y
+Occupied pixels beside others become walls, free pixels a floor at z = 0. Unknown pixels give nothing, nor does the inside of a
+solid area: a sensor sees surfaces, and many plans are black all around the building. The frame is map_server's: x right and y
 up from the lower left corner of the image, turned by the yaw of the origin and moved to it.
 Source: http://wiki.ros.org/map_server (values, thresholds and modes).
 """
@@ -15,6 +16,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.io.piece import BLOCK, LIMIT, Options, Piece, damaged, too_many
@@ -160,6 +162,7 @@ def _extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: Opti
     height = options.extrude / options.factor
     parts = max(1, math.ceil(plan.resolution / spacing - 1e-6))  # points a pixel along each axis
     levels = np.linspace(0.0, height, max(2, math.ceil(height / spacing - 1e-6) + 1))
+    occupied = occupied & ndimage.binary_dilation(~occupied, np.ones((3, 3)))
     walls, floor = int(occupied.sum()), int(free.sum())
     total = parts**2 * (walls * float(len(levels)) + floor * (1 + options.ceiling))
     if total > LIMIT:

@@ -36,7 +36,8 @@ def read(path: Path, options: Options) -> Iterator[Piece]:
     built = [p for p in model.by_type("IfcProduct") if p.Representation and _is_built(p, options.doors)]
     if not built:
         raise InputError(f"{path}: has no building elements with a shape; export it with its geometry")
-    yield Piece(np.empty((0, 3)), rooms=_rooms(model), done=0.05)
+    spaces = _spaces(model)
+    yield Piece(np.empty((0, 3)), rooms=_rooms(spaces), done=0.05)
     shapes: dict[int, tuple[Array, Array]] = {}
     for number, (element, vertices, faces) in enumerate(_shapes(model, built)):
         shapes[element] = vertices, faces
@@ -48,6 +49,7 @@ def read(path: Path, options: Options) -> Iterator[Piece]:
         for piece in sample(path, vertices, faces, options, first=first):
             yield Piece(piece.points, done=0.9)
         first += len(faces)
+    yield from _missing_floors(path, spaces, list(shapes.values()), options, first)
     lost = len(built) - len(shapes)
     if lost:
         yield Piece(np.empty((0, 3)), warnings=(f"{lost} of {len(built)} elements have no usable shape",), done=1.0)
@@ -90,13 +92,65 @@ def _shapes(model: Any, products: list[Any]) -> Iterator[tuple[int, Array, Array
             return
 
 
-def _rooms(model: Any) -> tuple[TrueRoom, ...]:
-    """Every space with a shape, in the order of its storey and name."""
+def _spaces(model: Any) -> list[tuple[Any, Array, Array]]:
+    """(space, vertices, faces) of every space with a shape, in the order of their ids."""
     spaces = {s.id(): s for s in model.by_type("IfcSpace") if s.Representation}
+    shapes = sorted(_shapes(model, list(spaces.values())), key=lambda s: s[0])
+    return [(spaces[element], vertices, faces) for element, vertices, faces in shapes]
+
+
+def _missing_floors(
+    path: Path, spaces: list[tuple[Any, Array, Array]], shapes: list[tuple[Array, Array]], options: Options, first: int
+) -> Iterator[Piece]:
+    """Floors of spaces on a level that has no slab: some models hold walls and ceilings only, and nobody could stand in them."""
+    slabs = np.concatenate([_level_areas(v, f, _flat(v, f)) for v, f in shapes])
+    lows = [_low(v, f) for _, v, f in spaces]
+    floors = [_level_areas(v, f, low) for (_, v, f), low in zip(spaces, lows, strict=True)]
+    levels = np.round([v[:, 2].min() for _, v, _ in spaces], 1)
+    added = 0
+    for level in np.unique(levels):
+        here = np.flatnonzero(levels == level)
+        needed = sum(float(floors[i][:, 1].sum()) for i in here)
+        near = (slabs[:, 0] > level - 0.4) & (slabs[:, 0] < level + 0.15)
+        if float(slabs[near, 1].sum()) >= 0.5 * needed:
+            continue
+        for i in here:
+            _, vertices, faces = spaces[i]
+            for piece in sample(path, vertices, faces[lows[i]], options, first=first):
+                yield Piece(piece.points, done=0.95)
+            first += len(faces)
+        added += len(here)
+    if added:
+        said = f"the model has no floors under {added} of its spaces; the lower faces of the spaces were taken for floors"
+        yield Piece(np.empty((0, 3)), warnings=(said,), done=0.95)
+
+
+def _level_areas(vertices: Array, faces: Array, which: Array) -> Array:
+    """(k, 2) height (m) and area (m2) of the faces chosen."""
+    a, b, c = (vertices[faces[which, i]] for i in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.column_stack([(a + b + c)[:, 2] / 3, area])
+
+
+def _flat(vertices: Array, faces: Array) -> Array:
+    """(m,) bool: is the face rather level than steep?"""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    return np.abs(normals[:, 2]) > 0.7 * np.linalg.norm(normals, axis=1)
+
+
+def _low(vertices: Array, faces: Array) -> Array:
+    """(m,) bool: level faces in the lowest quarter of a body, its floor."""
+    low, high = vertices[:, 2].min(), vertices[:, 2].max()
+    return _flat(vertices, faces) & (vertices[faces][:, :, 2].mean(axis=1) < low + (high - low) / 4)
+
+
+def _rooms(spaces: list[tuple[Any, Array, Array]]) -> tuple[TrueRoom, ...]:
+    """Every space with a shape, in the order of its storey and name."""
     found = []
-    for element, vertices, faces in _shapes(model, list(spaces.values())):
+    for space, vertices, faces in spaces:
         floor, ceiling = float(vertices[:, 2].min()), float(vertices[:, 2].max())
-        found.append((spaces[element], outline(vertices, faces), floor, ceiling))
+        found.append((space, outline(vertices, faces), floor, ceiling))
     storeys = _storeys([(_storey_of(space), floor) for space, _, floor, _ in found])
     rooms = [
         TrueRoom(str(space.Name or ""), polygon, floor, ceiling, storey, str(space.LongName or ""))
@@ -134,9 +188,7 @@ def outline(vertices: Array, faces: Array) -> Array:
     triangles = index.reshape(-1)[faces]
     a, b, c = (points[triangles[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
-    low, high = points[:, 2].min(), points[:, 2].max()
-    flat = np.abs(normals[:, 2]) > 0.7 * np.linalg.norm(normals, axis=1)
-    floor = flat & ((a + b + c)[:, 2] / 3 < low + (high - low) / 4)
+    floor = _low(points, triangles)
     turned = np.where(normals[floor, 2:] < 0, triangles[floor][:, ::-1], triangles[floor])  # all seen from above
     loops = [points[loop, :2] for loop in _loops(turned)]
     best = max(loops, key=area, default=np.empty((0, 2)))

@@ -33,7 +33,7 @@ def _any_near(table, bricks, x, y, z, reach):  # type: ignore[no-untyped-def]  #
 @njit(cache=True, parallel=True)
 def hollow_below(table, bricks, cells, reach, thickness, headroom, limit):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(m,) bool: does a run of at least `headroom` empty cells begin within `thickness` cells below each cell, and end at an
-    occupied one within `limit` cells? A level counts as occupied if any cell within `reach` columns is: sparse points leave gaps."""
+    occupied one within `limit` cells? A level is occupied if any cell within `reach` columns is: sparse points leave gaps."""
     out = np.zeros(len(cells), np.bool_)
     for i in prange(len(cells)):
         empty = 0

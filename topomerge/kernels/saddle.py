@@ -10,7 +10,7 @@ from topomerge.kernels.lookup import row
 
 
 @njit(cache=True)
-def saddle(cells, table, bricks, offsets, clearance, rows, first, second, parent):  # type: ignore[no-untyped-def]  # pragma: no cover
+def saddle(cells, table, bricks, offsets, rows, first, second, parent):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Row of the narrowest cell on the widest way from cell `first` to `second` through the cells `rows`, -1 if there is none.
 
     `rows` must be in descending order of clearance: cells are added one by one, as in Kruskal's algorithm, until the two ends are
