@@ -21,11 +21,13 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
-from topomerge.datasets.plan import Plan
+import numpy as np
+import shapely
+from topomerge.datasets.plan import Flight, Plan, PlanRoom
 from topomerge.datasets.plan_sketch import Sketch, finish
 
 from topomerge.errors import InputError
@@ -42,6 +44,11 @@ READERS = (  # what a file's name matches, and the module that reads it
     (r"\.ifc$", "plan_ifc"),
 )
 NOT_PLANS = re.compile(r"(^|/)(NOTE|README|LICENSE[^/]*)\.txt$|\.vectormap\.txt$|\.navigation\.txt$|(^|/)package\.xml$")
+
+LEVELS = ("plan_rmf", "plan_ifc")  # formats with several storeys a file
+WORDS = {"basement": -1.0, "lower": 0.0, "ground": 0.0, "main": 1.0, "first": 1.0, "upper": 2.0, "second": 2.0, "third": 3.0}
+ALIASES = {"romainrolland": "romainroland"}  # misspelt by the owner
+STRANGERS = ("scuolasconosciuta",)  # "unknown school": the three are different ones
 
 Maker = Callable[[], Sketch]
 
@@ -71,7 +78,23 @@ def read_plans(path: str | Path) -> list[Plan]:
         plans.append(result)
     if not plans:
         raise InputError(f"{path}: no plan in it")
-    return plans
+    return landed(plans)
+
+
+def landed(plans: list[Plan]) -> list[Plan]:
+    """Storeys, lowest first, without the lifts and stairs that end in no room: rooms that no door reaches are left out."""
+    out = []
+    for k, plan in enumerate(plans):
+        above = plans[k + 1].rooms if k + 1 < len(plans) else ()
+        kept = [f for f in plan.flights if all(_in_room(f, rooms) for rooms in (plan.rooms, above))]
+        out.append(replace(plan, flights=tuple(kept)))
+    return out
+
+
+def _in_room(flight: Flight, rooms: tuple[PlanRoom, ...]) -> bool:
+    ahead = np.array([np.cos(flight.heading), np.sin(flight.heading)])
+    middle = np.asarray(flight.corner) + ahead * flight.length / 2 + np.array([ahead[1], -ahead[0]]) * flight.width / 2
+    return any(shapely.Polygon(room.polygon).contains(shapely.Point(middle)) for room in rooms)
 
 
 def iter_plans(folder: str | Path) -> Iterator[tuple[str, Plan | Refusal]]:
@@ -83,16 +106,66 @@ def iter_plans(folder: str | Path) -> Iterator[tuple[str, Plan | Refusal]]:
     Raises:
         InputError: no such folder.
     """
-    folder = Path(folder)
+    for file, root in _files(Path(folder)):
+        for name, result in _read(file):
+            name = _full(file, root, name)
+            yield name, Refusal(name, result.reason) if isinstance(result, Refusal) else result
+
+
+def _files(folder: Path) -> list[tuple[Path, Path]]:
+    """Files with plans, and the folder that their names count from."""
     if not folder.exists():
         raise InputError(f"{folder}: no such file or folder")
-    files = [folder] if folder.is_file() else sorted(p for p in folder.rglob("*") if p.is_file() and _reader(p))
-    root = folder.parent if folder.is_file() else folder
-    for file in files:
-        above = file.parent.relative_to(root).as_posix()
-        for name, result in _read(file):
-            name = name if above == "." else f"{above}/{name}"
-            yield name, Refusal(name, result.reason) if isinstance(result, Refusal) else result
+    if folder.is_file():
+        return [(folder, folder.parent)]
+    return [(p, folder) for p in sorted(folder.rglob("*")) if p.is_file() and _reader(p)]
+
+
+def _full(file: Path, root: Path, name: str) -> str:
+    """Path of the folder and name of the plan, without repeating the folder's own name."""
+    above = file.parent.relative_to(root)
+    if above.name and above.name == name.split("/")[0]:
+        above = above.parent
+    return (above / name).as_posix()
+
+
+def siblings(folder: str | Path) -> list[list[str]]:
+    """Names (as of `iter_plans`) of the plans that are storeys of one building, lowest first; single storeys are left out.
+
+    Storeys of one file belong together; so do files whose names differ in a storey only: Sabadell1 and Sabadell2, P0 and P1,
+    groundfloor and secondfloor, LOWER and MAIN, the folders B1, F1 and F2. Whether their frames and scales agree is up to the
+    owner of the plans: those of the campus plans do not.
+    """
+    groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
+    for file, root in _files(Path(folder)):
+        names = [_full(file, root, name) for name in _names(file)]
+        if len(names) > 1 and _reader(file) in LEVELS:
+            groups[("", names[0])] = [(k, name) for k, name in enumerate(names)]
+        elif len(names) == 1:
+            above, _, last = names[0].rpartition("/")
+            base, level = _storey(last)
+            if base not in STRANGERS:
+                groups.setdefault((above if base or level else names[0], base), []).append((level, names[0]))
+    return [[name for _, name in sorted(group)] for _, group in sorted(groups.items()) if len(group) > 1]
+
+
+def _names(file: Path) -> list[str]:
+    try:
+        return [name for name, _ in import_module(f"topomerge.datasets.{_reader(file)}").sketches(file)]
+    except Exception:  # refused by `iter_plans`, with the reason
+        return []
+
+
+def _storey(name: str) -> tuple[str, float]:
+    """What a plan's name says of its building and of its storey: ("Sabadell", 2) of Sabadell2."""
+    word = re.fullmatch(rf"(.*?)[ _-]*({'|'.join(WORDS)})(?:[ _-]*floor)?", name, re.IGNORECASE)
+    if word:
+        return word[1].lower(), WORDS[word[2].lower()]
+    number = re.fullmatch(r"(.*?)[ _-]*([PFBL]?)(\d)(v\d|[ns]?e?)", name)
+    if not number:
+        return name, 0.0
+    base, level = number[1].lower(), float(number[3])
+    return ALIASES.get(base, base), (-level if number[2] == "B" else level) + (0.5 if number[4] else 0.0)
 
 
 def summarise(results: Iterable[tuple[str, Plan | Refusal] | Refusal]) -> dict[str, int]:

@@ -74,10 +74,10 @@ def finish(sketch: Sketch) -> tuple[Plan, list[str]]:
     """
     notes = list(sketch.notes)
     shapes = [_solid(shape, name) for shape, name in zip(sketch.shapes, sketch.names, strict=True)]
-    _check_overlap(shapes, sketch.names)
     if sketch.inset:
         shapes = [_largest(shape.buffer(-sketch.inset, join_style="mitre")) for shape in shapes]
     shapes = [_largest(shape.simplify(TOLERANCE)) for shape in shapes]
+    _check_overlap(shapes, sketch.names)
     passable = _check_doors(sketch) & _verified(sketch, shapes)
     kept = _connected(sketch, shapes, passable)
     stays = np.array([_stays(ends, kept) for ends in sketch.ends], bool)
