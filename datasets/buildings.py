@@ -271,9 +271,9 @@ def _row_room(draft: Draft, row: Row, span: Range, kind: str, corridor: int, rng
         return _ensuite(draft, row, span, kind, corridor)
     kind = {"flat": "storage"}.get(kind, kind)
     room = draft.room(outline, kind)
-    wide = {"classroom": 1.0, "ward": 1.2, "lab": 1.0, "openplan": 1.6, "living": 1.2}.get(
-        kind, float(rng.choice([0.8, 0.85, 0.9, 1.0]))
-    )
+    usual = float(rng.choice([0.8, 0.85, 0.9, 0.9, 1.0, 1.0, 1.25 if kind != "storage" else 0.9]))
+    usual = float(rng.choice([1.0, 1.5])) if kind == "meeting" else usual
+    wide = {"classroom": 1.0, "ward": 1.2, "lab": 1.2, "openplan": 1.6, "living": 1.2}.get(kind, usual)
     opening = "opening" if kind in ("openplan", "living") and rng.random() < 0.5 else "door"
     if kind == "lounge":
         wide, opening = 2.4, "opening"

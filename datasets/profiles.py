@@ -68,7 +68,7 @@ PROFILES = {
 }  # fmt: skip
 KINDS = tuple(PROFILES)
 WIDTHS: dict[str, Range] = {
-    "office": (2.6, 4.6), "meeting": (4.0, 7.0), "storage": (1.9, 3.0), "kitchen": (2.8, 4.0), "openplan": (9.0, 16.0),
+    "office": (2.6, 4.6), "meeting": (4.0, 9.0), "storage": (1.9, 3.0), "kitchen": (2.8, 4.0), "openplan": (9.0, 16.0),
     "flat": (7.6, 9.4), "hotel": (3.5, 4.1), "ward": (3.8, 4.6), "classroom": (7.2, 9.4), "library": (9.0, 13.0),
     "cloakroom": (3.0, 4.5), "lab": (5.4, 9.5), "living": (4.2, 6.5), "bath": (2.0, 2.6), "bedroom": (2.9, 4.4),
     "toilets": (3.0, 4.5), "nurses": (4.5, 6.5), "hall": (12.0, 16.0), "lounge": (4.5, 8.0), "atrium": (7.0, 10.0),
