@@ -45,7 +45,7 @@ def scan(
         points with `labels` (index into `rooms`: all of the building's, in the cloud's frame), estimated `poses` and `pose_of`.
 
     Raises:
-        InputError: unknown sensor or room, a spacing that is not positive, a room that cannot be reached.
+        InputError: unknown sensor or room, a spacing out of range, a room that cannot be reached, a sensor that saw nothing.
     """
     kind, rng = get_sensor(sensor), np.random.default_rng(seed)
     if spacing is not None and not 0.005 <= spacing <= 1.0:
@@ -57,6 +57,8 @@ def scan(
     number = budget or (LINE * len(poses) if kind.beams == 1 else _rays_for(building, visited, spacing))
     hits = _cast(building, kind, poses, max(number // len(poses), 8), rng)
     hits = _degrade(building, poses, hits, kind, rng)
+    if not len(hits.pose):
+        raise InputError(f"{building.name}: the {kind.name} sensor saw nothing; is its reach of {kind.reach} m right?")
     estimated = _drift(poses, walk, along, kind, rng)
     points = _placed(estimated, hits, hits.ranges)
     if not budget:

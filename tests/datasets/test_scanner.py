@@ -176,6 +176,8 @@ def test_wrong_arguments_are_refused(office: Building) -> None:
         scan(office, rooms=[99])
     with pytest.raises(InputError, match="spacing must be"):
         scan(office, spacing=0.0)
+    with pytest.raises(InputError, match="saw nothing"):
+        scan(office, replace(SENSORS["tls"], reach=(0.01, 0.02)), rooms=[3])
 
 
 def test_a_room_that_cannot_be_reached_is_named() -> None:
