@@ -28,7 +28,8 @@ ROOM_DTYPE = np.dtype(
         ("lo", "f8", 3),  # bounding box of the room's cells, in the input's frame
         ("hi", "f8", 3),
         ("cells", "i8"),  # occupied cells
-        ("glimpsed", "?"),  # seen only through a door or a window
+        ("completeness", "f8"),  # share of the floor's outline at which a wall or another room was seen
+        ("glimpsed", "?"),  # most of the outline was not seen: looked into through a door or a window
     ]
 )
 EDGE_DTYPE = np.dtype(

@@ -60,6 +60,20 @@ def test_a_corridor_with_eight_rooms():
             assert door["direction"] == pytest.approx(np.pi / 2, abs=0.1)
 
 
+def test_a_room_seen_through_its_door_is_glimpsed():
+    points = scenes.two_rooms().points(0.005)
+    beyond = points[:, 0] > 4.2
+    slope = (points[:, 1] - 2) / np.maximum(points[:, 0] - 2.0, 0.1)
+    seen = ~beyond | (np.abs(slope) < scenes.DOOR[0] / 2 / 2.0)  # a scanner at (2, 2) looks through the door
+    result = extract(points[seen & ~(points[:, 0] > 6.5)])  # and no farther than to 6.5 m
+    left, right = room_at(result, 2, 2.5), room_at(result, 5.5, 2)
+    assert left != right
+    assert result.rooms["glimpsed"].tolist() == [r == right for r in range(2)]
+    assert result.rooms["completeness"][left] > 0.95 and result.rooms["completeness"][right] < 0.5
+    whole = extract(points)
+    assert not whole.rooms["glimpsed"].any() and (whole.rooms["completeness"] > 0.95).all()
+
+
 def test_the_thesis_cuts_the_corridor():
     """Its known fault, kept: the range of 5 m cuts what is longer (findings.md)."""
     result = extract(scenes.corridor().points(0.01), preset="thesis")

@@ -208,7 +208,8 @@ def test_json_fields_and_strictness(scene: TopometricMap, tmp_path: Path) -> Non
     assert [listing[k] for k in ("format", "source", "voxel_size")] == [1, "building.ply", 0.1]
     room = listing["rooms"][1]
     assert list(room) == [
-        "id", "storey", "centroid", "area", "height", "volume", "bounding_box", "cells", "glimpsed",
+        "id", "storey", "centroid", "area", "height", "volume", "bounding_box", "cells",
+        "completeness", "glimpsed",
     ]  # fmt: skip
     assert room["area"] == 20.0 and room["id"] == 1 and room["glimpsed"] is False
     assert room["bounding_box"]["min"] == [2.1, 4.1, 0.5]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from topomerge.extraction.completeness import GLIMPSED, completeness
 from topomerge.extraction.doors import find_edges
 from topomerge.extraction.rooms import navigable_rooms
 from topomerge.extraction.storeys import ceiling_height, find_storeys, lowest_of_column
@@ -50,6 +51,8 @@ def _measure(
     """(R,) ROOM_DTYPE."""
     count = int(label.max(initial=-1)) + 1
     rooms = np.zeros(count, ROOM_DTYPE)
+    rooms["completeness"] = completeness(grid, navigable, label, count, body)
+    rooms["glimpsed"] = rooms["completeness"] < GLIMPSED
     floor = lowest_of_column(navigable)
     order = floor[np.argsort(label[floor], kind="stable")]
     floor_of = np.split(order, np.searchsorted(label[order], np.arange(count + 1)))[1:-1]

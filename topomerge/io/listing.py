@@ -5,12 +5,14 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
 
     {"format": 1, "source": "a.ply", "voxel_size": 0.1,
      "rooms": [{"id", "storey", "centroid": [x, y, z], "area", "height", "volume",
-                "bounding_box": {"min": [x, y, z], "max": [x, y, z]}, "cells", "glimpsed"}, …],
+                "bounding_box": {"min": [x, y, z], "max": [x, y, z]}, "cells",
+                "completeness", "glimpsed"}, …],
      "edges": [{"rooms": [id, id], "door": {"centre": [x, y, z], "width", "height", "direction"}, "kind"}, …],
      "storeys": [{"id", "floor", "ceiling", "area"}, …],
      "seconds": {step: s}, "parameters": {…}, "warnings": […]}
 
-`kind` is door, opening or stairs; `direction` is that of the wall's normal seen from above, from x towards y.
+`completeness` is the share of a floor's outline at which a wall was seen; `glimpsed` rooms were only looked into. `kind` is
+door, opening or stairs; `direction` is that of the wall's normal seen from above, from x towards y.
 """
 
 from __future__ import annotations
@@ -59,6 +61,7 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
             **{name: room[name] for name in ("storey", "centroid", "area", "height", "volume")},
             "bounding_box": {"min": room["lo"], "max": room["hi"]},
             "cells": room["cells"],
+            "completeness": room["completeness"],
             "glimpsed": room["glimpsed"],
         }
         for i, room in enumerate(map.rooms)

@@ -1,0 +1,140 @@
+"""Rules of the house that a machine can hold: imports go one way, every package is shipped, nothing is unpickled."""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+# Lower may not import higher. Names of the same rank may import each other within their package only.
+RANKS = {
+    "errors": 0,
+    "kernels": 0,
+    "types": 1,
+    "io": 2,
+    "extraction": 3,
+    "embedding": 4,
+    "matching": 5,
+    "fusion": 6,
+    "viz": 7,
+    "models": 8,
+    "configs": 8,
+    "config": 8,
+    "metrics": 8,
+    "datasets": 9,
+    "checkpoint": 10,
+    "training": 10,
+    "evaluation": 10,
+    "console": 11,
+    "commands": 12,
+    "cli": 13,
+    "__main__": 14,
+}
+HEAVY = ("torch", "torch_geometric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell", "trimesh", "lightning")
+
+
+def sources() -> list[tuple[str, str, Path]]:
+    """(package below topomerge, module, file) of every Python file that is installed."""
+    found = []
+    for folder in ("topomerge", "models", "datasets", "configs"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            name = parts[1] if folder == "topomerge" else folder
+            found.append((name, ".".join(parts), path))
+    return found
+
+
+def imports(path: Path) -> list[tuple[str, bool, int]]:
+    """(module, at the top level of the file?, line) of every import, leaving out those for type checkers."""
+    tree = ast.parse(path.read_text())
+    checked = {
+        id(n)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        for n in ast.walk(node)
+    }
+    inside = {
+        id(n)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        for n in ast.walk(node)
+    }
+    found = []
+    for node in ast.walk(tree):
+        if id(node) in checked:
+            continue
+        if isinstance(node, ast.Import):
+            found += [(a.name, id(node) not in inside, node.lineno) for a in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: import absolutely"
+            found += [(f"{node.module}.{a.name}", id(node) not in inside, node.lineno) for a in node.names]
+    return found
+
+
+@pytest.mark.parametrize(("package", "module", "path"), [pytest.param(*s, id=s[1]) for s in sources()])
+def test_imports_go_one_way(package, module, path):
+    if package == "__init__":  # the lazy face of the library names everything
+        return
+    assert package in RANKS, f"give {package} a rank in this test"
+    for name, top, line in imports(path):
+        first, *rest = name.split(".")
+        where = f"{path}:{line}: {name}"
+        assert first not in ("models", "datasets", "configs"), f"{where}: import topomerge.{first}"
+        if top:
+            learned = package in ("models", "training", "checkpoint")
+            assert first not in HEAVY or learned, f"{where}: import it inside the function that needs it"
+        if first == "topomerge" and rest:
+            other = rest[0]
+            if other == package or other not in RANKS:
+                continue
+            assert RANKS[other] < RANKS[package], f"{where}: {package} must not import {other}"
+
+
+def test_every_package_is_shipped():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    listed = set(settings["packages"])
+    mapped = {"topomerge": "topomerge", **{n: f"topomerge.{n}" for n in ("models", "datasets", "configs")}}
+    for folder, name in mapped.items():
+        for init in (ROOT / folder).rglob("__init__.py"):
+            parts = init.parent.relative_to(ROOT / folder).parts
+            assert ".".join((name, *parts)) in listed, f"{init.parent} is not in pyproject's list of packages"
+        for path in (ROOT / folder).rglob("*.py"):
+            assert (path.parent / "__init__.py").exists(), f"{path.parent} has no __init__.py"
+
+
+def test_nothing_is_unpickled():
+    for _, _, path in sources():
+        text = path.read_text()
+        tree = ast.parse(text)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                where = f"{path}:{node.lineno}"
+                assert called.split(".")[0] not in ("pickle", "dill", "joblib") or called.endswith(("Parallel", "delayed")) or (
+                    not called.endswith(("load", "loads"))
+                ), f"{where}: {called}"
+                keywords = {k.arg: ast.unparse(k.value) for k in node.keywords}
+                assert keywords.get("allow_pickle", "False") == "False", where
+                if called in ("np.load", "numpy.load"):
+                    assert keywords.get("allow_pickle") == "False", f"{where}: say allow_pickle=False"
+                if called == "torch.load":
+                    assert keywords.get("weights_only") == "True", f"{where}: say weights_only=True"
+
+
+@pytest.mark.parametrize("name", ["datasets", "models"])
+def test_a_second_copy_of_every_class_is_refused(name):
+    import importlib
+    import sys
+
+    sys.path.insert(0, str(ROOT))
+    try:
+        spec = importlib.machinery.PathFinder.find_spec(name, [str(ROOT)])
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        with pytest.raises(ImportError, match=f"import topomerge.{name}"):
+            spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(ROOT))

@@ -1,0 +1,51 @@
+"""How much of a room was seen: the share of its outline that ends at a wall, not at the edge of what is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topomerge.extraction.convolution import Kernel, any_at
+from topomerge.extraction.storeys import lowest_of_column
+from topomerge.types import Array, VoxelGrid
+
+GLIMPSED = 0.5  # rooms of which less of the outline was seen were only looked into
+STEP = 0.3  # m: floor beside a cell may be this much higher or lower
+WALL = (0.3, 1.5)  # m above the floor: where a wall has to be seen
+REACH = 0.25  # m beyond the body's half width
+
+
+def completeness(grid: VoxelGrid, navigable: VoxelGrid, label: Array, count: int, body: float) -> Array:
+    """(count,) share of each room's outline at which a wall was seen; 1 for a room without an end of its own.
+
+    The outline are the floor cells beside which nobody can stand. A door to another room is no end: the floor goes on.
+
+    Args:
+        grid: occupied cells.
+        navigable: the navigable volume.
+        label: (m,) room of each of its cells, -1 none.
+        count: number of rooms.
+        body: width (m) of the body that the navigable volume was made for.
+    """
+    floor = lowest_of_column(navigable)
+    floor = floor[label[floor] >= 0]
+    cells = navigable.cells[floor].astype(np.int64)
+    step = int(STEP / grid.edge)
+    end = np.zeros(len(floor), bool)
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        goes_on = np.zeros(len(floor), bool)
+        for dz in range(-step, step + 1):
+            goes_on |= navigable.contains(cells + (dx, dy, dz))
+        end |= ~goes_on
+    walled = any_at(grid, cells[end], _wall(grid.edge, body))
+    room = label[floor][end]
+    total = np.bincount(room, minlength=count)
+    seen = np.bincount(room, walled, minlength=count)
+    return np.where(total > 0, seen / np.maximum(total, 1), 1.0)
+
+
+def _wall(edge: float, body: float) -> Kernel:
+    """Where the wall beside the outline of a floor may stand."""
+    reach = int(np.ceil((body / 2 + REACH) / edge))
+    steps = np.arange(-reach, reach + 1)
+    heights = np.arange(int(WALL[0] / edge), int(WALL[1] / edge) + 1)
+    return Kernel.from_offsets(np.stack(np.meshgrid(steps, steps, heights, indexing="ij"), -1).reshape(-1, 3))
