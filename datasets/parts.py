@@ -1,0 +1,117 @@
+"""Which rooms two partial maps visit: connected parts of a building with a controlled share of rooms in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from topomerge.datasets.building import Building
+
+from topomerge.errors import InputError
+from topomerge.types import Array
+
+TRIES = 40
+LEAST = 3  # rooms a part
+CLOSE = 0.1  # an overlap may miss what was asked for by so much, or by half a room
+
+Neighbours = dict[int, set[int]]
+
+
+def room_graph(building: Building, among: Iterable[int] | None = None) -> Neighbours:
+    """Room -> rooms that a door, an opening or stairs lead to; lifts, and rooms that are not `among` the given, left out."""
+    fits = set(range(len(building.rooms)) if among is None else map(int, among))
+    fits -= {i for i, room in enumerate(building.rooms) if room.kind == "lift"}
+    neighbours: Neighbours = {i: set() for i in sorted(fits)}
+    for a, b in building.edges().tolist():
+        if a in fits and b in fits and a != b:
+            neighbours[a].add(b)
+            neighbours[b].add(a)
+    return neighbours
+
+
+def two_parts(
+    building: Building, rooms: int, overlap: float, rng: np.random.Generator, among: Iterable[int] | None = None
+) -> tuple[Array, Array]:
+    """Two connected parts of up to `rooms` rooms, ascending (n,) int64, with a share of rooms in common (see `share`).
+
+    Args:
+        overlap: 0 to 1; what comes out differs by `CLOSE` at most.
+        among: only these rooms.
+
+    Raises:
+        InputError: the building has no such parts.
+    """
+    if not 0 <= overlap <= 1 or rooms < LEAST:
+        raise InputError(f"overlap must be 0 to 1 and rooms {LEAST} or more, not {overlap:g} and {rooms}")
+    neighbours = room_graph(building, among)
+    count = min(rooms, int(len(neighbours) / (2 - overlap)))
+    best, least = None, np.inf
+    for _ in range(TRIES if count >= LEAST else 0):
+        a, b = _grow(neighbours, count, round(overlap * count), rng)
+        miss = abs(share(a, b) - overlap) + 0.02 * (2 * count - len(a) - len(b))
+        if min(len(a), len(b)) >= LEAST and miss < least:
+            best, least = (a, b), miss
+    if best is None or abs(share(*best) - overlap) > max(CLOSE, 0.5 / len(best[0])):
+        raise InputError(
+            f"{building.name} has no two connected parts of {LEAST} rooms or more with {100 * overlap:.0f} % of them in common; "
+            "take another overlap, another seed or more storeys"
+        )
+    return np.array(sorted(best[0]), np.int64), np.array(sorted(best[1]), np.int64)
+
+
+def share(a: Iterable[int], b: Iterable[int]) -> float:
+    """Rooms in common, of the mean number of rooms (Dice)."""
+    a, b = set(a), set(b)
+    return 2 * len(a & b) / max(len(a) + len(b), 1)
+
+
+def _grow(neighbours: Neighbours, count: int, common: int, rng: np.random.Generator) -> tuple[set[int], set[int]]:
+    """Grow what both have, then each in turn where the other is not."""
+    rooms = list(neighbours)
+    degree = np.array([len(neighbours[r]) + 0.1 for r in rooms])
+    first, second = rng.choice(rooms, 2, replace=False, p=degree / degree.sum()).tolist()
+    if common:
+        a = {first}
+        while len(a) < common and _step(a, set(), neighbours, rng):
+            pass
+        b = set(a)
+    else:
+        a, b = {first}, {second}
+    grown = True
+    while grown:
+        grown = len(a) < count and _step(a, b, neighbours, rng)
+        grown = (len(b) < count and _step(b, a, neighbours, rng)) or grown
+    return a, b
+
+
+def _step(part: set[int], other: set[int], neighbours: Neighbours, rng: np.random.Generator) -> bool:
+    """Add one room beside the part that the other doesn't have; False: there is none."""
+    edge = sorted({n for r in part for n in neighbours[r]} - part - other)
+    if edge:
+        part.add(edge[int(rng.integers(len(edge)))])
+    return bool(edge)
+
+
+def twin_rooms(building: Building) -> dict[int, int]:
+    """Rooms of one storey -> the rooms of another storey with the same plan: of the two storeys that share most.
+
+    Raises:
+        InputError: no two storeys have the same plan.
+    """
+    outlines = [room.polygon - room.polygon.mean(axis=0) for room in building.rooms]
+    best: dict[int, int] = {}
+    for low in range(len(building.storeys)):
+        for high in range(low + 1, len(building.storeys)):
+            here, there = ([i for i, r in enumerate(building.rooms) if r.storey == k and r.kind != "lift"] for k in (low, high))
+            found = {i: j for i in here for j in there if _same(building, outlines, i, j)}
+            best = max(best, found, key=len)
+    if len(best) < LEAST:
+        raise InputError(f"{building.name}: no two of its storeys have the same plan")
+    return best
+
+
+def _same(building: Building, outlines: list[Array], i: int, j: int) -> bool:
+    if len(outlines[i]) != len(outlines[j]):
+        return False
+    moved = building.rooms[i].polygon.mean(axis=0) - building.rooms[j].polygon.mean(axis=0)
+    return bool(np.abs(moved).max() < 0.05 and np.abs(outlines[i] - outlines[j]).max() < 0.05)
