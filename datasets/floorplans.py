@@ -130,7 +130,7 @@ def _full(file: Path, root: Path, name: str) -> str:
 
 
 def siblings(folder: str | Path) -> list[list[str]]:
-    """Names (as of `iter_plans`) of the plans that are storeys of one building, lowest first; single storeys are left out.
+    """Names (as of `iter_plans`) of the plans that are storeys of one building, lowest first; single ones are left out.
 
     Storeys of one file belong together; so do files whose names differ in a storey only: Sabadell1 and Sabadell2, P0 and P1,
     groundfloor and secondfloor, LOWER and MAIN, the folders B1, F1 and F2. Whether their frames and scales agree is up to the
@@ -146,7 +146,7 @@ def siblings(folder: str | Path) -> list[list[str]]:
             base, level = _storey(last)
             if base not in STRANGERS:
                 groups.setdefault((above if base or level else names[0], base), []).append((level, names[0]))
-    return [[name for _, name in sorted(group)] for _, group in sorted(groups.items()) if len(group) > 1]
+    return sorted([name for _, name in sorted(group)] for group in groups.values() if len(group) > 1)
 
 
 def _names(file: Path) -> list[str]:
@@ -214,7 +214,7 @@ def _made(name: str, make: Maker) -> Plan | Refusal:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, InputError):
-        return str(error)
+        return " ".join(str(error).split())
     if isinstance(error, FileNotFoundError):
         return f"missing file: {Path(error.filename or '').name}"
     return f"not read: {type(error).__name__}: {' '.join(str(error).split())[:200]}"

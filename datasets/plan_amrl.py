@@ -51,7 +51,9 @@ def sketch(text: bytes) -> Sketch:
     index = add_rooms(result, labels, {}, CELL, origin, SMALLEST, CAVITY / 2)
     if not index:
         raise InputError("not closed: the walls enclose no room")
-    add_contacts(result, contacts(labels, CELL, origin), index, "door")
+    for a, b, ends in contacts(labels, CELL, origin):
+        along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+        add_contacts(result, [(a, b, ends + np.stack([-along, along]) * CELL)], index, "door")  # walls were drawn thicker
     guess_kinds(result, "office")
     return result
 
@@ -98,4 +100,4 @@ def _drawn(lines: Array) -> tuple[Array, Array]:
     cells = np.floor((points - low) / CELL).astype(int)
     wall = np.zeros((shape[1] + 1, shape[0] + 1), bool)
     wall[cells[:, 1], cells[:, 0]] = True
-    return ndimage.binary_dilation(wall), low
+    return ndimage.binary_dilation(wall), low  # fills the cavity between the two faces of thin walls

@@ -148,10 +148,10 @@ def _scale(
         shape, usual = shapes[space.get("id", "")], _kind(space)[1]
         if shape is not None and usual:
             ratios.append(usual / (shape.area * stated**2))
-    factor = float(np.sqrt(np.median(ratios))) if len(ratios) >= 3 else 1.0
+    factor = float(np.sqrt(np.median(ratios))) if ratios else 1.0
     if not 1 / HOPELESS < factor < HOPELESS:
         raise InputError(f"absurd scale: rooms are {1 / factor:.2f} times as long as usual")
-    if 1 / TRUSTED < factor < TRUSTED:
+    if 1 / TRUSTED < factor < TRUSTED or len(ratios) < 3:
         return stated
     result.notes.append(f"scale made {factor:.2f} times that of the file, after usual rooms")
     return stated * factor

@@ -44,7 +44,7 @@ DOOR, BATHTUB, TOILET = 0.75, 1.2, 0.74  # m, usual lengths
 DOOR_RANGE = (0.7, 0.9)  # m, of the median narrow door
 SNAP = 6.0  # px; walls whose ends miss each other by less are joined
 THICKNESS = 0.12  # m
-MAX_MEMBERS, MAX_BYTES = 100_000, 1 << 20  # of an archive, of one plan
+MAX_MEMBERS, MAX_TOTAL, MAX_BYTES = 100_000, 1 << 30, 1 << 20  # of an archive, and of one plan
 
 Rows = list[tuple[Array, str, str]]  # (2, 2) px, category, type
 
@@ -60,11 +60,13 @@ def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
             raise InputError(f"absurd size: {path.stat().st_size} bytes for one plan")
         yield path.stem, partial(sketch, path.read_bytes())
         return
+    total = 0
     try:
         with tarfile.open(path, "r:*") as archive:
             for count, member in enumerate(archive):
-                if count >= MAX_MEMBERS:
-                    raise InputError(f"absurd size: more than {MAX_MEMBERS} members")
+                total += member.size
+                if count >= MAX_MEMBERS or total > MAX_TOTAL:
+                    raise InputError(f"absurd size: more than {MAX_MEMBERS} members or {MAX_TOTAL >> 20} MiB")
                 if not member.isfile() or not member.name.endswith(".txt"):
                     continue
                 name = member.name.removeprefix("./").removesuffix(".txt")
