@@ -55,6 +55,12 @@ def _above_zero(text: str) -> float:
     return value
 
 
+def _count(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number, not {text!r}")
+    return int(text)
+
+
 def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: getattr(args, name) for name in names if hasattr(args, name)}
 
@@ -115,6 +121,25 @@ def info_command(args: argparse.Namespace) -> int:
     return 0
 
 
+def simulate_command(args: argparse.Namespace) -> int:
+    """`topomerge simulate`: clouds of a building that is known, with the truth."""
+    folder = Path(args.output)
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file; give the name of a folder")
+    from topomerge.datasets.simulate import outputs, simulate
+
+    choices = _given(args, "seed", "storeys", "overlap", "rooms", "hard")
+    if hasattr(args, "sensors"):
+        choices["sensors"] = tuple(name.strip() for name in args.sensors.split(",") if name.strip())
+    building, made, frame = simulate(args.building, **choices, scale=args.scale == "free")
+    folder.mkdir(parents=True, exist_ok=True)
+    files = outputs(building, made, frame, folder)
+    write_all(files)
+    if not args.quiet:
+        print(f"{building.name}: {len(building.rooms)} rooms -> {' '.join(str(path) for path, _ in files)}")
+    return 0
+
+
 COMMANDS = (
     Command(
         "extract",
@@ -146,5 +171,29 @@ COMMANDS = (
         ),
         paths=("input",),
         description="Print the rooms, storeys, doors and times of a map.",
+    ),
+    Command(
+        "simulate",
+        simulate_command,
+        "make one or two partial maps of a building that is known exactly",
+        "topomerge simulate --building office --seed 7 --sensors tls,depth --overlap 0.4 -o pair/",
+        (
+            option("--building", required=True, metavar="KIND", default=None, help="office, hotel, house, school, ..."),
+            option("--seed", type=_count, metavar="N", help="another number, another building (default 7)"),
+            option("--storeys", type=_count, metavar="N", help="1 to 8 (default 1)"),
+            option(
+                "--sensors", metavar="A,B", help="tls lidar depth mono laser2d tablet; one gives one cloud (default tls,depth)"
+            ),
+            option("--overlap", type=float, metavar="S", help="share of the rooms that both maps visit (default 0.4)"),
+            option("--rooms", type=_count, metavar="N", help="of each map, at most (default 15; all, of a single cloud)"),
+            option("--scale", choices=("free", "known"), default="known", help="free: the scale of b is unknown"),
+            option("--hard", choices=("other-building", "other-storey", "twin-wing"), help="b is of a place that looks like a's"),
+            option(
+                "-o", "--output", required=True, metavar="DIR", default=None, help="folder for a.ply, b.ply, truth.json, plan.png"
+            ),
+            option("-q", "--quiet", action="store_true", default=False, help="print nothing"),
+        ),
+        paths=("output",),
+        description="Make partial maps of a building from a seed: clouds in random frames, the truth about them, and a picture.",
     ),
 )

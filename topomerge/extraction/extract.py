@@ -101,10 +101,21 @@ def extract(
         InputError: no finite point, an absurd extent, or no floor that somebody could stand on.
     """
     p = _preset(preset, overrides)
-    clock = _Clock(progress)
-    warnings: list[str] = []
+    known: dict[str, Any] = {"warnings": []}
+    try:
+        return _extract(source, voxel_size, p, preset, name, known, _Clock(progress))
+    except InputError as error:  # what looked wrong on the way is often the reason
+        if not known["warnings"]:
+            raise
+        raise InputError(f"{error} (and {'; '.join(known['warnings'])})") from error
+
+
+def _extract(
+    source: Any, voxel_size: float, p: Preset, preset: str | Preset, name: str | None, known: dict[str, Any], clock: _Clock
+) -> TopometricMap:
+    """The steps themselves."""
     with clock("read and voxelise", 0.0):
-        grid, known = _grid(source, voxel_size, warnings)
+        grid = _grid(source, voxel_size, known)
     with clock("navigable volume", 0.3):
         navigable = navigable_volume(grid, p)
     with clock("views", 0.4):
@@ -129,7 +140,7 @@ def extract(
         source=name if name is not None else known.get("source", ""),
         parameters={**parameters, "inflation": inflation},
         seconds=clock.seconds,
-        warnings=(*known.get("warnings", ()), *warnings),
+        warnings=tuple(known["warnings"]),
     )
 
 
@@ -191,22 +202,21 @@ def _preset(preset: str | Preset, overrides: dict[str, Any]) -> Preset:
     return replace(preset, **overrides)
 
 
-def _grid(source: Any, edge: float, warnings: list[str]) -> tuple[VoxelGrid, dict[str, Any]]:
-    """The voxel grid, and what the cloud knows beside its points."""
+def _grid(source: Any, edge: float, known: dict[str, Any]) -> VoxelGrid:
+    """The voxel grid; what a cloud knows beside its points goes into `known`."""
     if isinstance(source, VoxelGrid):
-        return source, {}
-    known: dict[str, Any] = {}
+        return source
+    if isinstance(source, np.ndarray):
+        return voxelise(source, edge, known["warnings"])
 
     def chunks() -> Iterator[PointCloud]:
         for chunk in [source] if isinstance(source, PointCloud) else source:
             known["source"] = chunk.source
             known["free"] = chunk.free if chunk.free is not None else known.get("free")
-            known["warnings"] = tuple(dict.fromkeys((*known.get("warnings", ()), *chunk.warnings)))
+            known["warnings"] += [w for w in chunk.warnings if w not in known["warnings"]]
             yield chunk
 
-    if isinstance(source, np.ndarray):
-        return voxelise(source, edge, warnings), known
-    return voxelise(chunks(), edge, warnings), known
+    return voxelise(chunks(), edge, known["warnings"])
 
 
 class _Clock:

@@ -18,6 +18,7 @@ log = logging.getLogger(__name__)
 # A group of points is a stray when it lies this far (m) from every larger group and holds less than this share of the cells.
 STRAY_DISTANCE = 10.0
 STRAY_SHARE = 0.01
+STRAY_TOTAL = 0.05  # of all cells may be strays
 MERGE_AT = 4_000_000  # cells of pending chunks
 LARGE = 2e8  # cells: 200 x 200 x 5 m at 0.1 m; smaller grids cost little whatever is in them
 
@@ -51,9 +52,12 @@ def voxelise(
     base, shape = _box(cells)
     if _volume(shape) > LARGE:
         kept = _without_strays(cells, edge)
-        # Nothing is dropped unless that makes the grid much smaller: a wing that was scanned thinly is no stray.
-        if _volume(_box(cells[kept])[1]) < _volume(shape) / 4:
-            warn(warnings, f"{counts[~kept].sum()} stray points lie more than {STRAY_DISTANCE:g} m from the rest: left out")
+        # Nothing is dropped unless that makes the grid much smaller: a wing that was scanned thinly is no stray. And where
+        # much would go, the points are not strays: the unit is wrong.
+        if _volume(_box(cells[kept])[1]) < _volume(shape) / 4 and kept.mean() > 1 - STRAY_TOTAL:
+            dropped = int(counts[~kept].sum())
+            said = "1 stray point lies" if dropped == 1 else f"{dropped} stray points lie"
+            warn(warnings, f"{said} more than {STRAY_DISTANCE:g} m from the rest: left out")
             cells, counts = cells[kept], counts[kept]
             base, shape = _box(cells)
     if (shape > morton.LIMIT).any() or _volume(shape) / 512 > lookup.MAX_BRICKS:
@@ -99,9 +103,10 @@ def _volume(shape: Array) -> float:
 
 
 def warn(warnings: list[str] | None, message: str) -> None:
-    """Log a warning and keep it for the map that is being made."""
-    log.warning("%s", message)
-    if warnings is not None:
+    """Keep a warning for the map that is being made, or log it where there is none."""
+    if warnings is None:
+        log.warning("%s", message)
+    else:
         warnings.append(message)
 
 

@@ -69,7 +69,9 @@ def _up_warning(points: Array, low: Array, high: Array, up: str) -> list[str]:
     best = int(np.argmax(scores))
     # A corridor seen without floor and ceiling is flat across its walls too, but it is not taller than a storey; a shaft or
     # a tower is, but flat across both pairs of its walls.
-    if best == 2 or scores[best] < max(0.12, 1.8 * sorted(scores)[1]) or high[2] - low[2] < STOREY:
+    second = sorted(scores)[1]
+    clear = scores[best] >= max(0.12, 1.8 * second) or scores[best] >= max(0.08, 2.5 * second)
+    if best == 2 or not clear or high[2] - low[2] < STOREY:
         return []
     axis = "xyz"[int(np.abs(turn(up)[best]).argmax())]
     return [
