@@ -16,6 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from topomerge.datasets.plan import MAX_DOOR, MIN_AREA, MIN_DOOR, Flight, Opening, Plan, PlanRoom, Wall, check_plan
 from topomerge.datasets.plan_doors import sides
+from topomerge.datasets.solids import rectangle
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -34,7 +35,7 @@ class Sketch:
 
     Args:
         names, kinds, shapes: of the rooms; shapes are shapely polygons, m, y up, holes allowed.
-        walls: with a thickness of their own; they are cut out of the shapes by `erect`.
+        walls: with a thickness of their own; they are cut out of the shapes.
         openings, ends: each opening and the two rooms (indices, -1: outside) that it joins.
         inset: m, half the thickness of walls that have no lines: taken off each shape all around.
         notes: what was changed or left out.
@@ -76,7 +77,8 @@ def finish(sketch: Sketch) -> tuple[Plan, list[str]]:
     shapes = [_solid(shape, name) for shape, name in zip(sketch.shapes, sketch.names, strict=True)]
     if sketch.inset:
         shapes = [_largest(shape.buffer(-sketch.inset, join_style="mitre")) for shape in shapes]
-    shapes = [_largest(shape.simplify(TOLERANCE)) for shape in shapes]
+    solid = shapely.union_all([rectangle(w.start, w.end, w.thickness) for w in sketch.walls if not w.glass])
+    shapes = [_largest(shape.difference(solid).simplify(TOLERANCE)) for shape in shapes]
     _check_overlap(shapes, sketch.names)
     passable = _check_doors(sketch) & _verified(sketch, shapes)
     kept = _connected(sketch, shapes, passable)

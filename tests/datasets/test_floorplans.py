@@ -12,6 +12,8 @@ import numpy as np
 import plan_files as write
 import pytest
 import shapely
+from topomerge.datasets.building import SURFACES
+from topomerge.datasets.difficulty import Difficulty
 from topomerge.datasets.erect import erect
 from topomerge.datasets.floorplans import Refusal, iter_plans, read_plans, siblings, summarise
 from topomerge.datasets.plan import Plan
@@ -58,9 +60,9 @@ def pack(path: Path, members: dict[str, bytes]) -> Path:
 def test_r2v(tmp_path: Path) -> None:
     (plan,) = read_plans(write.r2v(tmp_path / "a.txt"))
     scale = 0.75 / 40
-    assert areas(plan) == pytest.approx([(150 * scale) ** 2] * 2)
+    assert areas(plan) == pytest.approx([(150 * scale - 0.12) ** 2] * 2)
     assert [room.kind for room in plan.rooms] == ["bedroom", "kitchen"]
-    assert plan.rooms[0].polygon[:, 0].max() == pytest.approx(150 * scale)
+    assert plan.rooms[0].polygon[:, 0].max() == pytest.approx(150 * scale - 0.06)
     middle, width = door(plan)
     assert middle == pytest.approx([150 * scale, -40 * scale])  # y up: the upper half of the drawing is the higher y
     assert width == pytest.approx(0.75)
@@ -378,6 +380,14 @@ def test_hole_is_cut_open_and_closes_again() -> None:
     assert shape.area == pytest.approx(92, abs=0.01)
     healed = shapely.set_precision(shape, 1e-3)
     assert len(healed.interiors) == 2 and healed.area == pytest.approx(92)
+
+
+def test_slit_of_a_hole_becomes_no_wall(tmp_path: Path) -> None:
+    (plan,) = read_plans(write.campus(tmp_path / "a.xml", rooms=((0, 0, 300, 300), (100, 40, 250, 250)), portal=(100, 150)))
+    building = erect([plan], Difficulty(furniture=0, clutter=0, columns=0, beams=0, lamps=0))
+    middles = building.vertices[building.triangles][building.labels == SURFACES.index("wall")].mean(axis=1)[:, :2]
+    walls = shapely.union_all([shapely.box(0, -15, 15, 0).exterior, shapely.box(5, -12.5, 12.5, -2).exterior])
+    assert shapely.distance(walls, shapely.points(middles)).max() < 0.3
 
 
 def test_place_door_where_rooms_face_each_other() -> None:
