@@ -173,10 +173,12 @@ def _heading(points: Array) -> Array:
 
 
 def _scene(vertices: Array, triangles: Array) -> Any:
-    import open3d as o3d
+    """Embree's search tree over some of the triangles."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
 
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(o3d.core.Tensor(np.ascontiguousarray(vertices)), o3d.core.Tensor(triangles.astype(np.uint32)))
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(triangles, np.int32))
     return scene
 
 
@@ -218,20 +220,14 @@ def _cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np
 
 
 def _shoot(scene: Any, rays: Array) -> tuple[Array, Array, Array]:
-    """Range, triangle (-1: none) and |cosine| of incidence of rays (n, 6)."""
-    answer = scene.cast_rays(rays_tensor(rays), nthreads=1)
-    ranges = answer["t_hit"].numpy()
-    triangle = answer["primitive_ids"].numpy().astype(np.int64)
-    triangle[~np.isfinite(ranges)] = -1
-    cosine = np.abs(np.einsum("ni,ni->n", answer["primitive_normals"].numpy(), rays[:, 3:]))
+    """Range (inf: none), triangle (-1: none) and |cosine| of incidence of rays (n, 6) of unit length."""
+    answer = scene.run(np.ascontiguousarray(rays[:, :3]), np.ascontiguousarray(rays[:, 3:]), output=True)
+    triangle = answer["primID"].astype(np.int64)
+    ranges = np.where(triangle >= 0, answer["tfar"], np.float32(np.inf)).astype(np.float32)
+    normal = answer["Ng"]
+    length = np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    cosine = np.abs(np.einsum("ni,ni->n", normal, rays[:, 3:])) / length
     return ranges, triangle, cosine
-
-
-def rays_tensor(rays: Array) -> Any:
-    """Rays as the tensor that Open3D casts."""
-    import open3d as o3d
-
-    return o3d.core.Tensor(rays)
 
 
 def _mix(image: Array, share: float, rng: np.random.Generator) -> Array:

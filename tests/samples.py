@@ -37,11 +37,32 @@ def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, *, text
 
 
 def write_pcd(path: Path, points: np.ndarray, colors: np.ndarray, *, ascii: bool, compressed: bool) -> None:
-    import open3d
-
+    try:
+        import open3d
+    except ImportError:  # no wheel for this Python loads on a bare machine
+        _write_pcd_plainly(path, points, colors, ascii, compressed)
+        return
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(float)))
     cloud.colors = open3d.utility.Vector3dVector(colors / 255.0)
     open3d.io.write_point_cloud(str(path), cloud, write_ascii=ascii, compressed=compressed)
+
+
+def _write_pcd_plainly(path: Path, points: np.ndarray, colors: np.ndarray, ascii: bool, compressed: bool) -> None:
+    """The same without Open3D; what is compressed holds runs of bytes only, no repetitions."""
+    packed = (colors.astype(np.uint32) << np.array([16, 8, 0], np.uint32)).sum(axis=1).astype(np.uint32).view(np.float32)
+    rows = np.column_stack([points.astype(np.float32), packed])
+    kind = "ascii" if ascii else "binary_compressed" if compressed else "binary"
+    header = "VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+    header += f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA {kind}\n"
+    if ascii:
+        body = "".join(" ".join(f"{v:.9g}" for v in row) + "\n" for row in rows).encode()
+    elif compressed:
+        raw = rows.T.tobytes()
+        runs = b"".join(bytes([len(raw[i : i + 32]) - 1]) + raw[i : i + 32] for i in range(0, len(raw), 32))
+        body = np.array([len(runs), len(raw)], "<u4").tobytes() + runs
+    else:
+        body = rows.tobytes()
+    path.write_bytes(header.encode() + body)
 
 
 def write_las(path: Path, points: np.ndarray, colors: np.ndarray) -> None:

@@ -118,7 +118,7 @@ def test_stairs_can_be_climbed(kind: str, width: float, length: float) -> None:
 
 def head_room(building: Building, path: np.ndarray) -> float:
     """Least height above the feet along a path, m."""
-    import open3d as o3d
+    o3d = pytest.importorskip("open3d", exc_type=ImportError)
 
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(building.vertices), o3d.core.Tensor(building.triangles.astype(np.uint32)))

@@ -40,7 +40,7 @@ def off_the_walls(points: np.ndarray) -> np.ndarray:
 
 
 def off_the_surfaces(building: Building, cloud: PointCloud) -> np.ndarray:
-    import open3d as o3d
+    o3d = pytest.importorskip("open3d", exc_type=ImportError)
 
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(building.vertices), o3d.core.Tensor(building.triangles.astype(np.uint32)))
