@@ -1,0 +1,121 @@
+"""The graph: shapes, values reckoned by hand, and nothing that depends on the frame among the features."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.scenes_map import building
+from topomerge.embedding import graph
+from topomerge.embedding.graph import DOOR_FEATURES, EDGE_FEATURES, ROOM_FEATURES, graph_arrays, to_graph
+from topomerge.errors import InputError
+from topomerge.types import TopometricMap, VoxelGrid
+
+
+@pytest.fixture(scope="module")
+def map() -> TopometricMap:
+    return building(2, 2)
+
+
+def turned(map: TopometricMap) -> TopometricMap:
+    """The map turned by 90 degrees to the left about the vertical, and moved."""
+    width = map.grid.shape[1]
+    shift = np.array([7.0, -3.0, 1.5])
+
+    def turn(grid: VoxelGrid) -> tuple[VoxelGrid, np.ndarray]:
+        cells = np.stack([width - 1 - grid.cells[:, 1], grid.cells[:, 0], grid.cells[:, 2]], axis=1)
+        shape = (width, grid.shape[0], grid.shape[2])
+        new = VoxelGrid.from_cells(cells, shift, grid.edge, shape, {"row": np.arange(len(cells))})
+        return new, new.properties["row"]
+
+    def place(points: np.ndarray) -> np.ndarray:
+        local = points - map.grid.origin
+        return np.stack([width * map.grid.edge - local[:, 1], local[:, 0], local[:, 2]], axis=1) + shift
+
+    (grid, rows), (navigable, walked) = turn(map.grid), turn(map.navigable)
+    rooms, edges = map.rooms.copy(), map.edges.copy()
+    rooms["centroid"], edges["centre"] = place(rooms["centroid"]), place(edges["centre"])
+    return replace(
+        map,
+        grid=grid,
+        room=map.room[rows],
+        navigable=navigable,
+        navigable_room=map.navigable_room[walked],
+        rooms=rooms,
+        edges=edges,
+        free=None,
+        provenance=None,
+    )
+
+
+def test_shapes(map: TopometricMap) -> None:
+    arrays = graph_arrays(map, 64)
+    rooms, edges = len(map.rooms), len(map.edges)
+    assert arrays["x"].shape == (rooms, len(ROOM_FEATURES)) and arrays["x"].dtype == np.float32
+    assert arrays["room_points"].shape == (rooms, 64, 3) and arrays["room_points"].dtype == np.float32
+    assert arrays["edge_index"].shape == (2, 2 * edges) and arrays["edge_index"].dtype == np.int64
+    assert arrays["edge_attr"].shape == (2 * edges, len(EDGE_FEATURES))
+    assert arrays["door_attr"].shape == (arrays["door_index"].shape[1], len(DOOR_FEATURES))
+    assert all(np.isfinite(a).all() for a in arrays.values())
+    degree = np.bincount(arrays["edge_index"][0], minlength=rooms)
+    assert arrays["door_index"].shape[1] == (degree * (degree - 1)).sum()
+
+
+def test_both_directions_agree(map: TopometricMap) -> None:
+    arrays, edges = graph_arrays(map, 8), len(map.edges)
+    there, back = arrays["edge_attr"][:edges], arrays["edge_attr"][edges:]
+    name = {n: i for i, n in enumerate(EDGE_FEATURES)}
+    assert np.array_equal(arrays["edge_index"][:, :edges], arrays["edge_index"][::-1, edges:])
+    for same in ("width", "height", "door", "opening", "stairs", "distance", "turn_cos"):
+        assert np.allclose(there[:, name[same]], back[:, name[same]], atol=1e-5), same
+    for opposite in ("climb", "turn_sin"):
+        assert np.allclose(there[:, name[opposite]], -back[:, name[opposite]], atol=1e-5), opposite
+    assert np.allclose(there[:, name["from_middle"]], back[:, name["to_middle"]])
+    assert np.allclose(there[:, [name[k] for k in graph.KINDS]].sum(axis=1), 1)
+
+
+def test_features_do_not_depend_on_the_frame(map: TopometricMap) -> None:
+    here, there = graph_arrays(map, 16), graph_arrays(turned(map), 16)
+    for name in ("x", "edge_attr", "door_attr", "edge_index", "door_index"):
+        assert np.allclose(here[name], there[name], atol=1e-4), name
+    assert not np.allclose(here["pos"], there["pos"])
+
+
+def test_points_stand_on_their_floor_about_the_middle(map: TopometricMap) -> None:
+    arrays = graph_arrays(map, 512)
+    for r in range(len(map.rooms)):
+        points = arrays["room_points"][r]
+        assert points[:, 2].min() > -0.5 and points[:, 2].max() < 5
+        cells = map.grid.centroids()[map.room == r]
+        if len(cells):
+            middle = [*map.rooms["centroid"][r][:2], 0]
+            moved = cells - middle
+            assert points[:, :2].min() >= moved[:, :2].min() - 1e-3 and points[:, :2].max() <= moved[:, :2].max() + 1e-3
+
+
+def test_the_same_map_gives_the_same_tensors(map: TopometricMap) -> None:
+    one, two = graph_arrays(map), graph_arrays(map)
+    assert all(one[k].tobytes() == two[k].tobytes() for k in one)
+
+
+def test_a_map_without_edges_or_rooms(map: TopometricMap) -> None:
+    lonely = graph_arrays(replace(map, edges=map.edges[:0]), 4)
+    assert lonely["edge_index"].shape == (2, 0) and lonely["edge_attr"].shape == (0, len(EDGE_FEATURES))
+    assert lonely["door_index"].shape == (2, 0) and (lonely["x"][:, ROOM_FEATURES.index("degree")] == 0).all()
+    none = np.full(len(map.room), -1, np.int32), np.full(len(map.navigable), -1, np.int32)
+    empty = replace(map, edges=map.edges[:0], rooms=map.rooms[:0], room=none[0], navigable_room=none[1])
+    assert graph_arrays(empty, 4)["x"].shape == (0, len(ROOM_FEATURES))
+
+
+def test_a_wrong_number_of_points(map: TopometricMap) -> None:
+    with pytest.raises(InputError, match="1 or more, not 0"):
+        graph_arrays(map, 0)
+
+
+def test_tensors(map: TopometricMap) -> None:
+    pytest.importorskip("torch_geometric")
+    data = to_graph(map, 32)
+    assert data.validate() and data.num_nodes == len(map.rooms) and data.num_edges == 2 * len(map.edges)
+    assert data.x.shape[1] == len(ROOM_FEATURES) and data.room_points.shape == (len(map.rooms), 32, 3)
