@@ -182,11 +182,11 @@ def _places(
 
 
 def _another(building: Building) -> Building:
-    """A building of the same kind from another seed."""
+    """A building of the same kind from another seed, of the same split: seeds come in pairs there."""
     if building.seed < 0 or not building.kind:
         raise InputError(f"{building.name}: name the other building of the hard negative")
     known = building.parameters
-    return make_building(building.kind, building.seed + 1_000_003, len(building.storeys), Difficulty(**known["difficulty"]))
+    return make_building(building.kind, building.seed ^ 1, len(building.storeys), Difficulty(**known["difficulty"]))
 
 
 def draw_frames(count: int, scale: bool, rng: np.random.Generator) -> list[Sim3]:

@@ -1,0 +1,199 @@
+"""One cached pair: made from an item, written as an archive of arrays, read back as tensors."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from topomerge.datasets.building import Building
+from topomerge.datasets.buildings import make_building
+from topomerge.datasets.erect import erect
+from topomerge.datasets.pairs import Pair, make_pair
+from topomerge.datasets.plan import Plan
+from topomerge.datasets.recipe import Item, difficulty_of
+from topomerge.datasets.truth import room_truth, true_matches
+
+from topomerge.embedding.graph import from_arrays, graph_arrays
+from topomerge.errors import InputError
+from topomerge.extraction.extract import extract
+from topomerge.io import archive
+from topomerge.io.listing import plain
+from topomerge.types import Array
+
+if TYPE_CHECKING:
+    from torch import Tensor
+    from torch_geometric.data import Data
+
+FEWEST = 2  # rooms that must come out of each map
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of an item: `reason` is empty where the pair was made."""
+
+    name: str
+    reason: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Example:
+    """A cached pair.
+
+    Args:
+        a, b: graphs of the two maps (`embedding.graph`), with `true_room` (-1: none), `true_iou` and `true_one`.
+        matches: (M, 2) extracted rooms of a and of b that are the same true room; rooms may be in several.
+        transform: (4, 4) float64 T_ab; nan where there is none.
+        about: sensors, overlap, kind, building, ...
+    """
+
+    a: Data
+    b: Data
+    matches: Tensor
+    transform: Tensor
+    about: dict[str, Any]
+
+
+def make_file(item: Item, plans: Sequence[Plan], folder: str) -> Row:
+    """Make an item's file in a folder. It never raises: what went wrong is in the row.
+
+    One thread is used, so that as many workers as cores don't fight for them.
+    """
+    began = time.perf_counter()
+    try:
+        with one_thread():
+            archive.write(make_arrays(item, plans), Path(folder) / f"{item.name}.npz")
+        reason = ""
+    except Exception as error:  # one bad item must not end a build
+        reason = " ".join(str(error).split())[:200]
+        reason = reason if isinstance(error, InputError) else f"{type(error).__name__}: {reason}"
+    return Row(item.name, reason, time.perf_counter() - began)
+
+
+class one_thread:  # a context, used like a function
+    """Keep BLAS, OpenMP and numba to one thread."""
+
+    def __enter__(self) -> None:
+        import numba
+        from threadpoolctl import threadpool_limits
+
+        self.limits, self.threads = threadpool_limits(1), numba.get_num_threads()
+        numba.set_num_threads(1)
+
+    def __exit__(self, *_: object) -> None:
+        import numba
+
+        numba.set_num_threads(self.threads)
+        self.limits.restore_original_limits()
+
+
+def make_arrays(item: Item, plans: Sequence[Plan]) -> dict[str, Array]:
+    """Simulate, extract, judge: the arrays of an item.
+
+    Raises:
+        InputError: no candidate has such a pair, or a map has hardly a room.
+    """
+    pair = _first_pair(item, plans)
+    maps = [extract(cloud, voxel_size=item.voxel_size) for cloud in (pair.a, pair.b)]
+    if min(len(m.rooms) for m in maps) < FEWEST:
+        raise InputError(f"fewer than {FEWEST} rooms were extracted from a map of {' or '.join(item.sensors)}")
+    truths = [room_truth(m, cloud) for m, cloud in zip(maps, (pair.a, pair.b), strict=True)]
+    matches = true_matches(truths[0], truths[1], pair.shared)
+    arrays: dict[str, Array] = {}
+    for side, found, truth in zip("ab", maps, truths, strict=True):
+        arrays |= {f"{side}.{name}": array for name, array in graph_arrays(found, item.points_per_room).items()}
+        arrays |= {f"{side}.true_{name}": truth[name] for name in ("room", "iou", "one")}
+    arrays["matches"] = matches
+    arrays["transform"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
+    partners = [len(set(matches[:, k].tolist())) for k in (0, 1)]
+    about = {
+        **asdict(item),
+        "file": f"{item.name}.npz",
+        "building": pair.building,
+        "overlap": round(pair.overlap, 4),
+        "asked_overlap": item.overlap,
+        "visited": [len(v) for v in pair.visited],
+        "extracted": [len(t) for t in truths],
+        "identified": [int((t["room"] >= 0).sum()) for t in truths],
+        "one_to_one": [int(t["one"].sum()) for t in truths],
+        "partners": partners,
+        "points": [len(pair.a), len(pair.b)],
+    }
+    text = json.dumps(plain(about), sort_keys=True, ensure_ascii=False)
+    arrays["about"] = np.frombuffer(text.encode(), np.uint8)
+    return arrays
+
+
+def _first_pair(item: Item, plans: Sequence[Plan]) -> Pair:
+    """The pair of the first candidate that has one."""
+    refused: InputError | None = None
+    for k in range(len(item.buildings)):
+        try:
+            building = _building(item, k, plans)
+            other = _building(item, len(item.buildings), plans) if item.hard == "other-building" else None
+            rng = np.random.default_rng([item.seed, k])
+            choices = {"scale": item.scale, "hard": item.hard or None, "rooms": item.rooms, "other": other}
+            return make_pair(
+                building, item.overlap, item.sensors, rng, difficulty=difficulty_of(item), source=item.source, **choices
+            )
+        except InputError as error:
+            refused = error
+    raise refused or InputError("an item without buildings")
+
+
+def _building(item: Item, k: int, plans: Sequence[Plan]) -> Building:
+    """Candidate k; after the last one comes the other building."""
+    name = (*item.buildings, item.other[0])[k]
+    if item.source == "procedural":
+        return make_building(item.kind, int(name), item.storeys, difficulty_of(item))
+    return erect([plans[k]], difficulty_of(item), item.seed % 100_000 + k, name, item.source)
+
+
+def about(path: Path) -> dict[str, Any]:
+    """What a cached pair is, after checking that the whole file can be read.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    found: dict[str, Any] = json.loads(archive.read(path, "cached pair")["about"].tobytes())
+    return found
+
+
+def load_example(path: str | Path) -> Example:
+    """Read a cached pair as tensors; nothing is unpickled.
+
+    Raises:
+        InputError: no such file, or it is damaged.
+    """
+    import torch
+
+    arrays = archive.read(path, "cached pair")
+    told = json.loads(arrays.pop("about").tobytes())
+    sides = [from_arrays({n[2:]: a for n, a in arrays.items() if n.startswith(f"{s}.")}) for s in "ab"]
+    matches, transform = torch.from_numpy(arrays["matches"]), torch.from_numpy(arrays["transform"])
+    return Example(sides[0], sides[1], matches, transform, told)
+
+
+class PairSet:
+    """The pairs of a manifest, as a data set for `torch.utils.data.DataLoader`."""
+
+    def __init__(self, manifest: str | Path) -> None:
+        path = Path(manifest)
+        if not path.is_file():
+            raise InputError(f"{path}: no such manifest; make it with python -m topomerge.datasets.build")
+        self.rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        self.folder = path.parent / "pairs"
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: int) -> Example:
+        return load_example(self.folder / self.rows[index]["file"])
+
+    def __iter__(self) -> Iterator[Example]:
+        return (self[i] for i in range(len(self)))

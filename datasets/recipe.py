@@ -1,0 +1,218 @@
+"""What a training set is made of: a recipe, and the items that it is drawn into, one a pair."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from topomerge.datasets import splits
+from topomerge.datasets.buildings import PROFILES
+from topomerge.datasets.difficulty import Difficulty
+from topomerge.datasets.pairs import HARD
+from topomerge.datasets.plan import Plan
+from topomerge.datasets.sensors import get_sensor
+
+from topomerge.embedding import graph
+from topomerge.errors import InputError
+from topomerge.io.listing import plain
+
+FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
+CANDIDATES = 4  # buildings tried for an item: not every one has two parts with the overlap that is wanted
+Library = Mapping[str, Mapping[str, Plan]]  # source -> name -> plan
+
+
+@dataclass
+class Recipe:
+    """A set of pairs. Weights need not sum to 1; they have no defaults, as YAML would add its own to them.
+
+    Args:
+        name: of the manifest.
+        split: train, validation or test.
+        folder: of the real data; may be empty where `sources` is procedural only.
+        sources: weight of each: procedural, r2v, campus, mall, rmf.
+        kinds: weight of each kind of procedural building.
+        overlaps: shares of rooms in common, drawn alike often.
+        sensors: weight of each, drawn for each map by itself.
+        rooms: fewest and most rooms a map.
+        two_storeys: share of the procedural buildings with two storeys.
+        hard: share of the pairs that are hard negatives, of each kind.
+        scale: share of the pairs whose second map has an unknown scale.
+        spread: how far furniture, doors, glass and so on differ from building to building: 0.5 is half to one and a half times.
+        voxel_size: of the extraction, m.
+    """
+
+    name: str = "set"
+    split: str = "train"
+    pairs: int = 100
+    seed: int = 0
+    folder: str = ""
+    sources: dict[str, float] = field(default_factory=dict)
+    kinds: dict[str, float] = field(default_factory=dict)
+    overlaps: list[float] = field(default_factory=lambda: [0.25, 0.5, 0.75])
+    sensors: dict[str, float] = field(default_factory=dict)
+    rooms: list[int] = field(default_factory=lambda: [6, 15])
+    two_storeys: float = 0.0
+    hard: dict[str, float] = field(default_factory=dict)
+    scale: float = 0.0
+    spread: float = 0.5
+    voxel_size: float = 0.1
+    points_per_room: int = graph.POINTS
+
+
+@dataclass(frozen=True)
+class Item:
+    """Everything that the bytes of one pair depend on.
+
+    Args:
+        buildings: candidates, the first that works is taken: seeds of procedural buildings, or names of plans.
+        plans: digests of those plans; empty for procedural ones.
+        other: the building of "other-building", likewise, and its digest.
+        difficulty: what differs from the defaults.
+    """
+
+    source: str
+    kind: str
+    buildings: tuple[str, ...]
+    plans: tuple[str, ...]
+    other: tuple[str, str]
+    seed: int
+    storeys: int
+    overlap: float
+    sensors: tuple[str, str]
+    rooms: int
+    hard: str
+    scale: bool
+    difficulty: tuple[tuple[str, float], ...]
+    voxel_size: float
+    points_per_room: int
+
+    @property
+    def name(self) -> str:
+        """A hash of the inputs and of the versions of what is made from them."""
+        inputs = [FORMAT, graph.FORMAT, plain(asdict(self))]
+        return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def check(recipe: Recipe) -> None:
+    """Refuse a recipe that nothing can be made of.
+
+    Raises:
+        InputError: names the key and what is wrong.
+    """
+    splits.seeds(recipe.split)
+    for sensor in recipe.sensors:
+        get_sensor(sensor)
+    known = {"sources": ("procedural", *splits.FOLDERS), "kinds": tuple(PROFILES), "hard": HARD}
+    for key in ("sources", "kinds", "sensors", "hard"):
+        weights: dict[str, float] = getattr(recipe, key)
+        for name, weight in weights.items():
+            if name not in known.get(key, (name,)):
+                raise InputError(f"{key}: unknown {name!r}; {', '.join(known[key])} are possible")
+            if not 0 <= weight < np.inf:
+                raise InputError(f"{key}.{name} must be 0 or more, not {weight}")
+        if key != "hard" and sum(weights.values()) <= 0:
+            raise InputError(f"{key}: no weight above 0")
+    shares = {"two_storeys": recipe.two_storeys, "scale": recipe.scale, "hard, in all,": sum(recipe.hard.values())}
+    shares |= {f"overlaps[{i}]": o for i, o in enumerate(recipe.overlaps)} | {"spread": recipe.spread}
+    for key, value in shares.items():
+        if not 0 <= value <= 1:
+            raise InputError(f"{key} must be 0 to 1, not {value}")
+    if recipe.pairs < 1 or not recipe.overlaps or len(recipe.rooms) != 2 or not 3 <= recipe.rooms[0] <= recipe.rooms[1]:
+        raise InputError("pairs must be 1 or more, overlaps one or more, rooms [fewest, most] with 3 or more each")
+    if not 0.02 <= recipe.voxel_size <= 1 or recipe.points_per_room < 1:
+        raise InputError("voxel_size must be 0.02 to 1 m, and points_per_room 1 or more")
+
+
+def library(recipe: Recipe) -> Library:
+    """The real plans that the recipe draws from: those of its split.
+
+    Raises:
+        InputError: no folder of real data, or nothing of a source is in it.
+    """
+    from topomerge.datasets.floorplans import Refusal, iter_plans
+
+    out: dict[str, dict[str, Plan]] = {}
+    for source in (s for s, weight in recipe.sources.items() if s != "procedural" and weight > 0):
+        if not recipe.folder:
+            raise InputError(f"sources.{source} needs the real data: set folder or TOPOMERGE_DATA, or take procedural only")
+        wanted = set(splits.members(recipe.split, source))
+        plans = iter_plans(Path(recipe.folder) / splits.FOLDERS[source])
+        out[source] = {n: plan for n, plan in plans if n in wanted and not isinstance(plan, Refusal)}
+        if not out[source]:
+            raise InputError(f"sources.{source}: no plan of split {recipe.split} in {recipe.folder}")
+    return out
+
+
+def digest(plan: Plan) -> str:
+    """Hash of a plan's content."""
+    return hashlib.sha256(json.dumps(plain(asdict(plan)), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def draw_items(recipe: Recipe, plans: Library) -> list[Item]:
+    """The items of a recipe, each from its own number: a longer set begins with the shorter one."""
+    digests = {source: {name: digest(plan) for name, plan in sorted(of.items())} for source, of in plans.items()}
+    return [_draw(recipe, digests, np.random.default_rng([recipe.seed, i])) for i in range(recipe.pairs)]
+
+
+def _draw(recipe: Recipe, digests: Mapping[str, Mapping[str, str]], rng: np.random.Generator) -> Item:
+    hard = _pick({**recipe.hard, "": max(1 - sum(recipe.hard.values()), 0.0)}, rng)
+    overlap = float(recipe.overlaps[int(rng.integers(len(recipe.overlaps)))])
+    source = _pick(recipe.sources, rng) if hard != "other-storey" else "procedural"
+    kind = _pick(recipe.kinds, rng) if source == "procedural" else ""
+    storeys = 2 if hard == "other-storey" or rng.random() < recipe.two_storeys else 1
+    if overlap == 0 and not hard:  # one corridor can't be in neither
+        hard, storeys = ("", 2) if source == "procedural" else ("other-building", 1)
+    first, last = splits.seeds(recipe.split)
+    names = sorted(digests.get(source, {}))
+    chosen = [names[i] for i in rng.integers(len(names), size=CANDIDATES + 1)] if names else []
+    seeds = rng.integers(first, last + 1, size=CANDIDATES + 1).tolist()
+    known = [digests[source][n] for n in chosen] or [""] * (CANDIDATES + 1)
+    named = chosen or [str(s) for s in seeds]
+    return Item(
+        source=source,
+        kind=kind,
+        buildings=tuple(named[:CANDIDATES]),
+        plans=tuple(known[:CANDIDATES]),
+        other=(named[-1], known[-1]),
+        seed=int(rng.integers(2**31)),
+        storeys=storeys if source == "procedural" else 1,
+        overlap=overlap,
+        sensors=(_pick(recipe.sensors, rng), _pick(recipe.sensors, rng)),
+        rooms=int(rng.integers(recipe.rooms[0], recipe.rooms[1] + 1)),
+        hard=hard,
+        scale=bool(rng.random() < recipe.scale),
+        difficulty=_difficulty(recipe.spread, rng),
+        voxel_size=recipe.voxel_size,
+        points_per_room=recipe.points_per_room,
+    )
+
+
+def _pick(weights: Mapping[str, float], rng: np.random.Generator) -> str:
+    names = sorted(weights)
+    share = np.array([weights[n] for n in names], float)
+    return names[int(rng.choice(len(names), p=share / share.sum()))]
+
+
+def _difficulty(spread: float, rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
+    """Every number of the difficulty about its default."""
+    drawn = {f.name: round(float(f.default * rng.uniform(1 - spread, 1 + spread)), 3) for f in fields(Difficulty)}  # type: ignore[operator]
+    drawn = {name: value if name in ("furniture", "clutter", "people") else min(value, 1.0) for name, value in drawn.items()}
+    drawn["half"] = min(drawn["half"], round(1 - drawn["open"], 3))
+    return tuple(sorted(drawn.items()))
+
+
+def difficulty_of(item: Item) -> Difficulty:
+    """The item's difficulty; storeys are alike where that is what makes the item hard."""
+    difficulty = Difficulty(**dict(item.difficulty))
+    return replace(difficulty, differ=0.0) if item.hard == "other-storey" else difficulty
+
+
+def plans_of(item: Item, plans: Library) -> Sequence[Plan]:
+    """The plans of the item's candidates and of its other building; empty for a procedural one."""
+    of: Mapping[str, Any] = plans.get(item.source, {})
+    return [of[name] for name in (*item.buildings, item.other[0])] if of else []

@@ -1,0 +1,45 @@
+"""Settings from YAML files and the words of a command line, by Hydra, as typed dataclasses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from topomerge.errors import InputError
+
+Schema = TypeVar("Schema")
+
+
+def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schema:
+    """The settings of `configs/<name>.yaml`, overridden by words like ``data=train_small jobs=2 data.pairs=10``.
+
+    Every key must be a field of the dataclass `schema` and every value of its type; a field with a default may be absent.
+
+    Raises:
+        InputError: one line with the key's name.
+    """
+    try:
+        from hydra import compose as hydra_compose
+        from hydra import initialize_config_module
+        from hydra.errors import HydraException
+        from omegaconf import OmegaConf
+        from omegaconf.errors import OmegaConfBaseException
+    except ImportError as error:
+        raise InputError("settings need Hydra: pip install topomerge[learn]") from error
+    try:
+        with initialize_config_module("topomerge.configs", version_base="1.3"):
+            given = hydra_compose(name, overrides=list(words))
+        merged: Any = OmegaConf.merge(OmegaConf.structured(schema), given)
+        settings: Schema = OmegaConf.to_object(merged)  # type: ignore[assignment]
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(_one_line(error)) from error
+    return settings
+
+
+def _one_line(error: Exception) -> str:
+    """What Hydra and OmegaConf say in many lines; the innermost reason is the one that names the key's fault."""
+    texts = [str(error)]
+    if error.__cause__ is not None and str(error.__cause__) not in texts[0]:
+        texts.append(str(error.__cause__))
+    lines = [line.strip() for text in texts for line in text.splitlines()]
+    return "; ".join(line for line in lines if line and not line.startswith("object_type="))
