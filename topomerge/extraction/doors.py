@@ -76,7 +76,8 @@ def _edge(
     narrow = _narrowest(navigable, room, pair, cells)
     if narrow is not None and narrow[2] <= span:
         middle, along, span = narrow
-        rows = _under(navigable, middle, cells)
+    under = _under(navigable, middle, cells)
+    rows = under if len(under) else rows
     above = floor_to_ceiling[rows]
     height = float(np.quantile(above[above > 0], 0.1, method="nearest")) if (above > 0).any() else 0.0
     levels = np.sort(navigable.cells[rows, 2])

@@ -19,6 +19,7 @@ from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.extraction.floors import floor_components, largest_component
 from topomerge.extraction.gaps import bridge_gaps
 from topomerge.extraction.necks import merge_across_wide_necks
+from topomerge.extraction.noise import without_flying_cells
 from topomerge.extraction.propagation import propagate_labels
 from topomerge.extraction.rooms import split_rooms
 from topomerge.extraction.similarity import jaccard_similarity
@@ -38,6 +39,7 @@ Progress = Callable[[float, str], None]
 class Preset:
     """Parameters of the extraction; lengths in metres. The defaults mend the thesis' known faults where that is cheap."""
 
+    noise: float = 0.4  # cells with a smaller share of the usual number of neighbours are in nobody's way; 0: all are
     stem_height: float = 0.25  # a step may stand beside the foot
     body_width: float = 0.30
     body_height: float = 1.50  # with the stem 1.75: a grown-up
@@ -64,6 +66,7 @@ class Preset:
 PRESETS = {
     "default": Preset(),
     "thesis": Preset(
+        noise=0.0,
         body_height=0.75,
         bridge=0.0,
         ceilings=True,
@@ -151,6 +154,8 @@ def navigable_volume(grid: VoxelGrid, p: Preset) -> VoxelGrid:
         InputError: nowhere is room for a body on a floor.
     """
     body = stick_kernel(grid, p)
+    if p.noise:
+        grid = without_flying_cells(grid, p.noise)
     standing = unobstructed(grid, body)
     if not p.ceilings:
         standing = without_ceilings(grid, standing)

@@ -30,7 +30,8 @@ def topometric_map(grid: VoxelGrid, room: Array, navigable: VoxelGrid, body: flo
     label = navigable_rooms(grid, room, navigable)
     above = floor_to_ceiling(grid, navigable, body_height)
     storeys, storey = find_storeys(navigable, above)
-    used = np.bincount(label[label >= 0], minlength=int(room.max(initial=-1)) + 1) > 0
+    floor = label[lowest_of_column(navigable)]
+    used = np.bincount(floor[floor >= 0], minlength=int(room.max(initial=-1)) + 1) > 0
     number = np.append(np.where(used, np.cumsum(used) - 1, -1), -1).astype(np.int32)
     room, label = number[room], number[label]
     rooms = _measure(grid, room, navigable, label, storey, above, body)
