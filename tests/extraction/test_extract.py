@@ -74,6 +74,15 @@ def test_a_room_seen_through_its_door_is_glimpsed():
     assert not whole.rooms["glimpsed"].any() and (whole.rooms["completeness"] > 0.95).all()
 
 
+def test_flying_points_do_not_shut_a_door():
+    """Depth cameras leave points in the opening, between what is in front and what is behind."""
+    rng = np.random.default_rng(0)
+    flying = rng.uniform((3.5, 1.6, 0.4), (4.5, 2.4, 1.9), (60, 3)).astype(np.float32)
+    points = np.concatenate([scenes.two_rooms().points(0.005), flying])
+    assert len(extract(points).edges) == 1
+    assert len(extract(points, noise=0.0).edges) == 0
+
+
 def test_the_thesis_cuts_the_corridor():
     """Its known fault, kept: the range of 5 m cuts what is longer (findings.md)."""
     result = extract(scenes.corridor().points(0.01), preset="thesis")
