@@ -25,8 +25,10 @@ from topomerge.datasets.recipe import Item, Recipe, check, draw_items, library, 
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 
+PATIENCE = 20.0  # s to wait for the scheduler of a cluster
 OLD = 3600.0  # s; half-written files of a build that was killed are deleted when they are older
-Task = tuple[Item, "list[Plan]", str]
+Task = tuple[Item, list[Plan], str]
+Work = Callable[[Item, list[Plan], str], Row]
 
 
 @dataclass
@@ -50,11 +52,11 @@ class Report:
     refused: dict[str, int]
 
 
-def build(settings: Build, say: Callable[[str], None] = lambda text: None) -> Report:
+def build(settings: Build, say: Callable[[str], None] = lambda text: None, every: float = 10.0) -> Report:
     """Make what is missing of a set, then write its manifest.
 
     Args:
-        say: is told the progress, a line now and then.
+        say: is told the progress, a line each `every` seconds.
 
     Raises:
         InputError: a recipe that nothing can be made of, or a cluster that can't be reached.
@@ -71,7 +73,7 @@ def build(settings: Build, say: Callable[[str], None] = lambda text: None) -> Re
     known = {name: told for name in items if (told := _kept(folder / f"{name}.npz")) is not None}
     tasks = [(items[n], list(plans_of(items[n], plans)), str(folder)) for n in items if n not in known]
     say(f"{len(known)} of {len(items)} pairs are in the cache")
-    rows = _run(tasks, settings, Progress(len(tasks), say))
+    rows = _run(tasks, settings, Progress(len(tasks), say, every))
     known |= {row.name: about(folder / f"{row.name}.npz") for row in rows if not row.reason}
     manifest = folder.parent / f"{settings.data.name}.jsonl"
     with replacing(manifest) as beside:
@@ -104,7 +106,7 @@ def _kind(reason: str) -> str:
 class Progress:
     """Tells now and then how far a build is."""
 
-    def __init__(self, total: int, say: Callable[[str], None], every: float = 10.0) -> None:
+    def __init__(self, total: int, say: Callable[[str], None], every: float) -> None:
         self.total, self.say, self.every = total, say, every
         self.done = self.refused = 0
         self.began = self.last = time.monotonic()
@@ -120,39 +122,39 @@ class Progress:
             self.say(f"{self.done} of {self.total} pairs, {self.refused} refused, {each:.2f} s a pair, {left} left")
 
 
-def _run(tasks: list[Task], settings: Build, note: Callable[[Row], None]) -> list[Row]:
+def _run(tasks: list[Task], settings: Build, note: Callable[[Row], None], work: Work = make_file) -> list[Row]:
     """Rows of all tasks. A task that kills its worker is found by running those that were under way one by one."""
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     rows: dict[str, Row] = {}
     while pending := [task for task in tasks if task[0].name not in rows]:
         try:
-            for row in _parallel(pending, settings):
+            for row in _parallel(pending, settings, work):
                 rows[row.name] = row
                 note(row)
         except TerminatedWorkerError:
-            for task in [t for t in pending if t[0].name not in rows][: 2 * settings.jobs]:
-                row = _alone(task, settings)
+            left = [task for task in pending if task[0].name not in rows]
+            for row in (_alone(task, settings, work) for task in left[: 2 * settings.jobs]):
                 rows[row.name] = row
                 note(row)
     return list(rows.values())
 
 
-def _alone(task: Task, settings: Build) -> Row:
+def _alone(task: Task, settings: Build, work: Work) -> Row:
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     try:
-        return next(iter(_parallel([task], settings)))
+        return next(iter(list(_parallel([task], settings, work))))
     except TerminatedWorkerError:
         return Row(task[0].name, "killed its worker (out of memory?)", 0.0)
 
 
-def _parallel(tasks: Iterable[Task], settings: Build) -> Iterator[Row]:
+def _parallel(tasks: Iterable[Task], settings: Build, work: Work) -> Iterator[Row]:
     from joblib import Parallel, delayed
 
     with _backend(settings):
-        work = Parallel(return_as="generator_unordered", batch_size=1)
-        yield from work(delayed(make_file)(*task) for task in tasks)
+        parallel = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2 * n_jobs")
+        yield from parallel(delayed(work)(*task) for task in tasks)
 
 
 @contextmanager
@@ -169,7 +171,7 @@ def _backend(settings: Build) -> Iterator[None]:
     except ImportError as error:
         raise InputError("a cluster needs Dask: pip install topomerge[cluster]") from error
     try:
-        client = Client(settings.cluster, timeout=20, set_as_default=False)
+        client = Client(settings.cluster, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"cluster: no scheduler answers at {settings.cluster}") from error
     with client, parallel_config(backend="dask", client=client, n_jobs=-1):
