@@ -59,7 +59,7 @@ class Preset:
     propagation_rounds: int = 10
     least_volume: float = 0.128  # of a room's occupied cells, m3
     absorb: bool = True  # give smaller pieces to the room they touch
-    neck: float = 0.75  # rooms are merged where their connection has this share of the narrower one's width; 0: never
+    neck: float = 0.6  # rooms are merged where their connection has this share of the narrower one's width; 0: never
     opening: float = 1.8  # or where it is wider than this and has no lintel
 
 

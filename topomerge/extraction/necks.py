@@ -17,6 +17,7 @@ from topomerge.extraction.storeys import ceiling_height
 from topomerge.kernels import saddle as kernel
 from topomerge.types import Array, VoxelGrid
 
+UNDER_LINTEL = 0.75  # what a share of the width counts where it is that of a door
 LINTEL = 0.25  # m: a passage this much lower than the rooms on both sides is a door, however wide
 
 
@@ -80,7 +81,8 @@ def _merge(count: int, peak: Array, passages: dict[tuple[int, int], _Passage], r
     def score(pair: tuple[int, int]) -> float:
         passage = passages[pair]
         wide = 2 * passage.half_width >= width and not passage.lintel
-        return max(passage.half_width / min(peak[pair[0]], peak[pair[1]]), 1.0 if wide else 0.0)
+        share = passage.half_width / min(peak[pair[0]], peak[pair[1]])
+        return max(share * (UNDER_LINTEL if passage.lintel else 1.0), 1.0 if wide else 0.0)
 
     scores = {pair: score(pair) for pair in passages}
     while scores:
@@ -138,5 +140,7 @@ def _passage(
     window = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     near = navigable.rows(navigable.cells[at] + window)
     height = above[near[near >= 0]]
-    lintel = ceiling > 0 and bool((height > 0).any()) and float(height[height > 0].min()) <= ceiling - LINTEL
+    seen = height[height > 0]
+    # A lintel is as deep as the wall, a fifth of the window; single low points are none.
+    lintel = ceiling > 0 and len(seen) > 0 and float(np.quantile(seen, 0.15)) <= ceiling - LINTEL
     return _Passage(float(half_width[at]), lintel)
