@@ -36,7 +36,7 @@ class Scene:
         return self
 
     def wall(self, a, b, z=0.0, height=HEIGHT, doors=(), lintel=True, thick=THICK) -> Scene:
-        """Both faces of a wall from a to b; `doors` are distances of door centres from a. The jambs and the lintel are faces, too."""
+        """Both faces of a wall from a to b; `doors` are distances of door centres from a. Jambs are faces, too."""
         a, b = np.asarray(a, float), np.asarray(b, float)
         length = float(np.linalg.norm(b - a))
         along = (b - a) / length
