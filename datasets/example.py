@@ -136,10 +136,17 @@ def _first_pair(item: Item, plans: Sequence[Plan]) -> Pair:
         try:
             building = _building(item, k, plans)
             other = _building(item, len(item.buildings), plans) if item.hard == "other-building" else None
-            rng = np.random.default_rng([item.seed, k])
-            choices = {"scale": item.scale, "hard": item.hard or None, "rooms": item.rooms, "other": other}
             return make_pair(
-                building, item.overlap, item.sensors, rng, difficulty=difficulty_of(item), source=item.source, **choices
+                building,
+                item.overlap,
+                item.sensors,
+                np.random.default_rng([item.seed, k]),
+                item.scale,
+                item.hard or None,
+                item.rooms,
+                other,
+                difficulty_of(item),
+                item.source,
             )
         except InputError as error:
             refused = error
