@@ -101,15 +101,15 @@ def raise_flat(flat: Flat, z: float = 0.0) -> PointCloud:
     """The cloud of a floor at height `z`, m: floor, walls of `HEIGHT` and, where the sensor's rays went, free cells."""
     spacing = max(flat.cell, 0.05)
     levels = np.linspace(0.0, HEIGHT, round(HEIGHT / spacing) + 1)
-    walls = thin(flat.walls, spacing)
-    points = np.concatenate([_at(thin(flat.free, spacing), [0.0]), _at(walls, levels)]) + [0.0, 0.0, z]
+    free, walls = (thin(p, spacing) if flat.cell < 0.9 * spacing else p for p in (flat.free, flat.walls))
+    points = np.concatenate([_at(free, [0.0]), _at(walls, levels)]) + [0.0, 0.0, z]
     poses = None
     if flat.poses is not None:
         poses = np.array([Sim3(yaw, (x, y, z + LASER)).matrix for x, y, yaw in flat.poses.tolist()])
     rooms = tuple(replace(r, floor=r.floor + z, ceiling=r.ceiling + z) for r in flat.rooms)
     labels = rooms_at(points[:, :2], rooms) if rooms else None
-    free = _free(flat, z) if flat.rays else None
-    return PointCloud(points.astype(np.float32), labels=labels, poses=poses, free=free, rooms=rooms, source=flat.source)
+    known = _free(flat, z) if flat.rays else None
+    return PointCloud(points.astype(np.float32), labels=labels, poses=poses, free=known, rooms=rooms, source=flat.source)
 
 
 def keys(*sets: Array) -> tuple[Array, ...]:
@@ -138,7 +138,7 @@ def _at(points: Array, levels: Sequence[float] | Array) -> Array:
 
 def _free(flat: Flat, z: float) -> VoxelGrid:
     """Cells at the laser's height that hold free floor and no wall."""
-    corner = np.concatenate([flat.free, flat.walls]).min(axis=0) - EDGE
+    corner = np.concatenate([flat.free, flat.walls]).min(axis=0) - 1.5 * EDGE  # a lattice of this step falls on middles
     free = thin(flat.free - corner, EDGE)
     rows, walls = keys(squares(free, EDGE), squares(flat.walls - corner, EDGE))
     cells = squares(free[~np.isin(rows, walls)], EDGE)
@@ -163,9 +163,9 @@ def rooms_at(points: Array, rooms: Sequence[TrueRoom]) -> Array:
     return out
 
 
-def floor_overlap(a: Flat, b: Flat, truth: Sim3, cell: float = 0.2) -> float:
-    """Dice of the two floors: twice the common area by the sum of both areas."""
-    here, there = (np.unique(k) for k in keys(squares(a.free, cell), squares(_flat(truth, b.free), cell)))
+def floor_overlap(a: Array, b: Array, cell: float = 0.2) -> float:
+    """Dice of two floors given as points (n, 2) in one frame: twice the common area by the sum of both areas."""
+    here, there = (np.unique(k) for k in keys(squares(a, cell), squares(b, cell)))
     return float(2 * np.isin(here, there).sum() / (len(here) + len(there)))
 
 
@@ -187,5 +187,5 @@ def flat_pair(
     ]
     shared = seen_by_both(*clouds) if a.rooms and b.rooms else ()
     between = frames[0] @ truth @ frames[1].inverse()
-    overlap = floor_overlap(a, b, truth)
+    overlap = floor_overlap(a.free, _flat(truth, b.free))
     return Pair(name, clouds[0], clouds[1], between, shared, overlap, sensors, source, building)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -47,20 +47,24 @@ def iter_real_pairs(folder: str | Path, sources: Sequence[str] | None = None) ->
 def _iterate(folder: Path, sources: Sequence[str]) -> Iterator[tuple[str, Pair | Refusal]]:
     for source in sources:
         module = import_module(f"topomerge.datasets.real_{source}")
-        makers = module.pairs(folder / module.FOLDER)
-        while True:
-            try:
-                name, make = next(makers)
-            except StopIteration:
-                break
-            except Exception as error:  # the source as a whole can't be read
-                yield source, Refusal(source, reason(error))
-                break
-            name = f"{source}/{name}"
-            try:
-                yield name, make()
-            except Exception as error:  # one bad item never ends a run
-                yield name, Refusal(name, reason(error))
+        yield from collect(source, module.pairs(folder / module.FOLDER))
+
+
+def collect(source: str, makers: Iterator[tuple[str, Callable[[], Pair]]]) -> Iterator[tuple[str, Pair | Refusal]]:
+    """Pairs by their makers; whatever one of them, or the source as a whole, raises is a `Refusal`."""
+    while True:
+        try:
+            name, make = next(makers)
+        except StopIteration:
+            return
+        except Exception as error:  # the source as a whole can't be read
+            yield source, Refusal(source, reason(error))
+            return
+        name = f"{source}/{name}"
+        try:
+            yield name, make()
+        except Exception as error:  # one bad item never ends a run
+            yield name, Refusal(name, reason(error))
 
 
 def reason(error: Exception) -> str:

@@ -66,9 +66,9 @@ def split(count: int, a: str, b: str) -> tuple[Array, Array]:
     Raises:
         InputError: the log is too short.
     """
-    parts = [np.arange(*(round(end * count) for end in SPANS[part])) for part in (a, b)]
-    both = np.intersect1d(*parts)
-    rows = np.setdiff1d(parts[0], both[1::2]), np.setdiff1d(parts[1], both[::2])
+    first, second = (np.arange(*(round(end * count) for end in SPANS[part])) for part in (a, b))
+    both = np.intersect1d(first, second)
+    rows = np.setdiff1d(first, both[1::2]), np.setdiff1d(second, both[::2])
     if min(map(len, rows)) < FEWEST:
         raise InputError(f"a log of {count} scans is too short: {FEWEST} a part are needed")
     return rows
@@ -87,7 +87,8 @@ def read_log(path: Path) -> tuple[Array, Array]:
         raise InputError(f"{path}: can't be unpacked ({error}); copy it again") from error
     if len(text) > LARGEST:
         raise InputError(f"{path}: unpacks to more than {LARGEST >> 20} MB; is it a log?")
-    poses, ranges = [], []
+    poses: list[Array] = []
+    ranges: list[Array] = []
     for number, line in enumerate(text.splitlines(), 1):
         if line.startswith(b"FLASER "):
             words = line.split()
