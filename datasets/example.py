@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
+import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from topomerge.datasets.building import Building
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from torch_geometric.data import Data
 
 FEWEST = 2  # rooms that must come out of each map
+LONGEST = 600.0  # s a pair: a hundred times what is usual, so that no slow machine makes another set
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ def make_file(item: Item, plans: Sequence[Plan], folder: str) -> Row:
     """
     began = time.perf_counter()
     try:
-        with one_thread():
+        with one_thread(), time_limit(LONGEST):
             archive.write(make_arrays(item, plans), Path(folder) / f"{item.name}.npz")
         reason = ""
     except Exception as error:  # one bad item must not end a build
@@ -75,21 +79,38 @@ def make_file(item: Item, plans: Sequence[Plan], folder: str) -> Row:
     return Row(item.name, reason, time.perf_counter() - began)
 
 
-class one_thread:  # a context, used like a function
+@contextmanager
+def one_thread() -> Iterator[None]:
     """Keep BLAS, OpenMP and numba to one thread."""
+    import numba
+    from threadpoolctl import threadpool_limits
 
-    def __enter__(self) -> None:
-        import numba
-        from threadpoolctl import threadpool_limits
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        numba.set_num_threads(threads)
 
-        self.limits, self.threads = threadpool_limits(1), numba.get_num_threads()
-        numba.set_num_threads(1)
 
-    def __exit__(self, *_: object) -> None:
-        import numba
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """End what takes too long with an `InputError`; without effect in threads, which get no signals."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        yield
+        return
 
-        numba.set_num_threads(self.threads)
-        self.limits.restore_original_limits()
+    def stop(*_: object) -> NoReturn:
+        raise InputError(f"takes longer than {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def make_arrays(item: Item, plans: Sequence[Plan]) -> dict[str, Array]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from topomerge.datasets import splits
 from topomerge.datasets.buildings import PROFILES
 from topomerge.datasets.difficulty import Difficulty
@@ -22,6 +23,8 @@ from topomerge.errors import InputError
 from topomerge.io.listing import plain
 
 FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
+LEAST_ROOMS = 5  # of a real plan: fewer have no two parts
+LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
 CANDIDATES = 4  # buildings tried for an item: not every one has two parts with the overlap that is wanted
 Library = Mapping[str, Mapping[str, Plan]]  # source -> name -> plan
 
@@ -129,7 +132,7 @@ def check(recipe: Recipe) -> None:
 
 
 def library(recipe: Recipe) -> Library:
-    """The real plans that the recipe draws from: those of its split.
+    """The real plans that the recipe draws from: those of its split that have neither too few rooms nor a vast one.
 
     Raises:
         InputError: no folder of real data, or nothing of a source is in it.
@@ -142,10 +145,15 @@ def library(recipe: Recipe) -> Library:
             raise InputError(f"sources.{source} needs the real data: set folder or TOPOMERGE_DATA, or take procedural only")
         wanted = set(splits.members(recipe.split, source))
         plans = iter_plans(Path(recipe.folder) / splits.FOLDERS[source])
-        out[source] = {n: plan for n, plan in plans if n in wanted and not isinstance(plan, Refusal)}
+        out[source] = {n: p for n, p in plans if n in wanted and not isinstance(p, Refusal) and _fits(p)}
         if not out[source]:
             raise InputError(f"sources.{source}: no plan of split {recipe.split} in {recipe.folder}")
     return out
+
+
+def _fits(plan: Plan) -> bool:
+    areas = [shapely.Polygon(room.polygon).area for room in plan.rooms]
+    return len(areas) >= LEAST_ROOMS and max(areas) <= LARGEST_ROOM
 
 
 def digest(plan: Plan) -> str:

@@ -113,6 +113,13 @@ def test_one_bad_item_ends_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert (tmp_path / "small.jsonl").read_text() == ""
 
 
+def test_what_takes_too_long_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(example, "make_arrays", lambda item, plans: time.sleep(5))
+    monkeypatch.setattr(example, "LONGEST", 0.1)
+    row = example.make_file(draw_items(SMALL, {})[0], [], str(tmp_path))
+    assert row.reason == "takes longer than 0.1 s" and row.seconds < 2 and not list(tmp_path.iterdir())
+
+
 def test_items() -> None:
     items = draw_items(SMALL, {})
     assert draw_items(replace(SMALL, pairs=2), {}) == items[:2]
