@@ -21,7 +21,7 @@ demo: setup
 	@echo "The map from above: demo/a.png"
 
 test: setup
-	$(BIN)/python -m pytest -m 'not slow'
+	$(BIN)/python -m pytest -rs -m 'not slow'
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow

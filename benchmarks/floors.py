@@ -12,7 +12,8 @@ DOOR = 1.0  # m
 
 def _walls() -> list[tuple[tuple[float, float], tuple[float, float]]]:
     low, high = DEPTH / 2 - CORRIDOR / 2, DEPTH / 2 + CORRIDOR / 2
-    walls = [((0.0, 0.0), (WIDTH, 0.0)), ((0.0, DEPTH), (WIDTH, DEPTH)), ((0.0, 0.0), (0.0, DEPTH)), ((WIDTH, 0.0), (WIDTH, DEPTH))]
+    corners = [(0.0, 0.0), (WIDTH, 0.0), (WIDTH, DEPTH), (0.0, DEPTH)]
+    walls = list(zip(corners, corners[1:] + corners[:1], strict=True))
     for y in (low, high):
         begin = 0.0
         for x in (np.arange(ROOMS) + 0.5) * WIDTH / ROOMS:

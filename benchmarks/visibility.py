@@ -67,7 +67,8 @@ def main() -> None:
     peer = best(lambda: scene.cast_rays(rays), 3)
     line("visibility_rays", seconds, peer)
     rate = len(target) / 1e6
-    print(f"# {len(target)} rays, {len(grid)} cells: {rate / seconds:.1f} against {rate / peer:.1f} million a second; {agree:.4%} alike")
+    print(f"# {len(target)} rays, {len(grid)} cells; {agree:.4%} decided alike")
+    print(f"# {rate / seconds:.1f} against {rate / peer:.1f} million rays a second")
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ class Bars:
     """
 
     def __init__(self, enabled: bool = True, delay: float = 2.0) -> None:
-        self.enabled = enabled and sys.stderr.isatty()
+        self.enabled = enabled and sys.stderr is not None and sys.stderr.isatty()
         self._lock = threading.Lock()
         self._state: dict[str, tuple[float, str]] = {}
         self._rows: dict[str, Any] = {}

@@ -60,6 +60,16 @@ def test_nodes_without_neighbours_stay_alone():
     assert cluster_views(sparse.csr_array((0, 0)))[0].tolist() == []
 
 
+def test_stored_zeros_are_no_neighbours():
+    full = np.zeros((60, 60)) + np.eye(60)
+    row, column = np.indices(full.shape)
+    stored = sparse.csr_array((full.ravel(), (row.ravel(), column.ravel())), shape=full.shape)
+    assert stored.nnz == 3600
+    assert len(set(markov_clusters(stored, 1.5).tolist())) == 60
+    with pytest.raises(ValueError, match="self loops"):
+        markov_clusters(sparse.csr_array((3, 3)), 1.5)
+
+
 def test_distances_and_low_inflation_are_refused():
     with pytest.raises(ValueError, match="inflation"):
         markov_clusters(sparse.csr_array(np.eye(2)), 1.0)

@@ -200,7 +200,29 @@ def test_parameters_are_checked_and_kept():
         extract(points, rnge=3)
     result = extract(points, preset=Preset(range=4.0), voxel_size=0.1)
     assert result.parameters["range"] == 4.0 and result.parameters["preset"] == "custom"
-    assert PRESETS["thesis"].body_height == 0.75 and PRESETS["thesis"].range == 5.0
+    for edge in (0.0, -0.1, float("nan"), 0.001, 0.5, "a"):
+        with pytest.raises(InputError, match="voxel size must be between"):
+            extract(points, voxel_size=edge)
+
+
+def test_the_thesis_preset_is_the_table_of_the_method():
+    """method.md, section 1, the column of the finished thesis."""
+    p = PRESETS["thesis"]
+    assert (p.stem_height, p.body_width, p.body_height, p.dilation) == (0.25, 0.30, 0.75, 0.25)
+    assert (p.view_radius, p.view_height, p.range, p.least_similarity) == (0.5, 1.6, 5.0, 0.3)
+    assert (p.propagation_cells, p.propagation_rounds, p.least_volume) == (2.0, 10, 0.128)
+    assert (min(p.inflations), max(p.inflations)) == (1.2, 2.5)
+    assert p.largest_only and p.ceilings and not p.absorb
+    assert (p.noise, p.bridge, p.view_spacing, p.view_clearance, p.tolerance, p.neck) == (0, 0, 0, 0, 0, 0)
+
+
+def test_cells_finer_than_the_points_are_told():
+    result = extract(scenes.two_rooms().points()[::5], voxel_size=0.02)
+    assert len(result.rooms) == 0 and any("no room was found" in w for w in result.warnings)
+
+
+def test_coarse_cells_are_warned_of():
+    assert any("doors" in w for w in extract(scenes.two_rooms().points(), voxel_size=0.2).warnings)
 
 
 def test_progress_goes_forward():

@@ -9,7 +9,7 @@ from scipy.sparse import csgraph
 
 from topomerge.extraction.ceilings import without_ceilings
 from topomerge.extraction.components import connected_components, spread_labels
-from topomerge.extraction.convolution import circle, convolve, moore, stick, von_neumann
+from topomerge.extraction.convolution import Kernel, circle, convolve, moore, stick, von_neumann
 from topomerge.extraction.dilation import dilate_upwards
 from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.extraction.floors import floor_components, largest_component
@@ -60,6 +60,12 @@ def test_components_equal_a_dense_graph(seed, name):
     found = sorted(np.flatnonzero(component == c).tolist() for c in range(component.max() + 1))
     assert found == expected and (component[group < 0] == -1).all()
     assert (np.diff([np.flatnonzero(component == c)[0] for c in range(component.max() + 1)]) > 0).all()
+
+
+def test_a_neighbourhood_said_one_way_is_meant_both_ways():
+    grid = VoxelGrid.from_cells(np.array([(0, 0, 0), (1, 0, 0)], np.int32))
+    for step in ((1, 0, 0), (-1, 0, 0)):
+        assert connected_components(grid, Kernel.from_offsets(np.array([step]))).tolist() == [0, 0]
 
 
 def test_spread_takes_the_nearest_label():

@@ -95,6 +95,17 @@ def test_an_extent_that_no_building_has_is_refused():
         voxelise(points, 0.1)
 
 
+@pytest.mark.parametrize("size", [(800, 400, 260), (5000, 5, 3)])
+def test_an_extent_between_table_and_sorting(size):
+    """Too many bricks for one table: the median point's surroundings and the rest are joined."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(0, size, (2000, 3)), rng.uniform(0, 5, (2000, 3))]).astype(np.float32)
+    cells, counts = twin(points, 0.1)
+    base, found, number = kernel.occupied(points, np.zeros(3), 0.1)
+    keys = [tuple(c) for c in (found + base).tolist()]
+    assert set(keys) == cells and dict(zip(keys, number.tolist(), strict=True)) == counts
+
+
 @pytest.mark.parametrize("edge", [0.0, -1.0, float("nan"), 1e-5, 50.0])
 def test_absurd_voxel_size_is_refused(edge):
     with pytest.raises(InputError, match="voxel size"):

@@ -17,7 +17,7 @@ INFLATIONS = (1.2, 1.35, 1.5, 1.7, 1.9, 2.2, 2.5)
 
 
 def markov_clusters(
-    similarity: sparse.csr_array, inflation: float, threshold: float = 1e-4, most: int = 256, rounds: int = 100
+    similarity: sparse.csr_array, inflation: float, threshold: float = 1e-4, most: int = 64, rounds: int = 100
 ) -> Array:
     """Cluster of each node of a weighted graph.
 
@@ -40,6 +40,9 @@ def markov_clusters(
         raise ValueError("similarities must not be negative")
     flow = sparse.csc_array(similarity.astype(np.float64))
     flow.sum_duplicates()
+    flow.eliminate_zeros()
+    if (np.diff(flow.indptr) == 0).any():
+        raise ValueError("a node has no similarity at all: the diagonal must hold self loops")
     flow.sort_indices()
     sums = np.asarray(flow.sum(axis=0)).ravel()
     indptr, indices = flow.indptr.astype(np.int64), flow.indices.astype(np.int32)

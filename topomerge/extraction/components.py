@@ -21,7 +21,8 @@ def connected_components(grid: VoxelGrid, neighbourhood: Kernel | None = None, g
         (n,) int64, numbered from 0 in the order of their first cells, -1 for cells left out.
     """
     offsets = (neighbourhood or von_neumann()).stencil[0]
-    half = offsets[[tuple(o) > (0, 0, 0) for o in offsets.tolist()]]
+    both = np.unique(np.concatenate([offsets, -offsets]), axis=0)  # a neighbour's neighbour, whichever way it is said
+    half = both[[tuple(o) > (0, 0, 0) for o in both.tolist()]]
     group = np.zeros(len(grid), np.int64) if group is None else np.asarray(group, np.int64)
     return kernel.components(grid.cells, *grid._bricks, half, group)
 

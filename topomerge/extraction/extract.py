@@ -35,6 +35,9 @@ from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid
 Progress = Callable[[float, str], None]
 
 
+FINEST, COARSE, COARSEST = 0.02, 0.15, 0.3  # m: above the second, walls beside a door leave too little of it
+
+
 @dataclass(frozen=True)
 class Preset:
     """Parameters of the extraction; lengths in metres. The defaults mend the thesis' known faults where that is cheap."""
@@ -55,7 +58,7 @@ class Preset:
     tolerance: float = 0.2  # noisy walls are cells thick
     least_similarity: float = 0.3
     inflations: tuple[float, ...] = INFLATIONS
-    propagation_radius: float = 0.2
+    propagation_cells: float = 2.0  # radius of the neighbourhood, in cells as in the thesis
     propagation_rounds: int = 10
     least_volume: float = 0.128  # of a room's occupied cells, m3
     absorb: bool = True  # give smaller pieces to the room they touch
@@ -104,6 +107,9 @@ def extract(
         InputError: no finite point, an absurd extent, or no floor that somebody could stand on.
     """
     p = _preset(preset, overrides)
+    edge = source.edge if isinstance(source, VoxelGrid) else voxel_size
+    if not (isinstance(edge, int | float) and FINEST <= edge <= COARSEST):
+        raise InputError(f"voxel size must be between {FINEST} and {COARSEST} m to find rooms and doors, not {edge}")
     known: dict[str, Any] = {"warnings": []}
     try:
         return _extract(source, voxel_size, p, preset, name, known, _Clock(progress))
@@ -124,18 +130,22 @@ def _extract(
     with clock("views", 0.4):
         views = optimal_views(grid, navigable, p)
     with clock("visibility", 0.45):
-        visibility = visible_cells(grid, views, p.range, p.tolerance)
+        visibility = visible_cells(grid, views, p.range, p.tolerance, clock.part(0.45, 0.65))
     with clock("similarity", 0.65):
         similarity = jaccard_similarity(visibility, p.least_similarity, views, 2 * p.range)
     with clock("clusters", 0.75):
         cluster, inflation = cluster_views(similarity, p.inflations)
     with clock("rooms", 0.85):
         labels = vote(visibility, cluster)
-        labels = propagate_labels(grid, labels, sphere(p.propagation_radius, grid.edge), p.propagation_rounds)
+        labels = propagate_labels(grid, labels, sphere(p.propagation_cells, 1.0), p.propagation_rounds)
         room = split_rooms(grid, labels, p.least_volume, p.absorb)
         room = merge_rooms(grid, room, navigable, p)
     with clock("topology", 0.95):
         result = topometric_map(grid, room, navigable, p.body_width, p.stem_height + p.body_height)
+    if grid.edge > COARSE:
+        known["warnings"].append(f"cells of {grid.edge:g} m are coarse: doors may be lost, {COARSE} m or less finds them")
+    if not len(result.rooms):
+        known["warnings"].append("no room was found: take larger voxels if the points are sparse, smaller ones if they are dense")
     parameters = {**asdict(p), "voxel_size": grid.edge, "preset": preset if isinstance(preset, str) else "custom"}
     return replace(
         result,
@@ -191,8 +201,9 @@ def merge_rooms(grid: VoxelGrid, room: Array, navigable: VoxelGrid, p: Preset) -
 
 
 def stick_kernel(grid: VoxelGrid, p: Preset) -> Kernel:
-    """The stick that the preset describes, in cells of the grid."""
-    return stick(p.stem_height, p.body_width, p.body_height, grid.edge)
+    """The stick that the preset describes, in cells of the grid; the body's width is the nearest odd number of them."""
+    width = 2 * int((p.body_width / grid.edge - 1) / 2 + 0.5) + 1
+    return stick(p.stem_height, width * grid.edge, p.body_height, grid.edge)
 
 
 def _preset(preset: str | Preset, overrides: dict[str, Any]) -> Preset:
@@ -230,6 +241,13 @@ class _Clock:
     def __init__(self, progress: Progress | None) -> None:
         self.seconds: dict[str, float] = {}
         self.progress = progress
+
+    def part(self, begin: float, end: float) -> Progress | None:
+        """News of a step that takes the work from one share done to another."""
+        if self.progress is None:
+            return None
+        whole = self.progress
+        return lambda done, text: whole(begin + done * (end - begin), text)
 
     @contextmanager
     def __call__(self, step: str, done: float) -> Iterator[None]:

@@ -38,29 +38,39 @@ def floor_components(grid: VoxelGrid) -> VoxelGrid:
     widest = np.zeros(count, np.int64)
     np.maximum.at(widest, component, horizontal_distance_field(grid))
     floor = (area >= LEAST_AREA) & ((widest + 0.5) * grid.edge >= LEAST_HALF_WIDTH)
-    for c in np.flatnonzero(floor & (area <= FURNITURE_AREA)):
-        if _on_furniture(grid, component, area, floor, int(c)):
-            floor[c] = False
+    suspects = np.flatnonzero(floor & (area <= FURNITURE_AREA))
+    if len(suspects):
+        large = grid.cells[(floor & (area > 2 * area[suspects].min()))[component]] * grid.edge
+        below = cKDTree(large[:, :2]) if len(large) else None
+        order = np.argsort(component, kind="stable")
+        begin = np.searchsorted(component[order], np.arange(count + 1))
+        for c in suspects:
+            top = grid.cells[order[begin[c] : begin[c + 1]]] * grid.edge
+            if below is not None and _on_furniture(top, large, below):
+                floor[c] = False
     return grid.subset(floor[component])
 
 
 def _columns(grid: VoxelGrid, component: Array, count: int) -> Array:
     """Number of columns (x, y) that each component covers."""
-    keys = np.unique(np.column_stack([component, grid.cells[:, :2]]), axis=0)
-    return np.bincount(keys[:, 0], minlength=count)
+    columns = grid.shape[0] * grid.shape[1]
+    keys = np.unique((component * grid.shape[0] + grid.cells[:, 0]) * grid.shape[1] + grid.cells[:, 1])
+    return np.bincount(keys // columns, minlength=count)
 
 
-def _on_furniture(grid: VoxelGrid, component: Array, area: Array, floor: Array, c: int) -> bool:
-    """Does component `c` lie a table's height above the larger floor around it?"""
-    top = grid.cells[component == c] * grid.edge
-    near = floor[component] & (area[component] > 2 * area[c])
-    near &= (np.abs(grid.cells * grid.edge - top.mean(axis=0)) < np.ptp(top, axis=0) / 2 + (1.0, 1.0, 1.6)).all(axis=1)
-    if not near.any():
+def _on_furniture(top: Array, floors: Array, below: cKDTree) -> bool:
+    """Do the cells `top` (k, 3) lie a table's height above the floor around them? All in m; `below` searches the floors' plan.
+
+    Only a floor that is larger than the top counts: it is the one that goes around it.
+    """
+    around = below.query_ball_point(top[:, :2].mean(axis=0), float(np.ptp(top[:, :2], axis=0).max()) / 2 + 1.0)
+    near = floors[around]
+    near = near[(near[:, 2] < top[:, 2].min() - 1e-6) & (near[:, 2] > top[:, 2].min() - FURNITURE_HEIGHT[1] - 0.3)]
+    if len(near) <= len(top):
         return False
-    around = grid.cells[near] * grid.edge
-    distance, nearest = cKDTree(around[:, :2]).query(top[:, :2], distance_upper_bound=1.0)
+    distance, nearest = cKDTree(near[:, :2]).query(top[:, :2], distance_upper_bound=1.0)
     found = np.isfinite(distance)
     if found.mean() < 0.3:
         return False
-    rise = float(np.median(top[found, 2] - around[nearest[found], 2]))
+    rise = float(np.median(top[found, 2] - near[nearest[found], 2]))
     return FURNITURE_HEIGHT[0] <= rise <= FURNITURE_HEIGHT[1]

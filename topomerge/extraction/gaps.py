@@ -8,6 +8,8 @@ import numpy as np
 from topomerge.extraction.convolution import Kernel, any_at
 from topomerge.types import Array, VoxelGrid
 
+TILE = 256  # cells
+
 
 def bridge_gaps(grid: VoxelGrid, standing: VoxelGrid, stick: Kernel, reach: float) -> VoxelGrid:
     """Close gaps of up to twice `reach` m between cells that one can stand on.
@@ -24,20 +26,39 @@ def bridge_gaps(grid: VoxelGrid, standing: VoxelGrid, stick: Kernel, reach: floa
     radius = reach / grid.edge
     if radius < 1 or not len(standing):
         return standing
-    margin = int(np.ceil(radius)) + 1
-    levels = np.unique(standing.cells[:, 2])
-    by_level = {int(z): standing.cells[standing.cells[:, 2] == z, :2] for z in levels}
-    added: list[Array] = [standing.cells]
+    levels = np.split(standing.cells[np.argsort(standing.cells[:, 2], kind="stable")], _steps(standing.cells[:, 2]))
+    by_level = {int(level[0, 2]): level[:, :2] for level in levels}
+    added: list[Array] = []
     for z in by_level:
         near = np.concatenate([by_level[k] for k in (z - 1, z, z + 1) if k in by_level])
-        low = near.min(axis=0) - margin
-        plan = np.zeros(near.max(axis=0) - low + margin + 1, bool)
-        plan[tuple((near - low).T)] = True
-        grown = edt.edtsq((~plan).view(np.uint8), parallel=1) <= radius**2
-        closed = (edt.edtsq(grown.view(np.uint8), parallel=1) > radius**2) & ~plan
-        cells = np.argwhere(closed) + low
-        cells = cells[((cells >= 0) & (cells < grid.shape[:2])).all(axis=1)]
-        added.append(np.column_stack([cells, np.full(len(cells), z)]).astype(np.int32))
-    new = np.concatenate(added[1:])
+        columns = _closing(near, radius)
+        added.append(np.column_stack([columns, np.full(len(columns), z)]).astype(np.int32))
+    new = np.concatenate(added)
+    new = new[((new >= 0) & (new < grid.shape)).all(axis=1)]
     new = new[~any_at(grid, new, stick)]
     return grid.with_cells(np.concatenate([standing.cells, new]))
+
+
+def _steps(values: Array) -> Array:
+    """Where the sorted values change."""
+    return np.flatnonzero(np.diff(np.sort(values))) + 1
+
+
+def _closing(columns: Array, radius: float) -> Array:
+    """(k, 2) columns that closing by a disc of `radius` cells adds to the given ones, tile by tile: most of a building's box is
+    empty on most of its levels."""
+    margin = 2 * int(np.ceil(radius)) + 1
+    tile = columns // TILE
+    added = []
+    for corner in np.unique(tile, axis=0):
+        # closing looks twice as far as its radius
+        low, high = corner * TILE - margin, (corner + 1) * TILE + margin
+        here = columns[((columns >= low) & (columns < high)).all(axis=1)]
+        start = np.maximum(here.min(axis=0) - margin, low)
+        plan = np.zeros(np.minimum(here.max(axis=0) + margin + 1, high) - start, bool)
+        plan[tuple((here - start).T)] = True
+        grown = edt.edtsq((~plan).view(np.uint8), parallel=1) <= radius**2
+        closed = (edt.edtsq(grown.view(np.uint8), parallel=1) > radius**2) & ~plan
+        cells = np.argwhere(closed) + start
+        added.append(cells[(cells // TILE == corner).all(axis=1)])
+    return np.concatenate(added)

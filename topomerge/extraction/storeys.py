@@ -40,6 +40,7 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
     for s, z in enumerate(floors):
         rows = lowest[storey[lowest] == s]
         near = rows[np.abs(navigable.cells[rows, 2] - z) <= 1]
+        near = near if len(near) else rows
         height = navigable.origin[2] + (navigable.cells[near, 2].mean() + 0.5) * navigable.edge
         ceiling = height + (ceiling_height(floor_to_ceiling[near]) or np.nan)
         storeys[s] = (height, ceiling, len(rows) * navigable.edge**2)

@@ -7,9 +7,10 @@ import numpy as np
 from topomerge.io.frame import turn
 from topomerge.types import Array
 
-LARGE, HIGH = 2000.0, 500.0  # m, extents beyond any building
+LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
 SLAB = 0.1  # m
 STOREY = 4.5  # m
+STANDING, WIDE = 2.0, 3.6  # m, usual heights of a room
 ENOUGH = 200  # points below which nothing is judged
 
 
@@ -67,11 +68,14 @@ def _unit_warning(extent: Array, units: tuple[tuple[str, float], ...]) -> list[s
 def _up_warning(points: Array, low: Array, high: Array, up: str) -> list[str]:
     scores = flatness(points, low, high)
     best = int(np.argmax(scores))
+    tall, narrow = high[2] - low[2], float((high - low)[:2].min())
     # A corridor seen without floor and ceiling is flat across its walls too, but it is not taller than a storey; a shaft or
     # a tower is, but flat across both pairs of its walls.
     second = sorted(scores)[1]
     clear = scores[best] >= max(0.12, 1.8 * second) or scores[best] >= max(0.08, 2.5 * second)
-    if best == 2 or not clear or high[2] - low[2] < STOREY:
+    if STOREY <= tall <= 2 * STOREY and not clear and STANDING <= narrow <= WIDE:
+        return [f"{tall:.1f} m tall, but only {narrow:.1f} m wide: if another axis than {up} is up in this file, give --up"]
+    if best == 2 or not clear or tall < STOREY:
         return []
     axis = "xyz"[int(np.abs(turn(up)[best]).argmax())]
     return [

@@ -17,13 +17,15 @@ def step(indptr, indices, values, inflation, threshold, most):  # type: ignore[n
     chaos = 0.0
     total = np.zeros(n)
     touched = np.empty(n, np.int32)
+    met = np.full(n, -1, np.int64)  # the last column in which a row was met
     for j in range(n):
         m = 0
         for a in range(indptr[j], indptr[j + 1]):
             k, w = indices[a], values[a]
             for b in range(indptr[k], indptr[k + 1]):
                 i = indices[b]
-                if total[i] == 0.0:
+                if met[i] != j:
+                    met[i] = j
                     touched[m] = i
                     m += 1
                 total[i] += w * values[b]

@@ -150,7 +150,7 @@ def bricks_in_range(table, view, radius):  # type: ignore[no-untyped-def]  # pra
 
 @njit(cache=True, parallel=True)
 def room_for_words(views, radius, starts, table):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(v,) how many words of 64 rows each view may touch, and how many rows are in the bricks that it reaches."""
+    """(v,) how many words of 64 rows each view may touch."""
     room = np.zeros(len(views), np.int64)
     for v in prange(len(views)):
         total = np.int64(0)

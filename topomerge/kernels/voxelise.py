@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from topomerge.kernels import morton
 
+NEAR = 1 << 10  # cells around the median point that `_split` puts into a table, which is then small enough
 MAX_TABLE = 1 << 26  # bricks of the dense table; larger extents are sorted instead
 
 
@@ -119,7 +120,7 @@ def _split(
     to_lattice(points, shift, edge, cells)
     cells = cells[cells[:, 0] != np.iinfo(np.int64).min]
     middle = np.median(cells[:: max(len(cells) // 100_000, 1)], axis=0).astype(np.int64)
-    near = (np.abs(cells - middle) < (1 << 11)).all(axis=1)
+    near = (np.abs(cells - middle) < NEAR).all(axis=1)
     kept, counts = np.unique(cells[~near], axis=0, return_counts=True)
     if near.any():
         points_near = (cells[near] - middle + 0.5).astype(np.float32)
