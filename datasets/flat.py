@@ -59,7 +59,9 @@ class Flat:
 
 def _flat(frame: Sim3, points: Array) -> Array:
     """(n, 2) points in another frame."""
-    return frame.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
+    c, s = frame.scale * np.cos(frame.yaw), frame.scale * np.sin(frame.yaw)
+    x, y = points.T
+    return np.column_stack([c * x - s * y + frame.translation[0], s * x + c * y + frame.translation[1]])
 
 
 def moved_room(room: TrueRoom, frame: Sim3) -> TrueRoom:

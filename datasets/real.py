@@ -20,7 +20,19 @@ from topomerge.datasets.wall_fit import residual
 from topomerge.errors import InputError
 
 SOURCES = ("halmstad", "utexas", "strands", "carmen", "ifc")
-HEAD = ("pair", "sensors", "points", "yaw °", "scale", "overlap", "rooms in both", "median m", "within 0.2 m", "seen by a")
+HEAD = (
+    "pair",
+    "sensors",
+    "points",
+    "yaw °",
+    "scale",
+    "overlap",
+    "rooms in both",
+    "median m",
+    "within 0.2 m",
+    "seen by a",
+    "fit moves",
+)
 
 
 def iter_real_pairs(folder: str | Path, sources: Sequence[str] | None = None) -> Iterator[tuple[str, Pair | Refusal]]:
@@ -79,7 +91,7 @@ def row(pair: Pair) -> tuple[str, ...]:
     found, truth = residual(pair), pair.truth
     million = " / ".join(f"{len(c) / 1e6:.2f} M" for c in (pair.a, pair.b))
     numbers = f"{np.degrees(truth.yaw):.1f}", f"{truth.scale:.3f}", f"{pair.overlap:.2f}", str(len(pair.shared) or "-")
-    sizes = f"{found.median:.3f}", f"{found.near:.0%}", f"{found.seen:.0%}"
+    sizes = f"{found.median:.3f}", f"{found.near:.0%}", f"{found.seen:.0%}", f"{found.moved:.2f} m, {found.turned:.2f}°"
     return (f"{pair.source}/{pair.name}", " / ".join(pair.sensors), million, *numbers, *sizes)
 
 

@@ -28,11 +28,16 @@ class Residual:
         median: m.
         near: share of them within 0.2 m.
         seen: share of b's walls that lie where a has seen anything.
+        moved: m by which `fit_walls`, started at the transform, moves the middle of those walls: how exact the truth is, where
+            the maps themselves are.
+        turned: degrees, the same.
     """
 
     median: float
     near: float
     seen: float
+    moved: float = float("inf")
+    turned: float = float("inf")
 
 
 def wall_points(points: Array, floor: float) -> Array:
@@ -69,8 +74,11 @@ def residual(pair: Pair) -> Residual:
     seen = known.query(b, distance_upper_bound=SEEN)[0] <= SEEN
     if not seen.any() or not len(a):
         return Residual(float("inf"), 0.0, 0.0)
-    distance = cKDTree(a).query(b[seen])[0]
-    return Residual(float(np.median(distance)), float((distance < 0.2).mean()), float(seen.mean()))
+    b = b[seen]
+    distance, middle = cKDTree(a).query(b)[0], b.mean(axis=0)
+    better = fit_walls(a - middle, b - middle, Sim3())
+    moved, turned = float(np.hypot(*better.translation[:2])), float(abs(np.degrees(better.yaw)))
+    return Residual(float(np.median(distance)), float((distance < 0.2).mean()), float(seen.mean()), moved, turned)
 
 
 def fit_walls(a: Array, b: Array, guess: Sim3, scale: bool = False) -> Sim3:
