@@ -113,7 +113,9 @@ class Progress:
 
     def __call__(self, row: Row) -> None:
         self.done += 1
-        self.refused += bool(row.reason)
+        if row.reason:
+            self.refused += 1
+            self.say(f"refused {row.name}: {row.reason}")
         now = time.monotonic()
         if now - self.last >= self.every or self.done == self.total:
             self.last = now

@@ -24,6 +24,7 @@ from topomerge.io.listing import plain
 
 FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
 LEAST_ROOMS = 5  # of a real plan: fewer have no two parts
+LEAST_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told apart
 LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
 CANDIDATES = 4  # buildings tried for an item: not every one has two parts with the overlap that is wanted
 Library = Mapping[str, Mapping[str, Plan]]  # source -> name -> plan
@@ -132,7 +133,7 @@ def check(recipe: Recipe) -> None:
 
 
 def library(recipe: Recipe) -> Library:
-    """The real plans that the recipe draws from: those of its split that have neither too few rooms nor a vast one.
+    """The real plans that the recipe draws from: those of its split that are not too small and have no vast room.
 
     Raises:
         InputError: no folder of real data, or nothing of a source is in it.
@@ -153,7 +154,7 @@ def library(recipe: Recipe) -> Library:
 
 def _fits(plan: Plan) -> bool:
     areas = [shapely.Polygon(room.polygon).area for room in plan.rooms]
-    return len(areas) >= LEAST_ROOMS and max(areas) <= LARGEST_ROOM
+    return len(areas) >= LEAST_ROOMS and sum(areas) >= LEAST_AREA and max(areas) <= LARGEST_ROOM
 
 
 def digest(plan: Plan) -> str:
