@@ -30,6 +30,7 @@ BLOCK = 64  # scans at a time
 SOLID = 0.25  # share of the rays into a cell that must end there for it to be a wall
 LARGEST = 200 << 20  # bytes of an unpacked log
 FEWEST = 20  # scans of a part
+CELLS = 200_000_000  # of a raster
 
 
 def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
@@ -97,7 +98,12 @@ def read_log(path: Path) -> tuple[Array, Array]:
                 values = np.array(words[2 : beams + 5], float)
             except (ValueError, IndexError) as error:
                 raise InputError(f"{path}: line {number} is no scan ({error}); copy it again") from error
-            if len(values) < beams + 3 or not np.isfinite(values[beams:]).all() or (ranges and beams != len(ranges[0])):
+            if (
+                beams < 2
+                or len(values) < beams + 3
+                or not np.isfinite(values[beams:]).all()
+                or (ranges and beams != len(ranges[0]))
+            ):
                 raise InputError(f"{path}: line {number} has {len(values)} values for {beams} beams; copy it again")
             ranges.append(values[:beams])
             poses.append(values[beams:])
@@ -113,6 +119,9 @@ def draw(poses: Array, ranges: Array, frame: Sim3, source: str = "") -> Flat:
         poses: (n, 3) of the laser, m and rad.
         ranges: (n, k) m, from right to left; 180 or 181 beams are 1° apart, 360 or 361 half a degree.
         frame: log -> map.
+
+    Raises:
+        InputError: poses that are too far apart.
     """
     beams = ranges.shape[1]
     angles = np.radians(np.arange(beams) * (180.0 / (beams - beams % 2)) - 90.0)
@@ -120,6 +129,8 @@ def draw(poses: Array, ranges: Array, frame: Sim3, source: str = "") -> Flat:
     yaw = poses[:, 2] + frame.yaw
     low = np.array([x.min(), y.min()]) - REACH - 1.0
     wide, high = np.ceil((np.array([x.max(), y.max()]) + REACH + 1.0 - low) / CELL).astype(int)
+    if not float(wide) * float(high) < CELLS:
+        raise InputError(f"{source}: its poses span {wide * CELL:.0f} by {high * CELL:.0f} m; is it a log of one building?")
     ended, crossed = (np.zeros(wide * high, np.int32) for _ in range(2))
     for start in range(0, len(poses), BLOCK):
         block = slice(start, start + BLOCK)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +118,7 @@ def _ground(path: Path, building: Building) -> float:
     return float(np.median(found))
 
 
-@cache
+@lru_cache(maxsize=1)  # asked for thrice a pair
 def _model(path: Path) -> PointCloud:
     return read_points(path, spacing=SPACING)
 

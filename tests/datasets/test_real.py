@@ -157,6 +157,7 @@ def test_carmen_parts_share_no_scan_and_failed_ranges_say_nothing():
         (lambda p: p.write_bytes(gzip.compress(b"ODOM 0 0\n")), "no FLASER"),
         (lambda p: write_log(p, *scans(), tail="FLASER 181 1.0 2.0"), "line 63"),
         (lambda p: write_log(p, *scans(), tail="FLASER many"), "line 63"),
+        (lambda p: write_log(p, scans()[0] * [1e7, 1, 1], scans()[1]), "one building"),
     ],
 )
 def test_carmen_damage_is_refused_in_one_line(tmp_path, damage, said):
