@@ -44,13 +44,15 @@ def one(item: Item) -> tuple[float, float]:
 
 
 def all_of(recipe: Recipe, jobs: int) -> float:
-    """Seconds of a whole build, with workers that are running already."""
+    """Seconds of a whole build, with workers that are running already; prints how busy they were, whoever else took the cores."""
     with tempfile.TemporaryDirectory() as folder:
         began = perf_counter()
         report = build(Build(recipe, folder, jobs))
         if report.refused:
             raise RuntimeError(report.refused)
-        return perf_counter() - began
+        seconds = perf_counter() - began
+        print(f"# {jobs} at work: busy {report.seconds / (jobs * seconds):.1%} of the time")
+        return seconds
 
 
 def main(pairs: int = 8) -> None:
