@@ -11,6 +11,7 @@ from topomerge.extraction.similarity import jaccard_similarity
 from topomerge.extraction.visibility import Visibility, visible_cells
 from topomerge.extraction.votes import vote
 from topomerge.kernels import raycast
+from topomerge.kernels import sets as kernel
 from topomerge.types import VoxelGrid
 
 
@@ -109,6 +110,17 @@ def test_jaccard_equals_sets(sets, threshold):
             exact = 1.0 if i == j else len(a & b) / max(len(a | b), 1)
             assert found[i, j] == pytest.approx(exact if exact >= threshold or i == j else 0.0)
     np.testing.assert_allclose(visibility.matrix().sum(axis=1), [len(s) for s in sets])
+
+
+def test_views_of_other_heights_are_not_compared():
+    rows = [[1, 2, 70], [2, 70, 90], [100, 101]]
+    heights = np.arange(128) // 64
+    visibility = sets_of(rows, 128)
+    assert kernel.extents(visibility.indptr, visibility.words, visibility.masks, heights).tolist() == [[0, 1], [0, 1], [1, 1]]
+    plain, quick = (jaccard_similarity(visibility, heights=h).toarray() for h in (None, heights))
+    assert (plain == quick).all()
+    far = np.array([0] * 64 + [5] * 64)
+    assert jaccard_similarity(sets_of([[1, 2], [100]], 128), heights=far).toarray().tolist() == [[1, 0], [0, 1]]
 
 
 def test_only_pairs_within_reach_are_compared():

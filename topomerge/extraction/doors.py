@@ -47,8 +47,9 @@ def find_edges(
     swap = room[a] > room[b]
     a[swap], b[swap] = b[swap], a[swap]
     edges: list[tuple[Any, ...]] = []
-    for pair in np.unique(np.column_stack([room[a], room[b]]), axis=0):
-        here = (room[a] == pair[0]) & (room[b] == pair[1])
+    pair = room[a].astype(np.int64) * (int(room.max(initial=0)) + 1) + room[b]
+    order = np.argsort(pair, kind="stable")
+    for here in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []:
         rows = np.unique(np.concatenate([a[here], b[here]]))
         meeting = navigable.subset(rows)
         contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))

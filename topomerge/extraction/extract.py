@@ -132,7 +132,7 @@ def _extract(
     with clock("visibility", 0.45):
         visibility = visible_cells(grid, views, p.range, p.tolerance, clock.part(0.45, 0.65))
     with clock("similarity", 0.65):
-        similarity = jaccard_similarity(visibility, p.least_similarity, views, 2 * p.range)
+        similarity = jaccard_similarity(visibility, p.least_similarity, views, 2 * p.range, grid.cells[:, 2])
     with clock("clusters", 0.75):
         cluster, inflation = cluster_views(similarity, p.inflations)
     with clock("rooms", 0.85):

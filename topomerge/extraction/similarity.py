@@ -12,7 +12,11 @@ from topomerge.types import Array
 
 
 def jaccard_similarity(
-    visibility: Visibility, threshold: float = 0.0, views: Array | None = None, reach: float | None = None
+    visibility: Visibility,
+    threshold: float = 0.0,
+    views: Array | None = None,
+    reach: float | None = None,
+    heights: Array | None = None,
 ) -> sparse.csr_array:
     """(V, V) symmetric matrix of |A and B| / |A or B| of the seen sets, 1 on the diagonal (seeds 2.6).
 
@@ -20,6 +24,7 @@ def jaccard_similarity(
         threshold: smaller similarities are left out (0).
         views: (V, 3) positions, m; with `reach`, only pairs of views at most that far apart are compared.
         reach: twice the range of the visibility: views farther apart can't see the same cell.
+        heights: (n,) integer height of each cell; views that see other heights, as on two storeys, need no comparison.
     """
     sizes = visibility.sizes()
     if views is not None and reach is not None:
@@ -30,6 +35,9 @@ def jaccard_similarity(
     # no set of different size can be more alike than the ratio of the sizes: most pairs need no intersection
     smaller, larger = np.minimum(sizes[first], sizes[second]), np.maximum(sizes[first], sizes[second])
     possible = (smaller > 0) & (smaller >= threshold * larger)
+    if heights is not None:
+        low, high = sets.extents(visibility.indptr, visibility.words, visibility.masks, heights).T
+        possible &= (low[first] <= high[second]) & (low[second] <= high[first])
     first, second = first[possible], second[possible]
     both = sets.intersections(visibility.indptr, visibility.words, visibility.masks, first, second)
     value = both / (sizes[first] + sizes[second] - both)

@@ -35,7 +35,8 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
         if all(abs(int(z) - f) * navigable.edge >= LEAST_HEIGHT for f in floors):
             floors.append(int(z))
     floors.sort()
-    storey = np.abs(navigable.cells[:, 2][:, None] - np.array(floors)).argmin(axis=1).astype(np.int32)
+    halfway = (np.array(floors[:-1]) + np.array(floors[1:])) / 2
+    storey = np.searchsorted(halfway, navigable.cells[:, 2]).astype(np.int32)
     storeys = np.zeros(len(floors), STOREY_DTYPE)
     for s, z in enumerate(floors):
         rows = lowest[storey[lowest] == s]

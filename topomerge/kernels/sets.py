@@ -35,6 +35,23 @@ def intersections(indptr, words, masks, first, second):  # type: ignore[no-untyp
     return out
 
 
+@njit(cache=True, parallel=True)
+def extents(indptr, words, masks, values):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(s, 2) smallest and largest of the rows' values in each set; (largest, smallest) integers for an empty one."""
+    out = np.empty((len(indptr) - 1, 2), np.int64)
+    for s in prange(len(indptr) - 1):
+        low, high = np.iinfo(np.int64).max, np.iinfo(np.int64).min
+        for k in range(indptr[s], indptr[s + 1]):
+            mask, base = masks[k], np.int64(words[k]) << 6
+            while mask != 0:
+                lowest = mask & (~mask + np.uint64(1))
+                value = np.int64(values[base + np.int64(popcount(lowest - np.uint64(1)))])
+                mask ^= lowest
+                low, high = min(low, value), max(high, value)
+        out[s, 0], out[s, 1] = low, high
+    return out
+
+
 @njit(cache=True)
 def most_votes(indptr, words, masks, order, cluster, winner):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """For each row the cluster with the most sets that hold it, in place; ties go to the smaller cluster number.
