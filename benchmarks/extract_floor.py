@@ -1,7 +1,7 @@
 """The whole of `extract`, default preset: seconds a step on a floor of 1,500 m2 and 6 M points, memory, and growth with floors.
 
-The peer of `extract_floor` is the thesis preset on the same points. `growth_n` compares n floors, one above the other, with n
-times the seconds of one: a ratio of 1 is linear growth, above 1 is better. Run from the root:
+The peer of `extract_floor` is the thesis preset on the same points. `beside_n` compares n floors beside each other with n times
+the seconds of one, `above_n` the same one above the other: a ratio of 1 is linear growth, above 1 is better. Run from the root:
 ``python benchmarks/extract_floor.py [most floors]``. Each measurement is a process of its own, after one that compiles.
 """
 
@@ -18,19 +18,20 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import numpy as np
 from bench import line
-from floors import HEIGHT, storey
+from floors import HEIGHT, WIDTH, storey
 
 SLAB = 0.4  # m
 
 
-def measure(floors: int, preset: str, points: int) -> dict[str, object]:
+def measure(floors: int, preset: str, points: int, place: str) -> dict[str, object]:
     """Extract `floors` storeys in this process: seconds in all and a step, peak memory (MB), rooms, storeys."""
     from topomerge.extraction.extract import extract
     from topomerge.types import PointCloud
 
     extract(storey(60_000), preset=preset)  # loads what was compiled
     cloud = storey(points)
-    chunks = (PointCloud(cloud + np.array([0, 0, i * (HEIGHT + SLAB)], np.float32)) for i in range(floors))
+    step = np.array([0, 0, HEIGHT + SLAB] if place == "above" else [WIDTH + 1, 0, 0], np.float32)
+    chunks = (PointCloud(cloud + i * step) for i in range(floors))
     began = perf_counter()
     result = extract(chunks, preset=preset)
     seconds = perf_counter() - began
@@ -45,8 +46,8 @@ def measure(floors: int, preset: str, points: int) -> dict[str, object]:
     }
 
 
-def in_a_process(floors: int, preset: str = "default", points: int = 6_000_000) -> dict[str, object]:
-    command = [sys.executable, __file__, "--measure", str(floors), preset, str(points)]
+def in_a_process(floors: int, preset: str = "default", points: int = 6_000_000, place: str = "beside") -> dict[str, object]:
+    command = [sys.executable, __file__, "--measure", str(floors), preset, str(points), place]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
 
 
@@ -59,16 +60,17 @@ def main(most: int = 16) -> None:
         print(f"#   {step}: {seconds:.2f} s")
     print(f"# {one['cells']} cells, {one['rooms']} rooms, peak {one['peak_mb']:.0f} MB; thesis: {thesis['rooms']} rooms")
     small = min((in_a_process(1, points=2_000_000) for _ in range(3)), key=lambda m: m["seconds"])
-    floors = 2
-    while floors <= most:
-        many = in_a_process(floors, points=2_000_000)
-        line(f"growth_{floors}", many["seconds"], floors * small["seconds"])
-        print(f"# {many['cells']} cells, {many['rooms']} rooms, {many['storeys']} storeys, peak {many['peak_mb']:.0f} MB")
-        floors *= 2
+    for place in ("beside", "above"):
+        floors = 2
+        while floors <= most:
+            many = in_a_process(floors, points=2_000_000, place=place)
+            line(f"{place}_{floors}", many["seconds"], floors * small["seconds"])
+            print(f"# {many['cells']} cells, {many['rooms']} rooms, {many['storeys']} storeys, peak {many['peak_mb']:.0f} MB")
+            floors *= 2
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--measure"]:
-        print(json.dumps(measure(int(sys.argv[2]), sys.argv[3], int(sys.argv[4]))))
+        print(json.dumps(measure(int(sys.argv[2]), sys.argv[3], int(sys.argv[4]), sys.argv[5])))
     else:
         main(*(int(a) for a in sys.argv[1:2]))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +13,7 @@ from scipy import sparse
 from topomerge.kernels import raycast
 from topomerge.types import Array, VoxelGrid
 
-TILE = 12.0  # m: views of one tile share a distance field; small enough for the processor's cache, large enough to pay
+TILE = 10.0  # m: views of one tile share a distance field, tiles are shared among the cores
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +79,14 @@ def visible_cells(
     of_view = of_view.ravel()
     parts: list[tuple[Array, Array, Array, Array]] = []
     done = 0
-    for t in range(len(tiles)):
-        group = np.flatnonzero(of_view == t)
-        parts.append((group, *_cast_tile(grid.cells, table, starts, at[group], reach, slack)))
-        done += len(group)
-        if progress is not None:
-            progress(done / len(at), "looking around")
+    groups = [np.flatnonzero(of_view == t) for t in range(len(tiles))]
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # the compiled loops let go of the interpreter
+        cast = pool.map(lambda group: _cast_tile(grid.cells, table, starts, at[group], reach, slack), groups)
+        for group, part in zip(groups, cast, strict=True):
+            parts.append((group, *part))
+            done += len(group)
+            if progress is not None:
+                progress(done / len(at), "visibility")
     return _joined(parts, len(at), len(grid))
 
 

@@ -8,12 +8,12 @@ are jumped.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 FAR = 255  # the distance field is a byte
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def distance_field(bricks, starts, cells, low, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(size) uint8 Chebyshev distance, in cells, to the nearest occupied cell of the window at `low`; at most 255.
 
@@ -96,14 +96,14 @@ def reaches(field, ox, oy, oz, tx, ty, tz, tolerance):  # type: ignore[no-untype
             return False
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def cast(field, low, views, radius, tolerance, cells, starts, table, indptr, words, masks):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Seen rows of each view as words of 64 rows: word numbers and bit masks, from indptr[v] on; returns their count a view.
 
     `views` are in cells of the whole grid, `field` covers a window at `low`; indptr must leave room for every word in range.
     """
     counts = np.zeros(len(views), np.int64)
-    for v in prange(len(views)):
+    for v in range(len(views)):
         found = bricks_in_range(table, views[v], radius)
         ox, oy, oz = views[v, 0] - low[0], views[v, 1] - low[1], views[v, 2] - low[2]
         at = indptr[v]
@@ -127,7 +127,7 @@ def cast(field, low, views, radius, tolerance, cells, starts, table, indptr, wor
     return counts
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def bricks_in_range(table, view, radius):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Ascending numbers of the bricks that reach within `radius` cells of a view."""
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -148,11 +148,11 @@ def bricks_in_range(table, view, radius):  # type: ignore[no-untyped-def]  # pra
     return np.sort(found[:n])
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def room_for_words(views, radius, starts, table):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(v,) how many words of 64 rows each view may touch."""
     room = np.zeros(len(views), np.int64)
-    for v in prange(len(views)):
+    for v in range(len(views)):
         total = np.int64(0)
         for b in bricks_in_range(table, views[v], radius):
             total += ((starts[b + 1] - 1) >> 6) - (starts[b] >> 6) + 1
