@@ -29,7 +29,7 @@ test-slow: setup
 # models/ and datasets/ are installed as topomerge.models and topomerge.datasets: types are checked as installed, outside the checkout.
 lint: setup
 	$(BIN)/ruff check .
-	rm -rf build/lint && $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/lint .
+	rm -rf build/lint build/lib && $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/lint .
 	cd build/lint && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p topomerge
 
 bench: setup

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import shapely
@@ -70,8 +71,8 @@ def connected(building: Building) -> bool:
 def make_plans(profile: Profile, storeys: int, difficulty: Difficulty, rng: np.random.Generator) -> list[Plan]:
     """Plans of all storeys, lowest first."""
     curved = bool(rng.random() < difficulty.curved)
-    depths = np.round(rng.uniform(*profile.depth, 2), 2)
-    size = Size(float(rng.uniform(*profile.length)), *map(float, depths), round(float(rng.uniform(*profile.corridor)), 2), curved)
+    near, far = np.round(rng.uniform(*profile.depth, 2), 2).tolist()
+    size = Size(float(rng.uniform(*profile.length)), near, far, round(float(rng.uniform(*profile.corridor)), 2), curved)
     layout = make_layout(str(rng.choice(profile.shapes)), size, rng)
     height = round(float(rng.uniform(*profile.height)), 2)
     wall, merge = round(float(rng.uniform(0.1, 0.22)), 2), bool(rng.random() < 0.5)
@@ -233,7 +234,9 @@ def _fill(
     rng: np.random.Generator,
 ) -> list[tuple[int, int]]:
     """Cut a stretch of a row into rooms, each with a door to the corridor."""
-    kinds, drawn, length = [], [], gap[1] - gap[0]
+    kinds: list[str] = []
+    drawn: list[Any] = []
+    length = gap[1] - gap[0]
     while sum(drawn) < length:
         kind, width = deck.draw(length)
         if drawn and sum(drawn) + width / 2 > length:  # better stretch the others than squeeze this one in

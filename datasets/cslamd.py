@@ -58,9 +58,9 @@ def _refuse(error: InputError) -> Pair:
 
 
 def _pair(building: Path, a: str, b: str) -> Pair:
-    maps = [read_points(_mesh(building, name), up=UP, spacing=SPACING) for name in (a, b)]
+    one, other = (read_points(_mesh(building, name), up=UP, spacing=SPACING) for name in (a, b))
     name = f"{building.name}/{a}-{b}"
-    return framed_pair(*maps, Sim3(), name, "cslamd", building.name, "phone", zlib.crc32(name.encode()))
+    return framed_pair(one, other, Sim3(), name, "cslamd", building.name, "phone", zlib.crc32(name.encode()))
 
 
 def _mesh(building: Path, name: str) -> Path:

@@ -99,7 +99,8 @@ def furnish(floor: Floor, kind: str, density: float, clutter: float, doors: Arra
     """
     if kind in EMPTY:
         return []
-    area, out, rng = floor.shape.area, [], floor.rng
+    area, rng = floor.shape.area, floor.rng
+    out: list[Item | None] = []
     for name, where, least, every in ROOMS.get(kind, ROOMS["office"]):
         count = (least + (area / every if every else 0.0)) * density
         number = int(count) + int(rng.random() < count % 1)
@@ -119,8 +120,8 @@ def passable(shape: shapely.Polygon, items: list[Item], doors: Array) -> bool:
     """Can a person get from every door to every other one, and some way into the room?"""
     if not len(doors):
         return True
-    corners = np.concatenate([footprints(i.at[None], np.array([i.yaw]), i.size) for i in items if i.kind != "board"] or [[]])
-    blocked = shapely.union_all(shapely.polygons(corners) if len(corners) else []).buffer(BODY, 2)
+    standing = [footprints(i.at[None], np.array([i.yaw]), i.size) for i in items if i.kind != "board"]
+    blocked = shapely.union_all(shapely.polygons(np.concatenate(standing)) if standing else []).buffer(BODY, 2)
     parts = shapely.get_parts(shape.buffer(0.1, 2).buffer(-0.1 - BODY * 0.9, 2).difference(blocked))
     near = shapely.distance(parts[:, None], shapely.points(doors)[None]) < 0.45
     return bool((near.all(axis=1) & (shapely.area(parts) > 0.15 * shape.area * (shape.area > 8))).any())

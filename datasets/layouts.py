@@ -56,7 +56,7 @@ class Row:
     behind: int = -1
     cores: tuple[Core, ...] = ()
 
-    def place(self, points: Array) -> Array:
+    def place(self, points: Array | list[list[float]]) -> Array:
         """From metres along and left of the row to metres of the building."""
         return np.asarray(points, float) @ rotation(self.heading) + np.asarray(self.start)
 

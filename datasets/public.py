@@ -100,10 +100,9 @@ def cut_pair(cloud: PointCloud, name: str, source: str, sensor: str, seed: int) 
     frames = draw_frames(2, False, rng)
     maps = [moved(_only(cloud, part), frame) for part, frame in zip((a, b), frames, strict=True)]
     truth = frames[0] @ frames[1].inverse()
-    shared, visited = seen_by_both(*maps), (tuple(a), tuple(b))
-    return Pair(
-        name, *maps, truth, shared, share(a, b), (sensor, sensor), source, name, visited=visited, frames=(frames[0], frames[1])
-    )
+    one, other = maps
+    shared, visited, both = seen_by_both(one, other), (tuple(a), tuple(b)), (frames[0], frames[1])
+    return Pair(name, one, other, truth, shared, share(a, b), (sensor, sensor), source, name, visited=visited, frames=both)
 
 
 def _only(cloud: PointCloud, rooms: Sequence[int]) -> PointCloud:

@@ -203,12 +203,12 @@ def _cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np
         packed = np.empty((len(these), len(rays), 6), np.float32)
         packed[..., :3] = these[:, None, :3, 3]
         packed[..., 3:] = np.matmul(spun, these[:, :3, :3].astype(np.float32).transpose(0, 2, 1))
-        packed = packed.reshape(-1, 6)
-        ranges, triangle, cosine = _shoot(scene, packed)
+        flat = packed.reshape(-1, 6)
+        ranges, triangle, cosine = _shoot(scene, flat)
         through = (triangle >= 0) & glass[triangle] & (rng.random(len(triangle)) >= sensor.glass)
         if through.any():
             clear = clear or _scene(building.vertices, building.triangles[near[~glass]])
-            beyond = _shoot(clear, packed[through])
+            beyond = _shoot(clear, flat[through])
             ranges[through], cosine[through] = beyond[0], beyond[2]
             triangle[through] = np.where(beyond[1] >= 0, np.flatnonzero(~glass)[beyond[1]], -1)
         image = ranges.reshape(-1, rows, columns)

@@ -92,7 +92,8 @@ def read_scene(folder: Path) -> Scene:
     points = (cloud.points[:count].astype(np.float64) + cloud.shift) @ values[0][:3, :3].T + values[0][:3, 3]
     if not len(points):
         raise InputError(f"{mesh}: holds no vertices; copy it again")
-    groups, objects, object_of = folder / f"{name}.aggregation.json", (), np.empty(0, np.int32)
+    groups, object_of = folder / f"{name}.aggregation.json", np.empty(0, np.int32)
+    objects: tuple[str, ...] = ()
     if groups.is_file():
         objects, object_of = read_objects(folder / f"{name}_vh_clean_2.0.010000.segs.json", groups, count)
     floor, ceiling = np.percentile(points[:, 2], [1, 99]).tolist()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import shapely
@@ -43,7 +44,7 @@ def session(building: Building, difficulty: Difficulty | None = None, rng: np.ra
             near = fate >= difficulty.gone + difficulty.moved
             _move(building, things, outlines, gone, i, near, rng)
     _swing(things, doors, difficulty, rng)
-    for i in np.flatnonzero(things["movable"] & ~gone):
+    for i in np.flatnonzero(things["movable"] & ~gone).tolist():
         _carry(vertices, order[starts[i] : starts[i + 1]], building.things[i], things[i])
     kept = (building.thing_of < 0) | ~gone[building.thing_of]
     mesh = [vertices, building.triangles[kept], building.labels[kept], building.thing_of[kept]]
@@ -61,7 +62,7 @@ def session(building: Building, difficulty: Difficulty | None = None, rng: np.ra
 
 
 def _outline(thing: Array) -> shapely.Polygon:
-    return shapely.Polygon(footprints(thing["centre"][None, :2], thing["yaw"][None], thing["size"])[0])
+    return shapely.Polygon(footprints(thing["centre"][None, :2], thing["yaw"][None], thing["size"].tolist())[0])
 
 
 def _move(building: Building, things: Array, outlines: Array, gone: Array, i: int, near: bool, rng: np.random.Generator) -> None:
@@ -105,7 +106,7 @@ def _people(
     """Put persons on free spots of the rooms; returns the things with them."""
     tree = shapely.STRtree(outlines.tolist())
     stairs = [shapely.Polygon(s["footprint"]) for s in building.stairs]
-    rows = []
+    rows: list[Any] = []
     for index, room in enumerate(building.rooms):
         shape = shapely.Polygon(room.polygon)
         low, high = np.array(shape.bounds).reshape(2, 2)

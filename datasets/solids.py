@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import shapely
@@ -30,7 +31,7 @@ class Soup:
     things: list[Array] = field(default_factory=list)
     count: int = 0
 
-    def add(self, vertices: Array, triangles: Array, label: str | Array, thing: int = -1) -> None:
+    def add(self, vertices: Array, triangles: Array, label: str | int | Array, thing: int = -1) -> None:
         """Add (v, 3) vertices and (t, 3) triangles that count from 0."""
         if not len(triangles):
             return
@@ -139,7 +140,8 @@ def boundary(prisms: Sequence[Prism]) -> Faces:
     for low, high in pairwise(levels):
         layers.append(shapely.union_all(shapes[(spans[:, 0] <= low) & (spans[:, 1] >= high)], grid_size=GRID))
     layers.append(shapely.Polygon())
-    ups, downs = [], []
+    ups: list[Any] = []
+    downs: list[Any] = []
     for z, (below, above) in zip(levels, pairwise(layers), strict=True):
         for out, free, solid, turn in ((ups, above, below, 1), (downs, below, above, -1)):
             corners = flat(shapely.difference(free, solid, grid_size=GRID))[0][:, ::turn]

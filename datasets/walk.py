@@ -131,8 +131,8 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
     at = np.arange(first[-1] + 1)
     points = np.stack([np.interp(at, first, places[way][:, k]) for k in range(3)], axis=1)
     nearest = np.clip(np.searchsorted(first, at), 0, len(way) - 1)
-    halts = first[halts].astype(np.int64)
-    return Walk(_smooth(points), room[nearest].astype(np.int32), halts, price[nearest] < BLOCKED)
+    stand = first[halts].astype(np.int64)
+    return Walk(_smooth(points), room[nearest].astype(np.int32), stand, price[nearest] < BLOCKED)
 
 
 def _costs(building: Building, floors: Floors, wanted: list[int]) -> tuple[Array, Array]:
