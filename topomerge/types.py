@@ -39,7 +39,18 @@ EDGE_DTYPE = np.dtype(
         ("width", "f8"),  # m
         ("height", "f8"),  # m of clear height; 0 where nothing was seen above
         ("direction", "f8"),  # rad, of the wall's normal in the horizontal plane, in [0, pi)
-        ("kind", "U8"),  # door | opening | stairs
+        ("kind", "U8"),  # door | opening | stairs | ramp
+        ("open", "?"),  # one could walk through; a shut door joins two rooms, too
+        ("confidence", "f8"),  # that it is one: 0..1
+        ("lower", "f8", 3),  # of stairs and ramps: where they begin and end, in the input's frame; of doors both the centre
+        ("upper", "f8", 3),
+    ]
+)
+AREA_DTYPE = np.dtype(
+    [
+        ("room", "i4"),
+        ("centroid", "f8", 3),  # of its navigable cells, in the input's frame
+        ("area", "f8"),  # m2 of navigable floor, seen from above
     ]
 )
 STOREY_DTYPE = np.dtype([("floor", "f8"), ("ceiling", "f8"), ("area", "f8")])  # m, m (nan: not seen), m2
@@ -223,6 +234,9 @@ class TopometricMap:
         rooms: (R,) ROOM_DTYPE.
         edges: (E,) EDGE_DTYPE; two rooms that meet in two doors have two edges.
         storeys: (S,) STOREY_DTYPE, lowest first.
+        areas: (A,) AREA_DTYPE, the parts of rooms that a narrowing or a wide opening suggests; a room without such has one.
+        navigable_area: (m,) int32, area of each navigable cell, -1 none.
+        narrows: (N,) EDGE_DTYPE whose `rooms` are two areas of one room.
         free: cells known to be empty (rays crossed them), or None.
         provenance: (n,) uint32 bit set of the maps that saw each cell, or None for a map of one source.
         source: the file it was made from.
@@ -238,6 +252,9 @@ class TopometricMap:
     rooms: Array
     edges: Array
     storeys: Array
+    areas: Array = field(default_factory=lambda: np.zeros(0, AREA_DTYPE))
+    navigable_area: Array | None = None
+    narrows: Array = field(default_factory=lambda: np.zeros(0, EDGE_DTYPE))
     free: VoxelGrid | None = None
     provenance: Array | None = None
     source: str = ""
@@ -251,6 +268,15 @@ class TopometricMap:
         _check(self.rooms.dtype == ROOM_DTYPE, "rooms must have ROOM_DTYPE")
         _check(self.edges.dtype == EDGE_DTYPE, "edges must have EDGE_DTYPE")
         _check(self.storeys.dtype == STOREY_DTYPE, "storeys must have STOREY_DTYPE")
+        _check(self.areas.dtype == AREA_DTYPE and self.narrows.dtype == EDGE_DTYPE, "areas must have AREA_DTYPE, narrows EDGE_DTYPE")
+        if self.navigable_area is None:
+            object.__setattr__(self, "navigable_area", np.full(len(self.navigable), -1, np.int32))
+        assert self.navigable_area is not None
+        _check(self.navigable_area.shape == (len(self.navigable),), "navigable_area must have one label a cell")
+        _check(int(self.navigable_area.max(initial=-1)) < len(self.areas), "a cell's area does not exist")
+        _check(int(self.narrows["rooms"].max(initial=-1)) < len(self.areas), "a narrowing's area does not exist")
+        owner = self.areas["room"]
+        _check(not len(owner) or (owner.min() >= 0 and owner.max() < len(self.rooms)), "an area's room does not exist")
         for labels in (self.room, self.navigable_room):
             if len(labels):
                 _check(labels.min() >= -1 and labels.max() < len(self.rooms), "a cell's room does not exist")

@@ -90,7 +90,8 @@ def _edge(
     else:
         kind = "door" if width <= DOOR_WIDTH else "opening"
     across = float(np.arctan2(along[0], -along[1]) % np.pi)  # the wall's normal
-    return (tuple(int(p) for p in pair), tuple(centre.tolist()), width, height, across, kind)
+    place = tuple(centre.tolist())
+    return (tuple(int(p) for p in pair), place, width, height, across, kind, True, 1.0, place, place)
 
 
 def _under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:

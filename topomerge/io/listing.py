@@ -7,7 +7,9 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
      "rooms": [{"id", "storey", "centroid": [x, y, z], "area", "height", "volume",
                 "bounding_box": {"min": [x, y, z], "max": [x, y, z]}, "cells",
                 "completeness", "glimpsed"}, …],
-     "edges": [{"rooms": [id, id], "door": {"centre": [x, y, z], "width", "height", "direction"}, "kind"}, …],
+     "edges": [{"rooms": [id, id], "door": {"centre": [x, y, z], "width", "height", "direction"}, "kind",
+                "open", "confidence", "lower": [x, y, z], "upper": [x, y, z]}, …],
+     "areas": [{"id", "room", "centroid": [x, y, z], "area"}, …], "narrows": [like edges, "areas" for "rooms"],
      "storeys": [{"id", "floor", "ceiling", "area"}, …],
      "seconds": {step: s}, "parameters": {…}, "warnings": […]}
 
@@ -66,15 +68,16 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
         }
         for i, room in enumerate(map.rooms)
     ]
-    doors = ("centre", "width", "height", "direction")
-    edges = [{"rooms": e["rooms"], "door": {name: e[name] for name in doors}, "kind": e["kind"]} for e in map.edges]
+    areas = [{"id": i, **{name: a[name] for name in a.dtype.names}} for i, a in enumerate(map.areas)]
     storeys = [{"id": i, **{name: s[name] for name in s.dtype.names}} for i, s in enumerate(map.storeys)]
     listing = {
         "format": FORMAT,
         "source": map.source,
         "voxel_size": float(map.grid.edge),
         "rooms": rooms,
-        "edges": edges,
+        "edges": [_edge(e, "rooms") for e in map.edges],
+        "areas": areas,
+        "narrows": [_edge(e, "areas") for e in map.narrows],
         "storeys": storeys,
         "seconds": map.seconds,
         "parameters": map.parameters,
@@ -82,6 +85,11 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
     }
     strict: dict[str, Any] = _strict(plain(listing))
     return strict
+
+
+def _edge(edge: Any, ends: str) -> dict[str, Any]:
+    door = {name: edge[name] for name in ("centre", "width", "height", "direction")}
+    return {ends: edge["rooms"], "door": door, **{name: edge[name] for name in ("kind", "open", "confidence", "lower", "upper")}}
 
 
 def json_text(listing: Mapping[str, Any]) -> str:

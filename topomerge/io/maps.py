@@ -1,6 +1,6 @@
 """Topometric maps in files: `.tmap` in and out (and, from here too, JSON and PLY out).
 
-A `.tmap` is one compressed NumPy archive without pickled objects. Format 1 holds:
+A `.tmap` is one compressed NumPy archive without pickled objects. Format 2 holds:
 
 | array | content |
 |---|---|
@@ -11,7 +11,8 @@ A `.tmap` is one compressed NumPy archive without pickled objects. Format 1 hold
 | grid_shape, … | cells along x, y, z |
 | grid_property.NAME, … | one row a cell |
 | room, navigable_room | int32 room of each cell, -1 none |
-| rooms, edges, storeys | tables, see `topomerge.types` |
+| navigable_area | int32 area of each navigable cell, -1 none |
+| rooms, edges, storeys, areas, narrows | tables, see `topomerge.types` |
 | provenance | uint32 bit set of the maps that saw each cell |
 
 `free_…` and `provenance` are absent where the map has none.
@@ -30,11 +31,11 @@ from topomerge.io import archive
 from topomerge.io.listing import map_to_json, plain, save_json
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.kernels import morton
-from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
+from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
 
 __all__ = ["FORMAT", "load_map", "map_to_json", "save_json", "save_map", "save_rooms_ply"]
 
-FORMAT = 1
+FORMAT = 2
 KIND = "map of topomerge (.tmap)"
 
 
@@ -49,7 +50,8 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
     """
     arrays = _pack("grid", map.grid) | {"room": map.room.astype("<i4")}
     arrays |= _pack("navigable", map.navigable) | {"navigable_room": map.navigable_room.astype("<i4")}
-    arrays |= {"rooms": map.rooms, "edges": map.edges, "storeys": map.storeys}
+    arrays |= {"rooms": map.rooms, "edges": map.edges, "storeys": map.storeys, "areas": map.areas, "narrows": map.narrows}
+    arrays["navigable_area"] = np.asarray(map.navigable_area, "<i4")
     if map.free is not None:
         arrays |= _pack("free", map.free)
     if map.provenance is not None:
@@ -76,7 +78,9 @@ def load_map(path: str | Path) -> TopometricMap:
         raise InputError(f"{path}: is not a {KIND}: make one with `topomerge extract SCAN -o A.tmap`")
     number = arrays["format"]
     if number.shape != () or number.dtype.kind not in "iu" or int(number) != FORMAT:
-        raise InputError(f"{path}: is of format {number}, and this topomerge reads format {FORMAT}; update topomerge")
+        older = number.shape == () and number.dtype.kind in "iu" and int(number) < FORMAT
+        advice = "make it again with `topomerge extract`" if older else "update topomerge"
+        raise InputError(f"{path}: is of format {number}, and this topomerge reads format {FORMAT}; {advice}")
     try:
         return _map(arrays)
     except KeyError as error:
@@ -137,7 +141,9 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
         raise KeyError(min(missing))
     provenance = _typed(arrays, "provenance", "u", 1).astype(np.uint32) if "provenance" in arrays else None
     edges = _table(arrays, "edges", EDGE_DTYPE)
-    edges["kind"].tolist()  # fails here, not later, where the text is none
+    narrows = _table(arrays, "narrows", EDGE_DTYPE)
+    for table in (edges, narrows):
+        table["kind"].tolist()  # fails here, not later, where the text is none
     return TopometricMap(
         grid=_unpack(arrays, "grid"),
         room=_typed(arrays, "room", "i", 1).astype(np.int32),
@@ -146,6 +152,9 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
         rooms=_table(arrays, "rooms", ROOM_DTYPE),
         edges=edges,
         storeys=_table(arrays, "storeys", STOREY_DTYPE),
+        areas=_table(arrays, "areas", AREA_DTYPE),
+        navigable_area=_typed(arrays, "navigable_area", "i", 1).astype(np.int32),
+        narrows=narrows,
         free=_unpack(arrays, "free") if "free_cells" in arrays else None,
         provenance=provenance,
         source=str(about["source"]),
