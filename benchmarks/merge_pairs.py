@@ -1,0 +1,196 @@
+"""Pairs of voxel grids with known transforms for benchmarks of registration, made once and cached (resumable).
+
+``python benchmarks/merge_pairs.py train 400`` simulates pairs of training buildings into ``cache/merge/train``; ``test`` those of
+the test split. Every sixth pair has much moved furniture, every eighth glass walls, and a quarter must not merge.
+Needs TOPOMERGE_DATA for the buildings from real plans; without it all are procedural.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from topomerge.datasets.example import _first_pair, one_thread, time_limit
+from topomerge.datasets.pairs import Pair
+from topomerge.datasets.recipe import Item, Library, Recipe, draw_items, library, plans_of
+
+from topomerge.errors import InputError
+from topomerge.extraction.voxels import voxelise
+from topomerge.io import archive
+from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
+
+EDGE = 0.1  # m
+COMMON = 0.2  # m, columns by which the area in common is measured
+STEP = 0.08  # m along a ray
+LONGEST = 120.0  # s a pair
+WEIGHTS = {
+    "sources": {"procedural": 0.65, "r2v": 0.1, "campus": 0.25},
+    "kinds": {"office": 3, "openplan": 1, "apartment": 2, "hotel": 2, "hospital": 2, "school": 2, "lab": 1, "house": 1},
+    "sensors": {"tls": 3, "lidar": 2, "depth": 3, "tablet": 1, "laser2d": 1},
+    "hard": {"other-building": 0.13, "other-storey": 0.07, "twin-wing": 0.05},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class GridPair:
+    """Two voxel grids (property ``mean``: middle of the points of each cell), free cells where rays tell, and the truth.
+
+    `common` is the area, m2, that both maps saw; 0 where they are of two places. `about` tells sensors, kind, building.
+    """
+
+    name: str
+    a: VoxelGrid
+    b: VoxelGrid
+    free: tuple[VoxelGrid | None, VoxelGrid | None]
+    truth: Sim3 | None
+    common: float
+    about: dict[str, object]
+
+
+def recipe(split: str, pairs: int, seed: int = 0) -> Recipe:
+    """What the pairs are drawn from."""
+    folder = os.environ.get("TOPOMERGE_DATA", "")
+    sources = WEIGHTS["sources"] if folder else {"procedural": 1.0}
+    return Recipe(
+        name=f"merge_{split}", split=split, pairs=pairs, seed=seed, folder=folder, sources=dict(sources),
+        kinds=dict(WEIGHTS["kinds"]), sensors=dict(WEIGHTS["sensors"]), hard=dict(WEIGHTS["hard"]),
+        overlaps=[0.0, 0.1, 0.25, 0.4, 0.6], rooms=[4, 15], two_storeys=0.15,
+    )  # fmt: skip
+
+
+def items(split: str, pairs: int, seed: int = 0) -> tuple[list[Item], Library]:
+    """The items, some made harder."""
+    whole = recipe(split, pairs, seed)
+    plans = library(whole)
+    return [_harder(i, item) for i, item in enumerate(draw_items(whole, plans))], plans
+
+
+def _harder(i: int, item: Item) -> Item:
+    told = dict(item.difficulty)
+    if i % 6 == 5:
+        told |= {"moved": 0.6, "gone": 0.25}
+    if i % 8 == 7:
+        told |= {"glass": 0.5}
+    return replace(item, difficulty=tuple(sorted(told.items())))
+
+
+def grid_of(cloud: PointCloud) -> VoxelGrid:
+    """Occupied cells with the middle of their points."""
+    grid = voxelise(cloud, EDGE)
+    points = cloud.points.astype(np.float64) + cloud.shift
+    rows = grid.rows(grid.locate(points))
+    kept = rows >= 0
+    rows, points = rows[kept], points[kept]
+    many = np.maximum(np.bincount(rows, minlength=len(grid)), 1)
+    mean = np.column_stack([np.bincount(rows, points[:, k], len(grid)) / many for k in range(3)])
+    return VoxelGrid(grid.cells, grid.origin, grid.edge, grid.shape, {"mean": mean.astype(np.float32)})
+
+
+def free_of(cloud: PointCloud, grid: VoxelGrid) -> VoxelGrid | None:
+    """Cells that the rays of a cloud with poses crossed and that are not occupied."""
+    if cloud.poses is None or cloud.pose_of is None:
+        return None
+    pick = np.flatnonzero(cloud.pose_of >= 0)
+    ends = cloud.points[pick].astype(np.float64) + cloud.shift
+    starts = cloud.poses[cloud.pose_of[pick], :3, 3]
+    length = np.linalg.norm(ends - starts, axis=1)
+    seen = []
+    for d in np.arange(0.0, length.max(), STEP):
+        on = length > d + 2 * grid.edge
+        cells = grid.locate(starts[on] + (ends[on] - starts[on]) * (d / length[on])[:, None])
+        inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
+        seen.append(np.unique(cells[inside], axis=0))
+    cells = np.unique(np.concatenate(seen), axis=0)
+    return grid.with_cells(cells[~grid.contains(cells)])
+
+
+def columns_seen(grid: VoxelGrid, free: VoxelGrid | None, into: Sim3, floors: Array) -> Array:
+    """Unique (storey, ix, iy) of the columns of which a map knows anything, in another frame."""
+    points = [grid.centroids()] + ([free.centroids()] if free is not None else [])
+    at = into.apply(np.concatenate(points))
+    storey = np.searchsorted(floors - 0.4, at[:, 2]) - 1
+    rows = np.column_stack([storey, np.floor(at[:, :2] / COMMON)]).astype(np.int64)
+    return np.unique(rows[:, 0] * 2**40 + (rows[:, 1] + 2**18) * 2**20 + rows[:, 2] + 2**18)
+
+
+def common_area(pair: Pair, a: VoxelGrid, b: VoxelGrid, free: tuple[VoxelGrid | None, VoxelGrid | None]) -> float:
+    """Area, m2, of which both maps saw something, on the same storey."""
+    if pair.truth is None or pair.kind != "overlap":
+        return 0.0
+    floors = np.unique(np.round([r.floor for r in pair.a.rooms] or [-1e3], 1))
+    both = np.intersect1d(columns_seen(a, free[0], Sim3(), floors), columns_seen(b, free[1], pair.truth, floors))
+    return float(len(both) * COMMON**2)
+
+
+def arrays_of(pair: Pair, told: dict[str, object]) -> dict[str, Array]:
+    """What is cached of a pair."""
+    grids = [grid_of(c) for c in (pair.a, pair.b)]
+    free = tuple(free_of(c, g) if s == "laser2d" else None for c, g, s in zip((pair.a, pair.b), grids, pair.sensors, strict=True))
+    common = common_area(pair, grids[0], grids[1], (free[0], free[1]))
+    out: dict[str, Array] = {}
+    for side, grid, empty in zip("ab", grids, free, strict=True):
+        out[f"{side}.cells"], out[f"{side}.origin"] = grid.cells.astype(np.int16), grid.origin
+        offset = (grid.properties["mean"] - grid.cell_bounds(grid.cells)[0]) / grid.edge
+        out[f"{side}.mean"] = np.clip(offset * 256, 0, 255).astype(np.uint8)
+        out[f"{side}.shape"] = np.array(grid.shape)
+        if empty is not None:
+            out[f"{side}.free"] = empty.cells.astype(np.int16)
+    out["truth"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
+    told = {**told, "sensors": pair.sensors, "kind": pair.kind, "building": pair.building, "overlap": pair.overlap, "common": common}
+    out["about"] = np.frombuffer(json.dumps(told, sort_keys=True, default=str).encode(), np.uint8)
+    return out
+
+
+def sim3_of(matrix: Array) -> Sim3:
+    """The similarity of a (4, 4) matrix."""
+    scale = float(matrix[2, 2])
+    x, y, z = matrix[:3, 3].tolist()
+    return Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), (x, y, z), scale)
+
+
+def load(path: str | Path) -> GridPair:
+    """A cached pair."""
+    data = archive.read(path, "cached pair")
+    told = json.loads(data["about"].tobytes())
+    grids, free = [], []
+    for side in "ab":
+        shape = tuple(int(s) for s in data[f"{side}.shape"])
+        cells, origin = data[f"{side}.cells"].astype(np.int32), data[f"{side}.origin"]
+        mean = origin + (cells + (data[f"{side}.mean"] + 0.5) / 256) * EDGE
+        grids.append(VoxelGrid(cells, origin, EDGE, shape, {"mean": mean.astype(np.float32)}))  # type: ignore[arg-type]
+        empty = data.get(f"{side}.free")
+        free.append(None if empty is None else VoxelGrid(empty.astype(np.int32), origin, EDGE, shape))  # type: ignore[arg-type]
+    truth = None if np.isnan(data["truth"]).any() else sim3_of(data["truth"])
+    return GridPair(Path(path).stem, grids[0], grids[1], (free[0], free[1]), truth, float(told["common"]), told)
+
+
+def make(split: str, pairs: int, seed: int = 0, cache: str = "cache/merge") -> Iterator[Path]:
+    """Make what is missing, one after the other; refused items leave an empty mark so that they are not tried again."""
+    todo, plans = items(split, pairs, seed)
+    folder = Path(cache) / split
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, item in enumerate(todo):
+        path, refused = folder / f"{seed}_{i:05d}.npz", folder / f"{seed}_{i:05d}.refused"
+        if not path.exists() and not refused.exists():
+            began = time.perf_counter()
+            try:
+                with one_thread(), time_limit(LONGEST):
+                    told = {"difficulty": dict(item.difficulty), "source": item.source, "item": i}
+                    archive.write(arrays_of(_first_pair(item, plans_of(item, plans)), told), path)
+                print(f"{path.name} {time.perf_counter() - began:.1f} s", flush=True)
+            except InputError as error:
+                refused.write_text(str(error))
+        if path.exists():
+            yield path
+
+
+if __name__ == "__main__":
+    which, number = sys.argv[1], int(sys.argv[2])
+    for _ in make(which, number, int(sys.argv[3]) if len(sys.argv) > 3 else 0):
+        pass
