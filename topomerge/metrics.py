@@ -1,0 +1,227 @@
+"""How well the rooms, doors and storeys of a map agree with the truth, or with another map.
+
+Everything here works on label arrays: one integer per place (cell or column of the floor), 0 and above for a room, -1 for
+none. `datasets.judge` makes such arrays from maps and from what is true about a scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from topomerge.types import Array
+
+HALF = 0.5  # IoU from which a room counts as found
+SAME = 0.1  # IoU from which two rooms correspond, for the edges of the graph
+PLAN, HEIGHT = 0.5, 1.0  # m between a true door and the one found
+LEVEL = 0.5  # m between a true floor and the one found
+
+
+@dataclass(frozen=True)
+class RoomScores:
+    """Agreement of found rooms with true ones (`score_rooms`); means are over the true rooms, nan where there are none."""
+
+    iou: float
+    precision: float
+    recall: float
+    mcc: float
+    each: Array  # (T,) IoU of each true room with the room assigned to it
+    each_mcc: Array  # (T,)
+    assigned: Array  # (T,) int64 found room, -1 none
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Precision and recall; nan where nothing was found, or nothing is true."""
+
+    precision: float
+    recall: float
+    true: int
+    found: int
+    right: int
+
+    @staticmethod
+    def of(right: int, true: int, found: int) -> Scores:
+        """From the numbers of right, true and found ones."""
+        return Scores(_ratio(right, found), _ratio(right, true), true, found, right)
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else float("nan")
+
+
+def contingency(true: Array, found: Array, trues: int, founds: int) -> Array:
+    """(trues, founds) int64: places that have true room i and found room j.
+
+    Args:
+        true, found: (n,) labels of the same places, -1 none.
+    """
+    both = (true >= 0) & (found >= 0)
+    pair = true[both].astype(np.int64) * founds + found[both]
+    return np.bincount(pair, minlength=trues * founds).reshape(trues, founds)
+
+
+def overlaps(true: Array, found: Array, trues: int, founds: int) -> tuple[Array, Array]:
+    """IoU and Matthews correlation (trues, founds) of the mask of each true room against the mask of each found one.
+
+    The correlation is over all places given, 0 where one of the masks is empty or full.
+    """
+    both = contingency(true, found, trues, founds).astype(float)
+    of_true = np.bincount(true[true >= 0], minlength=trues).astype(float)[:, None]
+    of_found = np.bincount(found[found >= 0], minlength=founds).astype(float)[None]
+    total = float(len(true))
+    iou = both / np.maximum(of_true + of_found - both, 1)
+    spread = of_true * (total - of_true) * of_found * (total - of_found)
+    mcc = (both * total - of_true * of_found) / np.sqrt(np.maximum(spread, 1))
+    return iou, np.where(spread > 0, mcc, 0.0)
+
+
+def assign(iou: Array) -> Array:
+    """(T,) int64: the found room of each true one in the one-to-one assignment with the largest sum of IoU; -1: none that
+    overlaps it."""
+    out = np.full(len(iou), -1, np.int64)
+    if iou.size:
+        i, j = linear_sum_assignment(iou, maximize=True)
+        kept = iou[i, j] > 0
+        out[i[kept]] = j[kept]
+    return out
+
+
+def score_rooms(true: Array, found: Array, trues: int, counted: Array, expected: Array | None = None) -> RoomScores:
+    """Rooms found against true ones.
+
+    Mean IoU: of the one-to-one assignment, over all expected true rooms; one that got no room counts 0. Precision and recall:
+    found rooms that count and expected true rooms that are assigned to each other with an IoU of at least 0.5. MCC: Matthews
+    correlation of the mask of a true room against the mask assigned to it, over all places, 0 where none is, averaged over
+    the rooms (MAORIS: Mielle et al., "A method to segment maps from different modalities using free space layout", ICRA 2018).
+
+    Args:
+        true, found: (n,) labels of all places: those of true rooms and those that the map says are of a room.
+        trues: number of true rooms.
+        counted: (F,) bool, found rooms that are wrong if they are no true room.
+        expected: (trues,) bool, true rooms that should have been found; None: all.
+    """
+    expected = np.ones(trues, bool) if expected is None else expected
+    iou, mcc = overlaps(true, found, trues, len(counted))
+    iou[~expected] = 0
+    assigned = assign(iou)
+    rows, taken = np.arange(trues), np.maximum(assigned, 0)
+    each, each_mcc = np.zeros(trues), np.zeros(trues)
+    if iou.size:
+        each = np.where(assigned >= 0, iou[rows, taken], 0.0)
+        each_mcc = np.where(assigned >= 0, mcc[rows, taken], 0.0)
+    good = each >= HALF
+    right = set(assigned[good].tolist())
+    claims = len(right | set(np.flatnonzero(counted).tolist()))
+    count = int(expected.sum())
+    return RoomScores(
+        iou=_ratio(float(each.sum()), count),
+        precision=_ratio(int(good.sum()), claims),
+        recall=_ratio(int(good.sum()), count),
+        mcc=_ratio(float(each_mcc[expected].sum()), count),
+        each=each,
+        each_mcc=each_mcc,
+        assigned=assigned,
+    )
+
+
+def match_places(true: Array, found: Array, plan: float = PLAN, height: float = HEIGHT) -> Array:
+    """(m, 2) int64 pairs (true, found) of places within `plan` metres from above and `height` metres in height, one to one:
+    as many as possible, and then the nearest.
+
+    Args:
+        true, found: (n, 3), m.
+    """
+    if not len(true) or not len(found):
+        return np.zeros((0, 2), np.int64)
+    apart = cdist(true[:, :2], found[:, :2])
+    fits = (apart <= plan) & (cdist(true[:, 2:], found[:, 2:]) <= height)
+    i, j = linear_sum_assignment(np.where(fits, apart, 1e3))
+    return np.stack([i, j], axis=1)[fits[i, j]].astype(np.int64)
+
+
+def score_doors(true: Array, found: Array, counted: Array, others: Array | None = None) -> Scores:
+    """Doors found against true ones, one to one, by where they are (`match_places`).
+
+    Args:
+        true: (n, 3) centres of the doors that should be found, m.
+        found: (m, 3) centres of those of the map.
+        counted: (m,) bool, those that are wrong if there is no door; a right one always counts.
+        others: (k, 3) centres of doors that need not be found: one found there is neither right nor wrong.
+    """
+    pairs = match_places(true, found)
+    left = np.setdiff1d(np.flatnonzero(counted), pairs[:, 1])
+    if others is not None and len(left):
+        left = np.delete(left, match_places(others, found[left])[:, 1])
+    return Scores.of(len(pairs), len(true), len(pairs) + len(left))
+
+
+def score_edges(true: Iterable[Iterable[int]], found: Array, assigned: Array, counted: Array) -> Scores:
+    """Connected pairs of rooms found against the true ones, each pair once however many doors it has.
+
+    Args:
+        true: pairs of true rooms.
+        found: (e, 2) pairs of found rooms.
+        assigned: (T,) the found room of each true one, -1 none.
+        counted: (F,) bool, found rooms that are wrong if they are no true room; pairs with another one are left out.
+    """
+    wanted = {frozenset(map(int, pair)) for pair in true}
+    of = np.full(len(counted), -1)
+    of[assigned[assigned >= 0]] = np.flatnonzero(assigned >= 0)
+    got, false = set(), set()
+    for a, b in np.asarray(found).reshape(-1, 2).tolist():
+        pair = frozenset((int(of[a]), int(of[b])))
+        if of[a] >= 0 and of[b] >= 0:
+            got.add(pair)
+        elif counted[a] and counted[b]:
+            false.add(frozenset((a, b)))
+    return Scores.of(len(wanted & got), len(wanted), len(got) + len(false))
+
+
+def storeys_right(true: Array, found: Array, within: float = LEVEL) -> bool:
+    """Are there as many storeys as there should be, each floor within `within` metres?"""
+    return len(true) == len(found) and bool((np.abs(np.sort(true) - np.sort(found)) <= within).all())
+
+
+def consistency(a: Array, b: Array, least: int = 0) -> float:
+    """How alike two maps cut one place into rooms: 1 where they agree; the same either way round.
+
+    The mean IoU of the rooms assigned to each other one to one, the sum divided by the number of rooms of the map that has
+    more; so a room that is split in one of them costs. nan where neither has a room.
+
+    Args:
+        a, b: (n,) labels of the same places, those that both have seen.
+        least: rooms with fewer places than this in their own map are not asked for.
+    """
+    counts = [np.bincount(x[x >= 0], minlength=1) for x in (a, b)]
+    iou, _ = overlaps(a, b, len(counts[0]), len(counts[1]))
+    sizes = [c >= max(least, 1) for c in counts]
+    iou = iou[sizes[0]][:, sizes[1]]
+    most = max(iou.shape)
+    if not iou.size:
+        return 0.0 if most else float("nan")
+    i, j = linear_sum_assignment(iou, maximize=True)
+    return float(iou[i, j].sum() / most)
+
+
+def bootstrap(values: Array, groups: Array, rounds: int = 2000, seed: int = 0) -> tuple[float, float, float]:
+    """Mean of values and the ends of its 95 % confidence interval, drawing whole groups (buildings) with replacement.
+
+    Args:
+        values: (n,), nan where a value does not exist: left out.
+        groups: (n,) what each value belongs to.
+    """
+    values, groups = np.asarray(values, float), np.asarray(groups)
+    known = np.isfinite(values)
+    if not known.any():
+        return float("nan"), float("nan"), float("nan")
+    _, group = np.unique(groups[known], return_inverse=True)
+    total, count = np.bincount(group, values[known]), np.bincount(group)
+    drawn = np.random.default_rng(seed).integers(len(total), size=(rounds, len(total)))
+    means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5]).tolist()
+    return float(values[known].mean()), low, high
