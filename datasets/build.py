@@ -27,8 +27,9 @@ from topomerge.io.atomic import replacing
 
 PATIENCE = 20.0  # s to wait for the scheduler of a cluster
 OLD = 3600.0  # s; half-written files of a build that was killed are deleted when they are older
-Task = tuple[Item, list[Plan], str]
-Work = Callable[[Item, list[Plan], str], Row]
+Plans = list[tuple[Plan, ...]]
+Task = tuple[Item, Plans, str]
+Work = Callable[[Item, Plans, str], Row]
 
 
 @dataclass

@@ -63,7 +63,7 @@ class Example:
     about: dict[str, Any]
 
 
-def make_file(item: Item, plans: Sequence[Plan], folder: str) -> Row:
+def make_file(item: Item, plans: Sequence[Sequence[Plan]], folder: str) -> Row:
     """Make an item's file in a folder. It never raises: what went wrong is in the row.
 
     One thread is used, so that as many workers as cores don't fight for them.
@@ -113,7 +113,7 @@ def time_limit(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def make_arrays(item: Item, plans: Sequence[Plan]) -> dict[str, Array]:
+def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]:
     """Simulate, extract, judge: the arrays of an item.
 
     Raises:
@@ -150,7 +150,7 @@ def make_arrays(item: Item, plans: Sequence[Plan]) -> dict[str, Array]:
     return arrays
 
 
-def _first_pair(item: Item, plans: Sequence[Plan]) -> Pair:
+def _first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> Pair:
     """The pair of the first candidate that has one."""
     refused: InputError | None = None
     for k in range(len(item.buildings)):
@@ -168,18 +168,19 @@ def _first_pair(item: Item, plans: Sequence[Plan]) -> Pair:
                 other,
                 difficulty_of(item),
                 item.source,
+                item.over_stairs,
             )
         except InputError as error:
             refused = error
     raise refused or InputError("an item without buildings")
 
 
-def _building(item: Item, k: int, plans: Sequence[Plan]) -> Building:
+def _building(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> Building:
     """Candidate k; after the last one comes the other building."""
     name = (*item.buildings, item.other[0])[k]
     if item.source == "procedural":
         return make_building(item.kind, int(name), item.storeys, difficulty_of(item))
-    return erect([plans[k]], difficulty_of(item), item.seed % 100_000 + k, name, item.source)
+    return erect(plans[k], difficulty_of(item), item.seed % 100_000 + k, name, item.source)
 
 
 def about(path: Path) -> dict[str, Any]:

@@ -20,8 +20,9 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -46,6 +47,7 @@ READERS = (  # what a file's name matches, and the module that reads it
 NOT_PLANS = re.compile(r"(^|/)(NOTE|README|LICENSE[^/]*)\.txt$|\.vectormap\.txt$|\.navigation\.txt$|(^|/)package\.xml$")
 
 LEVELS = ("plan_rmf", "plan_ifc")  # formats with several storeys a file
+SURVEYED = ("plan_mall",)  # formats whose storeys, one a folder, are in one frame
 WORDS = {"basement": -1.0, "lower": 0.0, "ground": 0.0, "main": 1.0, "first": 1.0, "upper": 2.0, "second": 2.0, "third": 3.0}
 ALIASES = {"romainrolland": "romainroland"}  # misspelt by the owner
 STRANGERS = ("scuolasconosciuta",)  # "unknown school": the three are different ones
@@ -72,7 +74,7 @@ def read_plans(path: str | Path) -> list[Plan]:
     """
     file, _, member = str(path).partition("::")
     plans = []
-    for name, result in _read(Path(file), member):
+    for name, result in _read(Path(file), lambda name: not member or member == name):
         if isinstance(result, Refusal):
             raise InputError(f"{file}: {name}: {result.reason}")
         plans.append(result)
@@ -97,18 +99,22 @@ def _in_room(flight: Flight, rooms: tuple[PlanRoom, ...]) -> bool:
     return any(shapely.Polygon(room.polygon).contains(shapely.Point(middle)) for room in rooms)
 
 
-def iter_plans(folder: str | Path) -> Iterator[tuple[str, Plan | Refusal]]:
+def iter_plans(folder: str | Path, among: Collection[str] | None = None) -> Iterator[tuple[str, Plan | Refusal]]:
     """Every plan of a folder, or of one file, in the order of their names; a bad one is a `Refusal` and the rest goes on.
 
     Names are paths below the folder, without suffix, with the storey or the archive's member behind them: unique, and the same
     on every machine. What was changed or left out of a plan is logged at level INFO.
 
+    Args:
+        among: only plans of these names.
+
     Raises:
         InputError: no such folder.
     """
     for file, root in _files(Path(folder)):
-        for name, result in _read(file):
-            name = _full(file, root, name)
+        above = partial(_full, file, root)
+        for name, result in _read(file, lambda name, above=above: among is None or above(name) in among):  # type: ignore[misc]
+            name = above(name)
             yield name, Refusal(name, result.reason) if isinstance(result, Refusal) else result
 
 
@@ -149,6 +155,16 @@ def siblings(folder: str | Path) -> list[list[str]]:
     return sorted([name for _, name in sorted(group)] for group in groups.values() if len(group) > 1)
 
 
+def frame_of(folder: str | Path) -> dict[str, str]:
+    """Plan (named as of `iter_plans`) -> the frame it is in: that of its file or survey, otherwise one of its own."""
+    out = {}
+    for file, root in _files(Path(folder)):
+        for name in (_full(file, root, name) for name in _names(file)):
+            reader = _reader(file)
+            out[name] = file.as_posix() if reader in LEVELS else file.parent.parent.as_posix() if reader in SURVEYED else name
+    return out
+
+
 def _names(file: Path) -> list[str]:
     try:
         return [name for name, _ in import_module(f"topomerge.datasets.{_reader(file)}").sketches(file)]
@@ -183,7 +199,7 @@ def _reader(path: Path) -> str:
     return next((module for pattern, module in READERS if re.search(pattern, name)), "")
 
 
-def _read(path: Path, only: str = "") -> Iterator[tuple[str, Plan | Refusal]]:
+def _read(path: Path, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[tuple[str, Plan | Refusal]]:
     """Name and plan or refusal of each storey of a file."""
     module = _reader(path)
     if not module:
@@ -198,7 +214,7 @@ def _read(path: Path, only: str = "") -> Iterator[tuple[str, Plan | Refusal]]:
         except Exception as error:
             yield path.stem, Refusal(path.stem, _reason(error))
             return
-        if not only or only == name:
+        if wanted(name):
             yield name, _made(name, make)
 
 

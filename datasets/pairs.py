@@ -12,6 +12,7 @@ from topomerge.datasets.difficulty import Difficulty
 from topomerge.datasets.parts import share, twin_rooms, two_parts
 from topomerge.datasets.scanner import scan
 from topomerge.datasets.session import session
+from topomerge.datasets.twin import twin_wing
 
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3
@@ -112,6 +113,7 @@ def make_pair(
     other: Building | None = None,
     difficulty: Difficulty | None = None,
     source: str = "procedural",
+    over_stairs: bool = False,
 ) -> Pair:
     """Two sessions in a building, each scanned along a walk through a connected part of it.
 
@@ -120,11 +122,12 @@ def make_pair(
         sensors: names, of a and of b.
         rng: generator or seed; the same seed gives the same points.
         scale: b's scale is unknown.
-        hard: None, or one of `HARD`: b is another building, another storey with the same plan, or another wing with the same plan
-            (the same walls with other furniture, seen as another place).
+        hard: None, or one of `HARD`: b is another building, another storey with the same plan, or another wing with nearly the
+            same plan (other ends and other furniture, perhaps mirrored: `twin_wing`).
         rooms: of each map, at most.
         other: the building of "other-building"; None: one of the same kind with another seed.
         difficulty: of both sessions.
+        over_stairs: walks lead over stairs, where the building has any (`two_parts`).
 
     Raises:
         InputError: the building has no such parts, or a room can't be reached.
@@ -134,7 +137,7 @@ def make_pair(
         raise InputError(f"hard negative {hard!r}: {', '.join(HARD)} are possible")
     if len(sensors) != 2:
         raise InputError(f"a pair needs two sensors, not {len(sensors)}")
-    places, visited = _places(building, overlap, rooms, hard, other, rng)
+    places, visited = _places(building, overlap, rooms, hard, other, over_stairs, rng)
     frames = draw_frames(2, scale, rng)
     days = (difficulty, ELSEWHERE if hard == "twin-wing" else difficulty)
     a, b = (
@@ -167,7 +170,13 @@ def seen_by_both(a: PointCloud, b: PointCloud) -> tuple[tuple[int, int], ...]:
 
 
 def _places(
-    building: Building, overlap: float, rooms: int, hard: str | None, other: Building | None, rng: np.random.Generator
+    building: Building,
+    overlap: float,
+    rooms: int,
+    hard: str | None,
+    other: Building | None,
+    over_stairs: bool,
+    rng: np.random.Generator,
 ) -> tuple[tuple[Building, Building], tuple[Array, Array]]:
     """The two buildings, and the rooms that are visited in each."""
     if hard == "other-building":
@@ -178,7 +187,8 @@ def _places(
         twins = twin_rooms(building)
         a, b = two_parts(building, rooms, overlap, rng, twins)
         return (building, building), (a, np.array(sorted(twins[i] for i in b.tolist())))
-    return (building, building), two_parts(building, rooms, overlap, rng)
+    parts = two_parts(building, rooms, overlap, rng, over_stairs=over_stairs)
+    return (building, twin_wing(building, rng) if hard == "twin-wing" else building), parts
 
 
 def _another(building: Building) -> Building:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import combinations
 
 import numpy as np
+import shapely
 from topomerge.datasets.building import Building
 
 from topomerge.errors import InputError
@@ -12,6 +14,8 @@ from topomerge.types import Array
 
 TRIES = 40
 LEAST = 3  # rooms a part
+ALIKE, JOINING = 0.8, 0.3  # IoU of two rooms of the same plan, and of two that connect the others
+CONNECTING = ("corridor", "hall", "lobby", "stairs")
 CLOSE = 0.1  # an overlap may miss what was asked for by so much, or by half a room
 
 Neighbours = dict[int, set[int]]
@@ -30,13 +34,20 @@ def room_graph(building: Building, among: Iterable[int] | None = None) -> Neighb
 
 
 def two_parts(
-    building: Building, rooms: int, overlap: float, rng: np.random.Generator, among: Iterable[int] | None = None
+    building: Building,
+    rooms: int,
+    overlap: float,
+    rng: np.random.Generator,
+    among: Iterable[int] | None = None,
+    over_stairs: bool = False,
 ) -> tuple[Array, Array]:
     """Two connected parts of up to `rooms` rooms, ascending (n,) int64, with a share of rooms in common (see `share`).
 
     Args:
         overlap: 0 to 1; what comes out differs by `CLOSE` at most.
         among: only these rooms.
+        over_stairs: grow them from both ends of stairs, if the building has any: a part of which all is in common, and otherwise
+            the first part, goes over them; without overlap there is one part at each end.
 
     Raises:
         InputError: the building has no such parts.
@@ -45,9 +56,12 @@ def two_parts(
         raise InputError(f"overlap must be 0 to 1 and rooms {LEAST} or more, not {overlap:g} and {rooms}")
     neighbours = room_graph(building, among)
     count = min(rooms, int(len(neighbours) / (2 - overlap)))
+    flights = building.stairs["rooms"][building.stairs["kind"] != "lift"]
+    flights = [f for f in flights.tolist() if f[1] in neighbours.get(f[0], ())] if over_stairs else []
     best, least = None, np.inf
     for _ in range(TRIES if count >= LEAST else 0):
-        a, b = _grow(neighbours, count, round(overlap * count), rng)
+        ends = rng.permutation(flights[int(rng.integers(len(flights)))]).tolist() if flights else []
+        a, b = _grow(neighbours, count, round(overlap * count), ends, rng)
         miss = abs(share(a, b) - overlap) + 0.02 * (2 * count - len(a) - len(b))
         if min(len(a), len(b)) >= LEAST and miss < least:
             best, least = (a, b), miss
@@ -65,16 +79,19 @@ def share(a: Iterable[int], b: Iterable[int]) -> float:
     return 2 * len(a & b) / max(len(a) + len(b), 1)
 
 
-def _grow(neighbours: Neighbours, count: int, common: int, rng: np.random.Generator) -> tuple[set[int], set[int]]:
-    """Grow what both have, then each in turn where the other is not."""
+def _grow(
+    neighbours: Neighbours, count: int, common: int, ends: list[int], rng: np.random.Generator
+) -> tuple[set[int], set[int]]:
+    """Grow what both have, then each in turn where the other is not; from two rooms that are drawn, or from those given."""
     rooms = list(neighbours)
     degree = np.array([len(neighbours[r]) + 0.1 for r in rooms])
-    first, second = rng.choice(rooms, 2, replace=False, p=degree / degree.sum()).tolist()
+    first, second = ends or rng.choice(rooms, 2, replace=False, p=degree / degree.sum()).tolist()
     if common:
-        a = {first}
+        a = {first, second} if ends and common > 1 else {first}
         while len(a) < common and _step(a, set(), neighbours, rng):
             pass
         b = set(a)
+        a |= set(ends)
     else:
         a, b = {first}, {second}
     grown = True
@@ -93,25 +110,37 @@ def _step(part: set[int], other: set[int], neighbours: Neighbours, rng: np.rando
 
 
 def twin_rooms(building: Building) -> dict[int, int]:
-    """Rooms of one storey -> the rooms of another storey with the same plan: of the two storeys that share most.
+    """Rooms of one storey -> the rooms over them with the same plan (IoU above `ALIKE`): of the two storeys that share most.
+
+    Corridors, halls and stairwells need to have less in common (`JOINING`): they lead from room to room, also where they differ.
 
     Raises:
         InputError: no two storeys have the same plan.
     """
-    outlines = [room.polygon - room.polygon.mean(axis=0) for room in building.rooms]
+    shapes = np.array([shapely.Polygon(room.polygon) for room in building.rooms])
+    storey = np.array([room.storey for room in building.rooms])
+    fits = np.array([room.kind not in ("lift", "void") for room in building.rooms])
     best: dict[int, int] = {}
-    for low in range(len(building.storeys)):
-        for high in range(low + 1, len(building.storeys)):
-            here, there = ([i for i, r in enumerate(building.rooms) if r.storey == k and r.kind != "lift"] for k in (low, high))
-            found = {i: j for i in here for j in there if _same(building, outlines, i, j)}
-            best = max(best, found, key=len)
+    for low, high in combinations(range(len(building.storeys)), 2):
+        found = _over(building, shapes, np.flatnonzero(fits & (storey == low)), np.flatnonzero(fits & (storey == high)))
+        best = max(best, found, key=len)
     if len(best) < LEAST:
         raise InputError(f"{building.name}: no two of its storeys have the same plan")
     return best
 
 
-def _same(building: Building, outlines: list[Array], i: int, j: int) -> bool:
-    if len(outlines[i]) != len(outlines[j]):
-        return False
-    moved = building.rooms[i].polygon.mean(axis=0) - building.rooms[j].polygon.mean(axis=0)
-    return bool(np.abs(moved).max() < 0.05 and np.abs(outlines[i] - outlines[j]).max() < 0.05)
+def _over(building: Building, shapes: Array, low: Array, high: Array) -> dict[int, int]:
+    """Rooms -> the rooms over them that are alike, best pairs first, each room once."""
+    if not len(low) or not len(high):
+        return {}
+    i, j = shapely.STRtree(shapes[high]).query(shapes[low], predicate="intersects")
+    i, j = low[i], high[j]
+    both = shapely.area(shapely.intersection(shapes[i], shapes[j]))
+    iou = both / (shapely.area(shapes[i]) + shapely.area(shapes[j]) - both)
+    out: dict[int, int] = {}
+    for k in np.argsort(-iou, kind="stable").tolist():
+        a, b = int(i[k]), int(j[k])
+        joins = building.rooms[a].kind == building.rooms[b].kind and building.rooms[a].kind in CONNECTING
+        if iou[k] > (JOINING if joins else ALIKE) and a not in out and b not in out.values():
+            out[a] = b
+    return dict(sorted(out.items()))

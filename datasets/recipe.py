@@ -17,17 +17,19 @@ from topomerge.datasets.difficulty import Difficulty
 from topomerge.datasets.pairs import HARD
 from topomerge.datasets.plan import Plan
 from topomerge.datasets.sensors import get_sensor
+from topomerge.datasets.stack import Stack, alike, iter_stacks
 
 from topomerge.embedding import graph
 from topomerge.errors import InputError
 from topomerge.io.listing import plain
 
-FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
+FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names
 LEAST_ROOMS = 5  # of a real plan: fewer have no two parts
 LEAST_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told apart
 LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
 CANDIDATES = 4  # buildings tried for an item: not every one has two parts with the overlap that is wanted
-Library = Mapping[str, Mapping[str, Plan]]  # source -> name -> plan
+TWINS = 6  # rooms over rooms of the same outline, from which on two real storeys are hard to tell apart
+Library = Mapping[str, Mapping[str, tuple[Plan, ...]]]  # source -> name -> plans of its storeys, lowest first
 
 
 @dataclass
@@ -48,6 +50,8 @@ class Recipe:
         scale: share of the pairs whose second map has an unknown scale.
         spread: how far furniture, doors, glass and so on differ from building to building: 0.5 is half to one and a half times.
         voxel_size: of the extraction, m.
+        stacks: share of the real buildings with two storeys, where the source has sibling storeys that fit (`stack`).
+        over_stairs: share of the overlapping pairs in buildings of several storeys whose walks lead over stairs.
     """
 
     name: str = "set"
@@ -66,6 +70,8 @@ class Recipe:
     spread: float = 0.5
     voxel_size: float = 0.1
     points_per_room: int = graph.POINTS
+    stacks: float = 0.0
+    over_stairs: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -73,7 +79,8 @@ class Item:
     """Everything that the bytes of one pair depend on.
 
     Args:
-        buildings: candidates, the first that works is taken: seeds of procedural buildings, or names of plans.
+        buildings: candidates, the first that works is taken: seeds of procedural buildings, or names of plans; those of storeys
+            that are stacked are joined by " + ".
         plans: digests of those plans; empty for procedural ones.
         other: the building of "other-building", likewise, and its digest.
         difficulty: what differs from the defaults.
@@ -94,6 +101,7 @@ class Item:
     difficulty: tuple[tuple[str, float], ...]
     voxel_size: float
     points_per_room: int
+    over_stairs: bool = False
 
     @property
     def name(self) -> str:
@@ -121,7 +129,8 @@ def check(recipe: Recipe) -> None:
                 raise InputError(f"{key}.{name} must be 0 or more, not {weight}")
         if key != "hard" and sum(weights.values()) <= 0:
             raise InputError(f"{key}: no weight above 0")
-    shares = {"two_storeys": recipe.two_storeys, "scale": recipe.scale, "hard, in all,": sum(recipe.hard.values())}
+    shares = {key: getattr(recipe, key) for key in ("two_storeys", "stacks", "over_stairs", "scale")}
+    shares["hard, in all,"] = sum(recipe.hard.values())
     shares |= {f"overlaps[{i}]": o for i, o in enumerate(recipe.overlaps)} | {"spread": recipe.spread}
     for key, value in shares.items():
         if not 0 <= value <= 1:
@@ -140,15 +149,19 @@ def library(recipe: Recipe) -> Library:
     """
     from topomerge.datasets.floorplans import Refusal, iter_plans
 
-    out: dict[str, dict[str, Plan]] = {}
+    out: dict[str, dict[str, tuple[Plan, ...]]] = {}
     for source in (s for s, weight in recipe.sources.items() if s != "procedural" and weight > 0):
         if not recipe.folder:
             raise InputError(f"sources.{source} needs the real data: set folder or TOPOMERGE_DATA, or take procedural only")
         wanted = set(splits.members(recipe.split, source))
-        plans = iter_plans(Path(recipe.folder) / splits.FOLDERS[source])
-        out[source] = {n: p for n, p in plans if n in wanted and not isinstance(p, Refusal) and _fits(p)}
-        if not out[source]:
+        folder = Path(recipe.folder) / splits.FOLDERS[source]
+        plans = {n: p for n, p in iter_plans(folder, wanted) if not isinstance(p, Refusal) and _fits(p)}
+        if not plans:
             raise InputError(f"sources.{source}: no plan of split {recipe.split} in {recipe.folder}")
+        out[source] = {name: (plan,) for name, plan in plans.items()}
+        if source != "r2v" and (recipe.stacks > 0 or recipe.hard.get("other-storey", 0) > 0):  # apartments have one storey
+            found = iter_stacks(folder, dict(plans))
+            out[source] |= {name: stack.plans for name, stack in found if isinstance(stack, Stack)}
     return out
 
 
@@ -157,39 +170,70 @@ def _fits(plan: Plan) -> bool:
     return len(areas) >= LEAST_ROOMS and sum(areas) >= LEAST_AREA and max(areas) <= LARGEST_ROOM
 
 
-def digest(plan: Plan) -> str:
-    """Hash of a plan's content."""
-    return hashlib.sha256(json.dumps(plain(asdict(plan)), sort_keys=True).encode()).hexdigest()[:16]
+def digest(storeys: Sequence[Plan]) -> str:
+    """Hash of what plans contain, to a micrometre: the last bits of a reckoned number differ from one machine to the next."""
+    text = json.dumps([_rounded(plain(asdict(plan))) for plan in storeys], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(v) for v in value]
+    return round(value, 6) + 0.0 if isinstance(value, float) else value  # + 0.0: no minus zero
 
 
 def draw_items(recipe: Recipe, plans: Library) -> list[Item]:
     """The items of a recipe, each from its own number: a longer set begins with the shorter one."""
-    digests = {source: {name: digest(plan) for name, plan in sorted(of.items())} for source, of in plans.items()}
-    return [_draw(recipe, digests, np.random.default_rng([recipe.seed, i])) for i in range(recipe.pairs)]
+    shelves = {source: _shelf(of) for source, of in plans.items()}
+    return [_draw(recipe, shelves, i) for i in range(recipe.pairs)]
 
 
-def _draw(recipe: Recipe, digests: Mapping[str, Mapping[str, str]], rng: np.random.Generator) -> Item:
+@dataclass(frozen=True)
+class _Shelf:
+    """Digests by name of a source's single storeys, of its stacks, and of its stacks of storeys that are nearly alike."""
+
+    singles: Mapping[str, str]
+    stacks: Mapping[str, str]
+    twins: Mapping[str, str]
+
+
+def _shelf(plans: Mapping[str, tuple[Plan, ...]]) -> _Shelf:
+    singles = {name: digest(p) for name, p in sorted(plans.items()) if len(p) == 1}
+    stacks = {name: digest(p) for name, p in sorted(plans.items()) if len(p) > 1}
+    return _Shelf(singles, stacks, {name: text for name, text in stacks.items() if alike(*plans[name][:2]) >= TWINS})
+
+
+def _draw(recipe: Recipe, shelves: Mapping[str, _Shelf], i: int) -> Item:
+    rng, more = np.random.default_rng([recipe.seed, i]), np.random.default_rng([recipe.seed, i, 1])
     hard = _pick({**recipe.hard, "": max(1 - sum(recipe.hard.values()), 0.0)}, rng)
     overlap = float(recipe.overlaps[int(rng.integers(len(recipe.overlaps)))])
-    source = _pick(recipe.sources, rng) if hard != "other-storey" else "procedural"
+    source = _pick(recipe.sources, rng if hard != "other-storey" else more)
+    shelf = shelves.get(source, _Shelf({}, {}, {}))
+    of = shelf.twins if hard == "other-storey" else shelf.stacks if more.random() < recipe.stacks and not hard else {}
+    if hard == "other-storey" and not of:
+        source = "procedural"
     kind = _pick(recipe.kinds, rng) if source == "procedural" else ""
     storeys = 2 if hard == "other-storey" or rng.random() < recipe.two_storeys else 1
     if overlap == 0 and not hard:  # one corridor can't be in neither
-        hard, storeys = ("", 2) if source == "procedural" else ("other-building", 1)
+        hard, storeys = ("", 2) if source == "procedural" or of else ("other-building", 1)
+    known = {} if source == "procedural" else of or shelf.singles
+    storeys = storeys if source == "procedural" else 2 if of else 1
     first, last = splits.seeds(recipe.split)
-    names = sorted(digests.get(source, {}))
+    names = sorted(known)
     chosen = [names[i] for i in rng.integers(len(names), size=CANDIDATES + 1)] if names else []
     seeds = rng.integers(first, last + 1, size=CANDIDATES + 1).tolist()
-    known = [digests[source][n] for n in chosen] or [""] * (CANDIDATES + 1)
+    digests = [known[n] for n in chosen] or [""] * (CANDIDATES + 1)
     named = chosen or [str(s) for s in seeds]
     return Item(
         source=source,
         kind=kind,
         buildings=tuple(named[:CANDIDATES]),
-        plans=tuple(known[:CANDIDATES]),
-        other=(named[-1], known[-1]),
+        plans=tuple(digests[:CANDIDATES]),
+        other=(named[-1], digests[-1]),
         seed=int(rng.integers(2**31)),
-        storeys=storeys if source == "procedural" else 1,
+        storeys=storeys,
         overlap=overlap,
         sensors=(_pick(recipe.sensors, rng), _pick(recipe.sensors, rng)),
         rooms=int(rng.integers(recipe.rooms[0], recipe.rooms[1] + 1)),
@@ -198,6 +242,7 @@ def _draw(recipe: Recipe, digests: Mapping[str, Mapping[str, str]], rng: np.rand
         difficulty=_difficulty(recipe.spread, rng),
         voxel_size=recipe.voxel_size,
         points_per_room=recipe.points_per_room,
+        over_stairs=bool(more.random() < recipe.over_stairs and not hard and storeys > 1),
     )
 
 
@@ -221,7 +266,7 @@ def difficulty_of(item: Item) -> Difficulty:
     return replace(difficulty, differ=0.0) if item.hard == "other-storey" else difficulty
 
 
-def plans_of(item: Item, plans: Library) -> Sequence[Plan]:
-    """The plans of the item's candidates and of its other building; empty for a procedural one."""
-    of: Mapping[str, Any] = plans.get(item.source, {})
+def plans_of(item: Item, plans: Library) -> Sequence[tuple[Plan, ...]]:
+    """The storeys of the item's candidates and of its other building; empty for a procedural one."""
+    of: Mapping[str, tuple[Plan, ...]] = plans.get(item.source, {})
     return [of[name] for name in (*item.buildings, item.other[0])] if of else []

@@ -39,7 +39,7 @@ WORDS = [
     "data=procedural", "data.name=small", "data.seed=4", "data.overlaps=[0.5]", "data.rooms=[3,4]", "data.points_per_room=16",
     "data.voxel_size=0.15", "data.two_storeys=0", *(f"data.hard.{h}=0" for h in ("other-building", "other-storey", "twin-wing")),
     *(f"data.kinds.{k}=0" for k in ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab")),
-    *(f"data.sensors.{s}=0" for s in ("tls", "lidar", "tablet")),
+    *(f"data.sensors.{s}=0" for s in ("tls", "lidar", "tablet", "laser2d", "mono")), "data.stacks=0", "data.over_stairs=0",
 ]  # fmt: skip
 
 
