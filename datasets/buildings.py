@@ -25,6 +25,7 @@ from topomerge.errors import InputError
 
 LANDING = 1.35  # m before a flight
 TRIES = 20
+CLOSETED = ("office", "meeting", "openplan", "classroom", "lab", "library", "living", "kitchen", "bedroom")
 
 
 def make_building(
@@ -146,17 +147,17 @@ def _storey(
     """Draw one storey."""
     height, ceiling, wall, merge = size
     rng = np.random.default_rng(seeds[0])
-    draft = Draft(wall, rng)
+    draft = Draft(wall, rng, round(float(np.random.default_rng(seeds[1]).uniform(0.94, 1.08)), 3))
     corridors = draw(layout, draft, "corridor", merge)
     fronts: list[tuple[int, int]] = []  # rooms and their corridors
-    deck = Deck(profile.upper if k and profile.upper else profile.rooms, seeds[1] if profile.same else None, rng)
+    deck = Deck(profile.upper if k and profile.upper else profile.rooms, seeds[1] if profile.same else None, rng, difficulty.spread)
     inner = Deck(INNER, None, rng)
     for row in layout.rows:
         for core in row.cores:
             fronts += _core(draft, row, core, corridors[row.corridor], k, storeys, height)
         for a, b in row.gaps():
             cards = inner if row.inner else deck
-            rooms = _fill(draft, row, (a, b), cards, corridors[row.corridor], rng)
+            rooms = _fill(draft, row, (a, b), cards, corridors[row.corridor], rng, difficulty.closets)
             fronts += rooms
             if row.behind >= 0:
                 _through(draft, [r for r, _ in rooms], corridors[row.behind])
@@ -232,6 +233,7 @@ def _fill(
     deck: Deck,
     corridor: int,
     rng: np.random.Generator,
+    closets: float,
 ) -> list[tuple[int, int]]:
     """Cut a stretch of a row into rooms, each with a door to the corridor."""
     kinds: list[str] = []
@@ -248,7 +250,7 @@ def _fill(
     cuts[-1] = gap[1]
     out = []
     for kind, a, b in zip(kinds, cuts[:-1], cuts[1:], strict=False):
-        out += _row_room(draft, row, (float(a), float(b)), kind, corridor, rng)
+        out += _row_room(draft, row, (float(a), float(b)), kind, corridor, rng, closets)
     rooms = [r for r, _ in out]
     for left, right in pairwise(rooms):
         if {draft.rooms[left].kind, draft.rooms[right].kind} <= {
@@ -262,7 +264,9 @@ def _fill(
     return out
 
 
-def _row_room(draft: Draft, row: Row, span: Range, kind: str, corridor: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+def _row_room(
+    draft: Draft, row: Row, span: Range, kind: str, corridor: int, rng: np.random.Generator, closets: float
+) -> list[tuple[int, int]]:
     """One room of a row; hotel rooms and wards have their own bath, flats are several rooms."""
     a, b = span
     outline = row.outline(a, b)
@@ -273,7 +277,10 @@ def _row_room(draft: Draft, row: Row, span: Range, kind: str, corridor: int, rng
     if kind in ("hotel", "ward") and b - a > 3.2:
         return _ensuite(draft, row, span, kind, corridor)
     kind = {"flat": "storage"}.get(kind, kind)
-    room = draft.room(outline, kind)
+    closet = _closet(draft, row, span, rng) if kind in CLOSETED and rng.random() < closets and b - a > 3.6 else None
+    room = draft.room(outline if closet is None else outline.difference(draft.outlines[closet]), kind)
+    if closet is not None:
+        draft.door(closet, room if rng.random() < 0.5 else corridor, 0.75)
     usual = float(rng.choice([0.8, 0.85, 0.9, 0.9, 1.0, 1.0, 1.25 if kind != "storage" else 0.9]))
     usual = float(rng.choice([1.0, 1.5])) if kind == "meeting" else usual
     wide = {"classroom": 1.0, "ward": 1.2, "lab": 1.2, "openplan": 1.6, "living": 1.2}.get(kind, usual)
@@ -284,6 +291,14 @@ def _row_room(draft: Draft, row: Row, span: Range, kind: str, corridor: int, rng
     if b - a > 8.5:
         draft.door(room, corridor, min(wide, 1.0))
     return [(room, corridor)]
+
+
+def _closet(draft: Draft, row: Row, span: Range, rng: np.random.Generator) -> int:
+    """A closet in the corner of a room, beside the corridor."""
+    a, b = span
+    wide, deep = np.round(rng.uniform(1.6, min(2.4, (b - a) / 2.1)), 2), np.round(rng.uniform(1.75, 2.8), 2)
+    left = rng.random() < 0.5
+    return draft.room(row.outline(*((a, a + wide) if left else (b - wide, b)), min(deep, row.depth(a) * 0.6)), "storage")
 
 
 def _ensuite(draft: Draft, row: Row, span: Range, kind: str, corridor: int) -> list[tuple[int, int]]:

@@ -30,6 +30,9 @@ class Difficulty:
         gone: share of the movable things that are gone at the next session.
         doors_moved: share of the doors that stand differently at the next session.
         people: persons a room at the next session.
+        ducts: share of the rooms with ducts or trays hanging below the ceiling.
+        closets: share of the larger rooms beside a corridor out of which a closet is cut.
+        spread: how much rooms of a kind differ in width: share that are half as wide again or more.
     """
 
     lintels: float = 0.9
@@ -51,6 +54,9 @@ class Difficulty:
     gone: float = 0.1
     doors_moved: float = 0.3
     people: float = 0.2
+    ducts: float = 0.15
+    closets: float = 0.12
+    spread: float = 0.2
 
     def __post_init__(self) -> None:
         limits = {"furniture": 3.0, "clutter": 5.0, "people": 5.0}

@@ -11,6 +11,7 @@ from topomerge.datasets.plan import Flight, Opening, Plan, PlanRoom, Point, Wall
 
 from topomerge.types import Array
 
+SPREAD = 0.01  # m, standard deviation of the clear width of doors of one make, as built
 MARGIN = 0.12  # m between an opening and the corner of its room
 
 
@@ -21,10 +22,12 @@ class Draft:
     Args:
         wall: m, thickness of the inner walls.
         rng: decides where along a wall a door stands.
+        wide: factor on the widths of doors: every building has its own make.
     """
 
     wall: float
     rng: np.random.Generator
+    wide: float = 1.0
     outlines: list[shapely.Polygon] = field(default_factory=list)
     rooms: list[PlanRoom] = field(default_factory=list)
     walls: list[Wall] = field(default_factory=list)
@@ -49,7 +52,10 @@ class Draft:
 
         Returns False where no common wall is long enough.
         """
-        return self.cut(self.outlines[a].intersection(self.outlines[b]), width, kind, at, **more)
+        line = self.outlines[a].intersection(self.outlines[b])
+        if kind == "door":
+            width = round(max(width * self.wide + float(self.rng.normal(0, SPREAD)), 0.72), 2)
+        return self.cut(line, width, kind, at, **more) or (width < 1.3 and self.cut(line, 0.72, kind, at, **more))
 
     def entrance(self, a: int, width: float) -> bool:
         """A door to the outside."""

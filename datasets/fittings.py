@@ -10,7 +10,7 @@ import shapely
 from topomerge.datasets.building import SURFACES, THING_DTYPE
 from topomerge.datasets.difficulty import Difficulty
 from topomerge.datasets.furnish import Floor, furnish
-from topomerge.datasets.furniture import Item
+from topomerge.datasets.furniture import Item, footprints
 from topomerge.datasets.plan import Plan
 from topomerge.datasets.solids import Soup, boxes, column, flat, rotation
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 LEAF = 0.04  # m, thickness
 SWING = {"shut": (0.0, 0.0), "half": (0.5, 1.1), "open": (1.4, 1.9)}  # rad
+PLAIN = ("stairs", "lift", "atrium", "bath", "hotel", "bedroom", "living", "void")  # rooms without ducts
 DOUBLE = 1.25  # m; wider doors have two leaves
 
 
@@ -184,10 +185,36 @@ def _overhead(soup: Soup, things: list[tuple], space: Space, difficulty: Difficu
         deep = min(0.3, space.ceiling - space.floor - 2.3)
         parts += [[x, 0, -deep / 2, 0.25, wide, deep] for x in np.arange(2.0, long - 1.0, 3.6) - long / 2]
     turned = [[*(np.array(p[:2]) @ rotation(yaw) + middle), *p[2:]] for p in parts]
+    _ducts(soup, space, (middle, yaw, float(long), float(wide)), difficulty, rng)
     for part, at in zip(parts, turned, strict=True):
         if space.shape.buffer(0.01).contains(shapely.Point(at[:2]).buffer(min(part[3], part[4]) / 2)):
             where = np.array([at[0], at[1], space.ceiling])
             soup.add(*boxes(np.array([[0, 0, *part[2:]]]), where, yaw), "beam")
+
+
+def _ducts(
+    soup: Soup, space: Space, frame: tuple[Array, float, float, float], difficulty: Difficulty, rng: np.random.Generator
+) -> None:
+    """Air ducts, pipes and cable trays under the ceiling, along the room or across it.
+
+    Args:
+        frame: middle (2,), yaw (rad), length and width (m) of the rectangle around the room.
+    """
+    spare = space.ceiling - space.floor - 2.15
+    if rng.random() >= difficulty.ducts or space.plan.kind in PLAIN or spare < 0.25:
+        return
+    middle, yaw, long, wide = frame
+    for _ in range(int(rng.integers(1, 4))):
+        across = bool(rng.random() < 0.25)
+        reach, offset = (wide, rng.uniform(-0.4, 0.4) * long) if across else (long, rng.uniform(-0.4, 0.4) * wide)
+        broad, high = float(rng.uniform(0.1, 0.7)), float(min(rng.uniform(0.08, 0.4), spare))
+        drop = float(rng.uniform(0.0, min(0.4, spare - high)))
+        place = middle + (np.array([offset, 0.0]) if across else np.array([0.0, offset])) @ rotation(yaw)
+        turn, reach = yaw + np.pi / 2 * across, max(reach - 0.02, 0.5)
+        box = shapely.Polygon(footprints(place[None], np.array([turn]), (reach, broad))[0]).intersection(space.shape)
+        if box.area > 0.98 * reach * broad:
+            at = np.array([*place, space.ceiling])
+            soup.add(*boxes(np.array([[0, 0, -drop - high / 2, reach, broad, high]]), at, turn), "beam")
 
 
 def _furniture(

@@ -12,6 +12,7 @@ from topomerge.datasets.solids import rotation
 from topomerge.types import Array
 
 TRIES = 10
+SHIFT, TURN, GAPS = 0.06, 0.03, 0.08  # m and rad (standard deviations) and share by which rows of furniture are irregular
 BODY = 0.28  # m, half of what a person needs to pass
 ANYHOW = ("clutter", "person", "armchair", "plant")  # stand at any angle
 EMPTY = ("stairs", "lift", "void")
@@ -36,8 +37,13 @@ class Floor:
     def put(self, item: Item, where: str) -> Item | None:
         """The item at a place that is free, or None when none was found."""
         at, yaw = self._by_wall(item) if where == WALL else self._in_middle(item)
+        yaw = yaw + self._askew(item)
         free = np.flatnonzero(self.fits(at, yaw, item))
         return self._place(item, at[free[0]], float(yaw[free[0]])) if len(free) else None
+
+    def _askew(self, item: Item) -> float:
+        """rad by which a thing is not parallel to the walls; what is fitted stands straight."""
+        return float(self.rng.normal(0, TURN)) if item.movable else 0.0
 
     def fits(self, at: Array, yaw: Array, item: Item) -> Array:
         """(n,) bool: does the item lie within the room and clear of everything, at each place?"""
@@ -62,7 +68,8 @@ class Floor:
         free = self.rng.uniform(0, 1, TRIES) * spare
         corner = np.where(self.rng.random(TRIES) < 0.5, 0.04, spare - 0.04)
         offset = np.where(self.rng.random(TRIES) < 0.5, corner, free) + width / 2
-        at = self.corners[wall] + along * offset[:, None] + inward * (depth / 2 + 0.03)
+        gap = 0.05 + self.rng.exponential(0.03, TRIES) if item.movable else np.full(TRIES, 0.03)
+        at = self.corners[wall] + along * offset[:, None] + inward * (depth / 2 + gap)[:, None]
         return at, np.arctan2(-inward[:, 1], -inward[:, 0]) - np.pi / 2
 
     def _in_middle(self, item: Item) -> tuple[Array, Array]:
@@ -83,8 +90,10 @@ class Floor:
         size, aisle = np.array(item.size[:2]), self.rng.uniform(0.5, 0.9, 2)
         xs, ys = (np.arange(low[k] + size[k] / 2, high[k] - size[k] / 2 + 1e-6, size[k] + aisle[k]) for k in (0, 1))
         spots = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2) @ rotation(yaw)
-        free = self.fits(spots, np.full(len(spots), yaw), item) if len(spots) else np.zeros(0, bool)
-        return [self._place(item, spot, yaw) for spot in spots[free][:count]]
+        spots = spots + self.rng.normal(0, SHIFT, spots.shape)
+        yaws = yaw + self.rng.normal(0, TURN, len(spots))
+        free = self.fits(spots, yaws, item) & (self.rng.random(len(spots)) > GAPS) if len(spots) else np.zeros(0, bool)
+        return [self._place(item, spot, float(y)) for spot, y in zip(spots[free][:count], yaws[free][:count], strict=True)]
 
 
 def furnish(floor: Floor, kind: str, density: float, clutter: float, doors: Array) -> list[Item]:

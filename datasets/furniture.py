@@ -35,6 +35,15 @@ def _table(w: float, d: float, h: float = 0.74) -> list[list[float]]:
     return [[0, 0, h - 0.015, w, d, 0.03], *legs]
 
 
+def _pile(w: float, d: float, h: float, g: np.random.Generator, most: int = 4) -> list[list[float]]:
+    """What lies about on a top: papers, boxes, bags."""
+    number = int(g.integers(most + 1))
+    sizes = g.uniform([0.1, 0.1, 0.03], [0.35, 0.3, 0.35], (number, 3))
+    sizes[:, 2] *= g.uniform(0.2, 1.0, number)
+    at = g.uniform(-0.5, 0.5, (number, 2)) * np.maximum([w - 0.35, d - 0.3], 0.0)
+    return [[x, y, h + s[2] / 2, *s] for (x, y), s in zip(at.tolist(), sizes.tolist(), strict=True)]
+
+
 def _chair(x: float = 0.0, y: float = 0.0, back: float = -1.0) -> list[list[float]]:
     return [
         [x, y, 0.44, 0.45, 0.45, 0.06],
@@ -47,9 +56,11 @@ def _around(x: float, y: float, dx: float, dy: float, z: float, side: float, h: 
     return [[x + i * dx, y + j * dy, z, side, side, h] for i in (-1, 1) for j in (-1, 1)]
 
 
-def _shelf(w: float, d: float, h: float) -> list[list[float]]:
+def _shelf(w: float, d: float, h: float, g: np.random.Generator) -> list[list[float]]:
     boards = [[0, 0, z, w, d, 0.03] for z in np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))]
-    books = [[0, 0.03, z + 0.14, w * 0.8, d * 0.6, 0.25] for z in np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))[:-1:2]]
+    levels = np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))[:-1]
+    full = g.uniform(0, 0.95, len(levels)) * w  # rows of books begin at the left
+    books = [[f / 2 - w / 2, 0.03, z + 0.14, f, d * 0.6, 0.25] for z, f in zip(levels, full, strict=True) if f > 0.1]
     return [
         [0, d / 2 - 0.01, h / 2, w, 0.02, h],
         [-w / 2, 0, h / 2, 0.03, d, h],
@@ -68,54 +79,58 @@ def _sofa(w: float, d: float = 0.9) -> list[list[float]]:
     return [[0, 0, 0.21, w, d, 0.42], [0, d / 2 - 0.1, 0.55, w, 0.2, 0.6], *arms]
 
 
-def _desk(w: float, d: float) -> list[list[float]]:
-    """Desk with screen and chair; the chair's side is y < 0."""
+def _desk(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
+    """Desk with screen, chair and what lies on it; the chair's side is y < 0, anywhere between pushed in and pulled out."""
     y = 0.35
-    shift = [[b[0], b[1] + y, *b[2:]] for b in _table(w, d)]
+    shift = [[b[0], b[1] + y, *b[2:]] for b in [*_table(w, d), *_pile(w, d, 0.74, g)]]
+    x, out = float(g.normal(0, 0.12)), float(g.uniform(-0.1, 0.35))
     return [
         *shift,
         [0, y + 0.2, 1.0, 0.55, 0.04, 0.33],
         [0, y + 0.2, 0.8, 0.2, 0.15, 0.12],
-        *_chair(0.0, y - d / 2 - 0.2),
+        *_chair(x, y - d / 2 - out),
     ]
 
 
-def _dining(w: float, d: float) -> list[list[float]]:
+def _dining(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
+    """Table with chairs on both sides; one in eight is missing."""
     xs = np.arange(int(w / 0.65)) * 0.65
     xs = xs - xs.mean()
-    return [*_table(w, d), *(b for x in xs for s in (-1, 1) for b in _chair(float(x), s * (d / 2 + 0.12), float(s)))]
+    seats = [(float(x + g.normal(0, 0.05)), s, float(g.uniform(0.0, 0.3))) for x in xs for s in (-1.0, 1.0) if g.random() < 0.88]
+    return [*_table(w, d), *_pile(w, d, 0.74, g), *(b for x, s, out in seats for b in _chair(x, s * (d / 2 + out), s))]
 
 
-def _counter(w: float, d: float = 0.6) -> list[list[float]]:
+def _counter(w: float, g: np.random.Generator, d: float = 0.6) -> list[list[float]]:
     """Kitchen run with cupboards above and a tall fridge."""
     cupboard = [w * 0.1, d / 2 - 0.17, 1.75, w * 0.75, 0.34, 0.65]
-    return [[0, 0, 0.45, w, d, 0.9], cupboard, [-w / 2 + 0.3, 0, 0.95, 0.6, d, 1.9]]
+    return [[0, 0, 0.45, w, d, 0.9], *_pile(w, d, 0.9, g), cupboard, [-w / 2 + 0.3, 0, 0.95, 0.6, d, 1.9]]
 
 
 def _toilet() -> list[list[float]]:
     return [[0, -0.05, 0.2, 0.37, 0.5, 0.4], [0, 0.22, 0.6, 0.4, 0.18, 0.4]]
 
 
-def _bench(w: float, d: float) -> list[list[float]]:
+def _bench(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
     """Laboratory island: drawers, a worktop and a rack of shelves along its middle."""
     return [
         [0, 0, 0.42, w * 0.95, d * 0.8, 0.84],
         [0, 0, 0.89, w, d, 0.06],
         [0, 0, 1.35, w * 0.9, 0.3, 0.03],
         [0, 0, 1.2, 0.05, 0.3, 0.6],
+        *_pile(w, d, 0.92, g, 8),
     ]
 
 
-def _seat(w: float) -> list[list[float]]:
+def _seat(w: float, g: np.random.Generator) -> list[list[float]]:
     """School desk for two with two chairs."""
-    back = [b for x in (-w / 4, w / 4) for b in _chair(x, -0.5)]
+    back = [b for x in (-w / 4, w / 4) for b in _chair(x, -float(g.uniform(0.3, 0.6)))]
     return [*_table(w, 0.5, 0.72), *back]
 
 
 Make = Callable[[np.random.Generator], list[list[float]]]
 ITEMS: dict[str, Make] = {
-    "desk": lambda g: _desk(g.choice([1.2, 1.4, 1.6]), 0.8),
-    "shelf": lambda g: _shelf(g.choice([0.8, 1.0, 1.6]), 0.35, g.choice([1.2, 1.9, 2.1])),
+    "desk": lambda g: _desk(g.choice([1.2, 1.4, 1.6]), 0.8, g),
+    "shelf": lambda g: _shelf(g.choice([0.8, 1.0, 1.6]), 0.35, g.choice([1.2, 1.9, 2.1]), g),
     "cabinet": lambda g: [[0, 0, (h := g.uniform(0.8, 1.5)) / 2, g.choice([0.8, 1.2]), 0.45, h]],
     "wardrobe": lambda g: [[0, 0, 1.05, g.choice([1.0, 1.5, 2.0]), 0.6, 2.1]],
     "bed": lambda g: _bed(g.choice([0.9, 1.4, 1.6])),
@@ -124,17 +139,17 @@ ITEMS: dict[str, Make] = {
     "sofa": lambda g: _sofa(g.choice([1.5, 1.9, 2.3])),
     "lowtable": lambda g: _table(1.0, 0.6, 0.4),
     "armchair": lambda g: _sofa(0.9, 0.85),
-    "dining": lambda g: _dining(g.choice([1.4, 1.8]), 0.85),
-    "meeting": lambda g: _dining(g.choice([2.4, 3.2]), 1.1),
-    "kitchen": lambda g: _counter(g.choice([1.8, 2.4, 3.0])),
+    "dining": lambda g: _dining(g.choice([1.4, 1.8]), 0.85, g),
+    "meeting": lambda g: _dining(g.choice([2.4, 3.2]), 1.1, g),
+    "kitchen": lambda g: _counter(g.choice([1.8, 2.4, 3.0]), g),
     "tv": lambda g: [[0, 0, 0.25, 1.5, 0.4, 0.5], [0, 0.05, 0.85, 1.1, 0.06, 0.65]],
     "toilet": lambda g: _toilet(),
     "sink": lambda g: [[0, 0, 0.8, 0.55, 0.45, 0.16], [0, 0.1, 0.36, 0.18, 0.2, 0.72], [0, 0.21, 1.5, 0.5, 0.03, 0.7]],
     "shower": lambda g: [[0, 0, 0.04, 0.9, 0.9, 0.08], [0, 0.42, 1.1, 0.05, 0.05, 2.0]],
     "bath": lambda g: [[0, 0, 0.28, 1.7, 0.75, 0.56]],
-    "bench": lambda g: _bench(g.choice([1.8, 2.4, 3.0]), g.choice([0.8, 1.4])),
+    "bench": lambda g: _bench(g.choice([1.8, 2.4, 3.0]), g.choice([0.8, 1.4]), g),
     "hood": lambda g: [[0, 0, 0.45, 1.5, 0.8, 0.9], [0, 0.3, 1.6, 1.5, 0.2, 1.4], [0, 0, 2.25, 1.5, 0.8, 0.3]],
-    "seat": lambda g: _seat(1.3),
+    "seat": lambda g: _seat(1.3, g),
     "board": lambda g: [[0, 0, 1.5, g.choice([1.8, 2.4, 3.6]), 0.05, 1.2]],
     "locker": lambda g: [[0, 0, 0.9, g.choice([0.9, 1.8, 2.7]), 0.4, 1.8]],
     "printer": lambda g: [[0, 0, 0.55, 0.65, 0.6, 1.1]],
@@ -148,7 +163,7 @@ ITEMS: dict[str, Make] = {
         [0, 0, 0.9, 0.5, 0.5, (h := g.uniform(0.6, 1.2))],
         [0, 0, 0.7, 0.06, 0.06, h],
     ],
-    "rack": lambda g: _shelf(1.2, 0.6, 2.1),
+    "rack": lambda g: _shelf(1.2, 0.6, 2.1, g),
     "trolley": lambda g: [[0, 0, 0.5, 0.8, 0.5, 0.9]],
     "radiator": lambda g: [[0, 0, 0.45, g.choice([0.8, 1.2]), 0.1, 0.6]],
     "partition": lambda g: [[0, 0, 0.75, 1.6, 0.05, 1.5]],

@@ -75,21 +75,28 @@ WIDTHS: dict[str, Range] = {
     "lift": (2.1, 2.5),
 }  # fmt: skip
 INNER = ("lounge", "storage", "meeting", "kitchen", "lounge", "storage", "toilets")  # what lies in a building's middle
+MERGED = {"office", "meeting", "storage", "openplan", "lab", "library", "lounge"}  # rooms that may be as wide as two
 DARK = {"storage", "lift", "bath", "toilets", "corridor", "void"}  # no windows, or small ones
 
 
 class Deck:
     """Kinds of rooms in a shuffled order, dealt again when all are out, so that shares hold even in small buildings.
 
-    Half of all buildings have a module of 1.2 or 1.5 m that all widths are multiples of.
+    Half of all buildings have a module of 1.2 or 1.5 m that all widths are multiples of. `spread` is that of the difficulty.
     """
 
-    def __init__(self, kinds: Sequence[str], style: int | None, rng: np.random.Generator) -> None:
-        self.kinds, self.rng = kinds, rng
+    def __init__(self, kinds: Sequence[str], style: int | None, rng: np.random.Generator, spread: float = 0.0) -> None:
+        self.kinds, self.rng, self.spread = kinds, rng, spread
         self.left: list[str] = []
         self.module = float(rng.choice([0.0, 0.0, 1.2, 1.5]))
         fixed = np.random.default_rng(style)
         self.widths = {} if style is None else {k: float(fixed.uniform(*WIDTHS[k])) for k in sorted(set(kinds))}
+
+    def _width(self, kind: str) -> float:
+        """m; some rooms are as wide as two, as where a wall was left out."""
+        width = float(self.rng.uniform(*WIDTHS[kind]))
+        wide = kind in MERGED and self.rng.random() < self.spread
+        return width * float(self.rng.uniform(1.4, 2.2)) if wide else width
 
     def draw(self, most: float) -> tuple[str, float]:
         """The next kind that fits into a width, and its own width; an office or a store where none fits."""
@@ -97,6 +104,6 @@ class Deck:
             self.left = self.left or self.rng.permutation(np.array(self.kinds)).tolist()
             kind = self.left.pop()
             if WIDTHS[kind][0] * 0.85 <= most:
-                width = self.widths.get(kind) or float(self.rng.uniform(*WIDTHS[kind]))
+                width = self.widths.get(kind) or self._width(kind)
                 return kind, max(round(width / self.module), 2) * self.module if self.module else width
         return ("storage" if most < 2.8 or "flat" in self.kinds else "office"), most

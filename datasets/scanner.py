@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 from topomerge.datasets.building import SURFACES, Building
 from topomerge.datasets.sensors import Sensor, get_sensor
 from topomerge.datasets.walk import Walk, draw_floors, plan_walk
@@ -30,6 +31,7 @@ def scan(
     spacing: float | None = None,
     budget: int | None = None,
     frame: Sim3 | None = None,
+    unfinished: float = 0.5,
 ) -> PointCloud:
     """A partial map of a building.
 
@@ -40,6 +42,7 @@ def scan(
         spacing: m between points (one point a cube of that size); None: the sensor's. It sets the number of rays.
         budget: number of rays, where it shall not follow from the spacing.
         frame: the cloud is given in this frame (it maps the building's coordinates into the cloud's); None: the building's own.
+        unfinished: share of the long rooms that are left half-way (`plan_walk`).
 
     Returns:
         points with `labels` (index into `rooms`: all of the building's, in the cloud's frame), estimated `poses` and `pose_of`.
@@ -52,7 +55,7 @@ def scan(
         raise InputError(f"spacing must be 0.005 to 1 m, not {spacing}")
     spacing = spacing or kind.spacing
     visited = [i for i, r in enumerate(building.rooms) if r.kind != "lift"] if rooms is None else [int(r) for r in rooms]
-    walk = plan_walk(building, visited, rng)
+    walk = plan_walk(building, visited, rng, unfinished)
     poses, along = _poses(walk, kind, visited, rng)
     number = budget or (LINE * len(poses) if kind.beams == 1 else _rays_for(building, visited, spacing))
     hits = _cast(building, kind, poses, max(number // len(poses), 8), rng)
@@ -97,6 +100,7 @@ class Hits:
         ranges: (n,) float32, m.
         triangle: (n,) int64, of the building.
         cosine: (n,) float32, |cosine| of the angle of incidence.
+        ghost: (n,) bool, seen in a pane as in a mirror.
     """
 
     pose: Array
@@ -104,10 +108,11 @@ class Hits:
     ranges: Array
     triangle: Array
     cosine: Array
+    ghost: Array
 
     def take(self, rows: Array) -> Hits:
         """Some of the rows."""
-        return Hits(self.pose[rows], self.rays[rows], self.ranges[rows], self.triangle[rows], self.cosine[rows])
+        return Hits(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 def _placed(poses: Array, hits: Hits, ranges: Array) -> Array:
@@ -204,30 +209,42 @@ def _cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np
         packed[..., :3] = these[:, None, :3, 3]
         packed[..., 3:] = np.matmul(spun, these[:, :3, :3].astype(np.float32).transpose(0, 2, 1))
         flat = packed.reshape(-1, 6)
-        ranges, triangle, cosine = _shoot(scene, flat)
-        through = (triangle >= 0) & glass[triangle] & (rng.random(len(triangle)) >= sensor.glass)
+        ranges, triangle, cosine, normal = _shoot(scene, flat)
+        chance = rng.random(len(triangle))
+        pane = (triangle >= 0) & glass[triangle] & (chance >= sensor.glass)
+        ghost = pane & (chance >= 1 - sensor.ghost)
+        through = pane & ~ghost
         if through.any():
             clear = clear or _scene(building.vertices, building.triangles[near[~glass]])
             beyond = _shoot(clear, flat[through])
             ranges[through], cosine[through] = beyond[0], beyond[2]
             triangle[through] = np.where(beyond[1] >= 0, np.flatnonzero(~glass)[beyond[1]], -1)
+        if ghost.any():
+            mirrored = _mirrored(flat[ghost], ranges[ghost], normal[ghost])
+            beyond = _shoot(scene, mirrored)
+            ranges[ghost], triangle[ghost], cosine[ghost] = ranges[ghost] + beyond[0], beyond[1], beyond[2]
         image = ranges.reshape(-1, rows, columns)
         ranges = _mix(image, sensor.mixed, rng).ravel()
         kept = np.flatnonzero((triangle >= 0) & (ranges > sensor.reach[0]) & (ranges < reach))
         pose = first + kept // len(rays)
-        out.append((pose, spun[kept % len(rays)], ranges[kept], near[triangle[kept]], cosine[kept]))
+        out.append((pose, spun[kept % len(rays)], ranges[kept], near[triangle[kept]], cosine[kept], ghost[kept]))
     return Hits(*(np.concatenate(column) for column in zip(*out, strict=True)))
 
 
-def _shoot(scene: Any, rays: Array) -> tuple[Array, Array, Array]:
-    """Range (inf: none), triangle (-1: none) and |cosine| of incidence of rays (n, 6) of unit length."""
+def _mirrored(rays: Array, ranges: Array, normal: Array) -> Array:
+    """Rays (n, 6) as panes with these normals throw them back."""
+    way = rays[:, 3:]
+    back = way - 2 * np.einsum("ni,ni->n", way, normal)[:, None] * normal
+    return np.hstack([rays[:, :3] + way * (ranges[:, None] - 0.001), back]).astype(np.float32)
+
+
+def _shoot(scene: Any, rays: Array) -> tuple[Array, Array, Array, Array]:
+    """Range (inf: none), triangle (-1: none), |cosine| of incidence and unit normals (n, 3) of rays (n, 6) of unit length."""
     answer = scene.run(np.ascontiguousarray(rays[:, :3]), np.ascontiguousarray(rays[:, 3:]), output=True)
     triangle = answer["primID"].astype(np.int64)
     ranges = np.where(triangle >= 0, answer["tfar"], np.float32(np.inf)).astype(np.float32)
-    normal = answer["Ng"]
-    length = np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
-    cosine = np.abs(np.einsum("ni,ni->n", normal, rays[:, 3:])) / length
-    return ranges, triangle, cosine
+    normal = answer["Ng"] / np.maximum(np.linalg.norm(answer["Ng"], axis=1), 1e-12)[:, None]
+    return ranges, triangle, np.abs(np.einsum("ni,ni->n", normal, rays[:, 3:])), normal
 
 
 def _mix(image: Array, share: float, rng: np.random.Generator) -> Array:
@@ -263,19 +280,19 @@ def _degrade(building: Building, poses: Array, hits: Hits, sensor: Sensor, rng: 
 
 
 def _rooms_of(building: Building, poses: Array, hits: Hits) -> Array:
-    """(n,) int32 true room of each point: the room on the sensor's side of the surface; -1: outdoors."""
+    """(n,) int32 true room of each point: the room on the sensor's side of the surface; -1: outdoors, or seen in a pane."""
     floors = draw_floors(building, LABEL_CELL)
     near = [ndimage.distance_transform_edt(r < 0, return_distances=True, return_indices=True) for r in floors.room]
     filled = np.stack([np.where(d * LABEL_CELL < 0.3, r[i[0], i[1]], -1) for r, (d, i) in zip(floors.room, near, strict=True)])
     points = _placed(poses, hits, hits.ranges - 0.08)
     storey = np.clip(np.searchsorted(building.storeys["floor"], points[:, 2] + 0.02, side="right") - 1, 0, None)
     ij = floors.cells(points)
-    return filled[storey, ij[:, 0], ij[:, 1]].astype(np.int32)
+    return np.where(hits.ghost, -1, filled[storey, ij[:, 0], ij[:, 1]]).astype(np.int32)
 
 
 def _drift(poses: Array, walk: Walk, along: Array, sensor: Sensor, rng: np.random.Generator) -> Array:
     """The poses as odometry has them: the heading wanders, and the way bends with it; gravity is a little off."""
-    out = poses.copy()
+    out = _jittered(poses, sensor, rng)
     if sensor.drift:
         total = walk.along[-1]
         knots = np.arange(0, total + 30.0, 15.0)
@@ -288,8 +305,8 @@ def _drift(poses: Array, walk: Walk, along: Array, sensor: Sensor, rng: np.rando
         moved = np.concatenate([[walk.points[0]], walk.points[0] + np.cumsum(bent, axis=0)]) - walk.points
         at = np.searchsorted(walk.along, along)
         for k, i in enumerate(np.clip(at, 0, len(moved) - 1)):
-            out[k, :3, :3] = Sim3(float(error[i])).matrix[:3, :3] @ poses[k, :3, :3]
-            out[k, :3, 3] = poses[k, :3, 3] + moved[i]
+            out[k, :3, :3] = Sim3(float(error[i])).matrix[:3, :3] @ out[k, :3, :3]
+            out[k, :3, 3] += moved[i]
     if sensor.tilt:
         a, b = np.radians(sensor.tilt) * rng.normal(size=2)
         lean = np.array([[1, 0, b], [0, 1, -a], [-b, a, 1]])
@@ -297,6 +314,16 @@ def _drift(poses: Array, walk: Walk, along: Array, sensor: Sensor, rng: np.rando
         centre = out[:, :3, 3].mean(axis=0)
         out[:, :3, 3] = (out[:, :3, 3] - centre) @ lean.T + centre
         out[:, :3, :3] = lean @ out[:, :3, :3]
+    return out
+
+
+def _jittered(poses: Array, sensor: Sensor, rng: np.random.Generator) -> Array:
+    """The poses, each off by itself: what is left of the errors when a map has been put together."""
+    out = poses.copy()
+    shift, turn = rng.normal(0, sensor.jitter[0], (len(poses), 3)), np.radians(rng.normal(0, sensor.jitter[1], (len(poses), 3)))
+    flat = sensor.beams == 1
+    out[:, :3, 3] += shift * [1, 1, 0 if flat else 1]
+    out[:, :3, :3] = Rotation.from_rotvec(turn * [not flat, not flat, 1]).as_matrix() @ out[:, :3, :3]
     return out
 
 

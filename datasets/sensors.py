@@ -33,6 +33,8 @@ class Sensor:
         mixed: share of the rays at depth edges that return a range between.
         drift: degrees by which the heading goes astray (standard deviation), over about 15 m.
         tilt: degrees by which gravity is misjudged.
+        jitter: m and degrees by which each pose is off by itself (standard deviation): walls become thick where views overlap.
+        ghost: share of the rays that a pane neither returns nor lets through but mirrors: they make points behind the glass.
         plain: share of the points on floors, ceilings and walls that are kept (cameras need texture).
         lowest: points lower than this above the floor are missing.
         metric: the scale of its maps is known.
@@ -58,6 +60,8 @@ class Sensor:
     mixed: float = 0.3
     drift: float = 0.0
     tilt: float = 0.0
+    jitter: tuple[float, float] = (0.0, 0.0)
+    ghost: float = 0.05
     plain: float = 1.0
     lowest: float = -1.0
     metric: bool = True
@@ -78,27 +82,29 @@ class Sensor:
 SENSORS = {
     s.name: s
     for s in (
-        Sensor("tls", (0.4, 40), 360, (-62, 88), height=1.7, grazing=3.0),
+        Sensor("tls", (0.4, 40), 360, (-62, 88), height=1.7, grazing=3.0, jitter=(0.003, 0.01)),
         Sensor(
             "lidar", (0.5, 30), 360, (-45, 45), 32, height=1.4, step=0.4, swing=12, spacing=0.05, noise=(0.012, 0.0004),
-            drift=0.3, tilt=0.2,
+            drift=0.3, tilt=0.2, jitter=(0.01, 0.1),
         ),
         Sensor(
             "depth", (0.4, 5.0), 72, (-28, 28), height=1.45, step=0.35, turns=10, pitch=-4, swing=24, spacing=0.05,
             noise=(0.003, 0.0), quadratic=0.0025, grazing=12, dark=0.08, lost=0.03, glass=0.02, mixed=0.5, drift=0.5, tilt=0.4,
+            jitter=(0.01, 0.25), ghost=0.02,
         ),
         Sensor(
             "mono", (0.6, 8.0), 80, (-30, 30), height=1.5, step=0.5, turns=8, pitch=-4, swing=20, spacing=0.12,
             noise=(0.01, 0.005), quadratic=0.004, grazing=10, dark=0.1, lost=0.2, glass=0.2, mixed=0.6, drift=0.8, tilt=0.6,
-            plain=0.3, metric=False,
+            plain=0.3, metric=False, jitter=(0.02, 0.3), ghost=0.0,
         ),
         Sensor(
-            "laser2d", (0.1, 20), 270, (0, 0), 1, height=0.3, step=0.35, turns=2, spacing=0.03, noise=(0.01, 0.0005), drift=0.3
+            "laser2d", (0.1, 20), 270, (0, 0), 1, height=0.3, step=0.35, turns=2, spacing=0.03, noise=(0.01, 0.0005), drift=0.3,
+            jitter=(0.01, 0.1),
         ),
         Sensor(
-            "tablet", (0.3, 5.0), 62, (-24, 24), height=1.4, step=0.4, turns=10, pitch=24, swing=16, spacing=0.05,
-            noise=(0.006, 0.001), quadratic=0.001, grazing=10, dark=0.05, lost=0.02, glass=0.05, mixed=0.5, drift=0.5, tilt=0.3,
-            lowest=1.0,
+            "tablet", (0.3, 5.0), 62, (-24, 24), height=1.4, step=0.4, turns=6, pitch=34, swing=12, spacing=0.05,
+            noise=(0.010, 0.003), quadratic=0.001, grazing=10, dark=0.05, lost=0.02, glass=0.05, mixed=0.5, drift=0.5, tilt=0.3,
+            lowest=1.0, jitter=(0.012, 0.3), ghost=0.02,
         ),
     )
 }  # fmt: skip

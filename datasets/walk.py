@@ -21,7 +21,9 @@ CELL = 0.1  # m, of the floor that is walked on
 BODY = 0.2  # m, half a person's width
 BLOCKED = 40.0  # what a step through furniture costs: only taken where there is no other way
 FOREIGN = 8.0  # what a step in a room that was not asked for costs
-SIGHT = 4.0  # m; every part of a room is that close to a stop
+SIGHT = (3.5, 6.0)  # m; every part of a room is that close to a stop: thorough surveyors and hasty ones
+LONG = 8.0  # m; a room whose parts lie farther from a stop than that may be left half-way
+WALKED = (0.2, 0.8)  # share of the stops of such a room that are made
 STEP_UP = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
 
 
@@ -99,11 +101,15 @@ def fill(raster: Array, polygon: Array, value: int) -> None:
     raster[low[1] : high[1], low[0] : high[0]][inside] = value
 
 
-def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator) -> Walk:
+def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator, unfinished: float = 0.5) -> Walk:
     """A walk into all the given rooms, from one of them.
 
     The way follows one shortest-path tree, so the surveyor returns through the corridors as people do. Shut doors are opened in
     passing; rooms that were not asked for are crossed only where there is no other way.
+
+    Args:
+        unfinished: share of the long rooms (corridors, halls) in which the surveyor turns half-way, as real sessions do: every
+            room is entered, but what lies beyond is passed only on the way to another room.
 
     Raises:
         InputError: no rooms, a room that does not exist, or one that cannot be reached.
@@ -114,7 +120,11 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
     floors = draw_floors(building, CELL)
     cost, clear = _costs(building, floors, wanted)
     graph, places = _graph(building, floors, cost)
-    stops = [s for r in wanted for s in _stops(floors, clear, building.rooms[r].storey, r)]
+    sight = float(rng.uniform(*SIGHT))
+    stops = []
+    for r in wanted:
+        made = _stops(floors, clear, building.rooms[r].storey, r, sight)
+        stops += _half_way(made, floors, rng) if rng.random() < unfinished else made
     if not stops:
         raise InputError(f"{building.name}: none of the rooms has a free floor to stand on")
     start = stops[int(rng.integers(len(stops)))]
@@ -217,7 +227,7 @@ def _nearest(point: Array, storey: int, floors: Floors, cost: Array) -> int:
     return int(storey * cost[0].size + i[best] * cost.shape[2] + j[best])
 
 
-def _stops(floors: Floors, clear: Array, storey: int, room: int) -> list[int]:
+def _stops(floors: Floors, clear: Array, storey: int, room: int, sight: float) -> list[int]:
     """Nodes from which a room is seen: its freest spot, then whatever lies far from the stops so far."""
     inside = floors.room[storey] == room
     i, j = np.nonzero(inside & (clear[storey] >= min(0.35, clear[storey][inside].max(initial=0.0))))
@@ -225,10 +235,21 @@ def _stops(floors: Floors, clear: Array, storey: int, room: int) -> list[int]:
         return []
     out = [int(np.argmax(clear[storey][i, j]))]
     far = np.hypot(i - i[out[0]], j - j[out[0]]) * floors.cell
-    while far.max() > SIGHT:
+    while far.max() > sight:
         out.append(int(np.argmax(far)))
         far = np.minimum(far, np.hypot(i - i[out[-1]], j - j[out[-1]]) * floors.cell)
     return [int(storey * clear[0].size + i[k] * clear.shape[2] + j[k]) for k in out]
+
+
+def _half_way(stops: list[int], floors: Floors, rng: np.random.Generator) -> list[int]:
+    """Of the stops in a long room those next to one of them."""
+    i, j = np.unravel_index(stops, floors.room.shape)[1:] if stops else (np.empty(0), np.empty(0))
+    if not len(i) or np.hypot(i - i[0], j - j[0]).max() * floors.cell < LONG:
+        return stops
+    one = int(rng.integers(len(stops)))
+    order = np.argsort(np.hypot(i - i[one], j - j[one]), kind="stable")
+    number = max(round(float(rng.uniform(*WALKED)) * len(stops)), 1)
+    return [stops[k] for k in sorted(order[:number].tolist())]
 
 
 def _tour(start: int, stops: list[int], before: Array, reach: Array) -> tuple[Array, list[int]]:

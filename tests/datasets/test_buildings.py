@@ -84,7 +84,7 @@ def test_each_difficulty_does_what_it_says() -> None:
 
     assert share(EMPTY, "furniture") == 0 < share(Difficulty(), "furniture") < share(Difficulty(furniture=2), "furniture")
     assert share(replace(EMPTY, glass=0, windows=0), "glass") == 0 < share(replace(EMPTY, glass=1, windows=0), "glass")
-    assert share(replace(EMPTY, lamps=0, beams=0), "beam") == 0 < share(replace(EMPTY, lamps=1), "beam")
+    assert share(replace(EMPTY, lamps=0, beams=0, ducts=0), "beam") == 0 < share(replace(EMPTY, lamps=1), "beam")
     doors = {n: make_building("office", 8, 1, replace(EMPTY, lintels=n), shape="double").doors["lintel"] for n in (0, 1)}
     assert doors[0].mean() < 0.2 and doors[1].all()
     shut = make_building("office", 8, 1, replace(EMPTY, open=0, half=0), shape="double").doors
