@@ -1,8 +1,9 @@
-"""The extraction against the truth: rooms, doors, graph, storeys and seconds, on scans that nobody tuned it to.
+"""The extraction against the truth: rooms, doors, graph, storeys, consistency and seconds, on maps that nobody tuned it to.
 
-``python benchmarks/extraction.py --dev`` runs the small set for development (training buildings only), ``--set NAME ...`` others.
-Scans are kept under ``cache/scans/``; a line a case goes to ``OUT/results.jsonl``, and a case is run again only when its scan,
-the preset or the code has changed. The definitions are in `topomerge/metrics.py` and `datasets/judge.py`.
+``python benchmarks/extraction.py --dev`` runs the small set for development (training buildings only), ``--set all`` everything
+else, ``--quick`` two cases of each set. Scans are made once and kept under ``cache/scans/`` (``--fresh`` makes them again). Each
+case gives a line of ``OUT/results.jsonl``; it is run again only when its scan, the preset or the code has changed.
+``--write docs/results.md`` writes the tables there. The definitions are in `topomerge/metrics.py` and `datasets/judge.py`.
 """
 
 from __future__ import annotations
@@ -18,17 +19,22 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))
+sys.path.insert(0, str(Path(__file__).parent))
 
 import numpy as np
-from extraction_cases import SETS
-from extraction_scans import Case, load
-from extraction_tables import markdown
+from extraction_agree import keep, with_agreement
+from extraction_cases import GROUPS, chosen
+from extraction_scans import Case, Scan, load
+from extraction_tables import listing, summary, write
 
-ROOT = HERE.parent
+ROOT = Path(__file__).parent.parent
 CODE = ("topomerge/extraction", "topomerge/kernels", "topomerge/metrics.py", "topomerge/types.py", "datasets/judge.py")
 Row = dict[str, Any]
+NAN = float("nan")
+NOTHING: Row = {
+    "iou": 0.0, "mcc": 0.0, "precision": NAN, "recall": 0.0, "door_precision": NAN, "door_recall": 0.0, "edge_precision": NAN,
+    "edge_recall": 0.0, "storeys": 0.0,
+}  # fmt: skip
 
 
 def code_hash() -> str:
@@ -41,7 +47,8 @@ def key_of(case: Case, preset: str, code: str) -> str:
     """What a line of results is found by."""
     from topomerge.extraction.extract import PRESETS
 
-    inputs = [case.key, asdict(PRESETS[preset]), code]
+    varied = [case.thin, case.turn, case.shuffle, case.voxel]
+    inputs = [case.key, varied, asdict(PRESETS[preset]), code]
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:20]
 
 
@@ -49,59 +56,78 @@ def measure(case: Case, preset: str, key: str, scans: Path, data: Path | None, o
     """Run a case in this process."""
     from topomerge.datasets.example import one_thread
 
-    row: Row = {"key": key, "set": case.set, "case": case.name, "place": case.place, "sensor": case.sensor, "preset": preset}
+    row: Row = {"key": key, "preset": preset, "picture": picture, "error": ""}
     with one_thread():
         try:
             scan = load(case, scans, data)
         except Exception as error:
-            return {**row, "key": "", "error": f"no scan: {type(error).__name__}: {error}"}
+            return {**row, "key": "", "missing": f"{type(error).__name__}: {error}"}
         row["points"] = len(scan.cloud)
-        return {**row, **_scored(scan, preset, case, out, picture)}
+        return _rounded({**row, **_measured(scan, preset, case, out, picture, key)})
 
 
-def _scored(scan: Any, preset: str, case: Case, out: Path, picture: bool) -> Row:
-    from topomerge.datasets.judge import judge, said
+def _measured(scan: Scan, preset: str, case: Case, out: Path, picture: bool, key: str) -> Row:
     from topomerge.extraction.extract import extract
 
     began = perf_counter()
     try:
-        found = extract(scan.cloud, preset=preset)
+        found = extract(scan.cloud, preset=preset, voxel_size=case.voxel)
     except Exception as error:  # a map that fails altogether counts as nothing found
-        return {**NOTHING, "error": f"{type(error).__name__}: {error}", "seconds": perf_counter() - began, "picture": picture}
-    row: Row = {"seconds": round(perf_counter() - began, 3), "picture": picture, "error": ""}
+        row = {"error": f"{type(error).__name__}: {error}", "seconds": perf_counter() - began}
+        return row if scan.truth is None else {**NOTHING, **row}
+    row = {"seconds": perf_counter() - began, "found": int((~found.rooms["glimpsed"]).sum()), "doors_found": len(found.edges)}
+    row |= {"levels_found": len(found.storeys)}
+    path = out / "pictures" / f"{case.name}-{preset}.png"
+    if scan.truth is None:
+        if picture:
+            from topomerge.viz.figures import save_figure
+
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_figure(found, path)
+        return row
+    return {**row, **_judged(scan, found, f"{case.name}  {preset}", path if picture else None, out / "said" / f"{key}.npz")}
+
+
+def _judged(scan: Scan, found: Any, name: str, picture: Path | None, said_to: Path) -> Row:
+    from topomerge.datasets.judge import judge, said
+
+    assert scan.truth is not None
     columns = said(found, scan.truth)
+    keep(said_to, columns, scan.truth)
     verdict = judge(found, scan.truth, columns)
     rooms, doors, edges = verdict.rooms, verdict.doors, verdict.edges
-    row |= {"iou": rooms.iou, "mcc": rooms.mcc, "precision": rooms.precision, "recall": rooms.recall}
+    row: Row = {"iou": rooms.iou, "mcc": rooms.mcc, "precision": rooms.precision, "recall": rooms.recall}
     row |= {"door_precision": doors.precision, "door_recall": doors.recall}
     row |= {"edge_precision": edges.precision, "edge_recall": edges.recall, "storeys": float(verdict.storeys)}
-    row |= {"rooms": verdict.true_rooms, "found": verdict.found_rooms, "doors": doors.true, "doors_found": doors.found}
-    row |= {"levels": verdict.true_storeys, "levels_found": verdict.found_storeys}
-    row["worst"] = {scan.rooms[i].name: round(float(rooms.each[i]), 2) for i in np.argsort(rooms.each)[:5] if scan.truth.visited[i]}
+    row |= {"rooms": verdict.true_rooms, "doors": doors.true, "levels": verdict.true_storeys}
+    order = [i for i in np.argsort(rooms.each, kind="stable") if scan.truth.visited[i]][:4]
+    row["worst"] = {scan.rooms[i].name or str(i): round(float(rooms.each[i]), 2) for i in order}
     if picture:
         from extraction_picture import save
 
-        title = f"{case.name}  {preset}: IoU {rooms.iou:.2f}, MCC {rooms.mcc:.2f}, doors {doors.precision:.2f}/{doors.recall:.2f}"
-        title += f", rooms {verdict.found_rooms}/{verdict.true_rooms}, {row['seconds']:.1f} s"
-        save(scan, found, columns, verdict, title, out / "pictures" / f"{case.name}-{preset}.png")
+        title = f"{name}: IoU {rooms.iou:.2f}, MCC {rooms.mcc:.2f}, doors {doors.precision:.2f}/{doors.recall:.2f}"
+        save(scan, found, columns, verdict, f"{title}, rooms {verdict.found_rooms}/{verdict.true_rooms}", picture)
+    return row
+
+
+def _rounded(row: Row) -> Row:
     return {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}
 
 
-NOTHING: Row = {
-    "iou": 0.0, "mcc": 0.0, "precision": float("nan"), "recall": 0.0, "door_precision": float("nan"), "door_recall": 0.0,
-    "edge_precision": float("nan"), "edge_recall": 0.0, "storeys": 0.0,
-}  # fmt: skip
-
-
-def run(tasks: list[tuple[Any, ...]], jobs: int) -> Iterator[Row]:
-    """Rows as they come."""
+def run(tasks: list[tuple[Any, ...]], jobs: int) -> Iterator[tuple[int, Row]]:
+    """Numbers of tasks and their rows, as they come."""
     if jobs == 1:
-        for task in tasks:
-            yield measure(*task)
+        for n, task in enumerate(tasks):
+            yield n, measure(*task)
         return
     from joblib import Parallel, delayed
 
-    yield from Parallel(jobs, return_as="generator_unordered", batch_size=1, pre_dispatch=jobs)(delayed(measure)(*t) for t in tasks)
+    work = (delayed(_numbered)(n, *t) for n, t in enumerate(tasks))
+    yield from Parallel(jobs, return_as="generator_unordered", batch_size=1, pre_dispatch=jobs)(work)
+
+
+def _numbered(number: int, *task: Any) -> tuple[int, Row]:
+    return number, measure(*task)
 
 
 def known_rows(path: Path) -> dict[str, Row]:
@@ -111,53 +137,71 @@ def known_rows(path: Path) -> dict[str, Row]:
 
 
 def results(cases: list[Case], presets: list[str], settings: argparse.Namespace) -> list[Row]:
-    """A row for each case and preset, those that are missing made now."""
-    out, code = Path(settings.out), code_hash()
+    """A row for each case and preset; those that are missing are made now."""
+    out, scans, code = Path(settings.out), Path(settings.scans), code_hash()
     out.mkdir(parents=True, exist_ok=True)
     known = known_rows(out / "results.jsonl")
+    if settings.fresh:
+        known = {}
+        for key in {case.key for case in cases}:
+            (scans / f"{key}.npz").unlink(missing_ok=True)
     data = Path(os.environ["TOPOMERGE_DATA"]) if os.environ.get("TOPOMERGE_DATA") else None
-    scans = Path(settings.scans)
     wanted = [(case, preset, key_of(case, preset, code)) for case in cases for preset in presets]
     missing = [w for w in wanted if w[2] not in known or (settings.pictures and not known[w[2]].get("picture"))]
-    tasks = [(*w, scans, data, out, settings.pictures) for w in missing]
-    rows = {}
+    missing = list({w[2]: w for w in missing}.values())
     with (out / "results.jsonl").open("a", encoding="utf-8") as file:
-        for n, row in enumerate(run(tasks, settings.jobs), 1):
-            print(f"# {n}/{len(tasks)} {row['case']} {row['preset']} {_short(row)}", file=sys.stderr, flush=True)
+        for done, (n, row) in enumerate(run([(*w, scans, data, out, settings.pictures) for w in missing], settings.jobs), 1):
+            case, preset, key = missing[n]
+            print(f"# {done}/{len(missing)} {case.name} {preset} {_short(row)}", file=sys.stderr, flush=True)
+            known[key] = row
             if row["key"]:
                 file.write(json.dumps(row) + "\n")
                 file.flush()
-            rows[row["case"], row["preset"]] = row
-    found = [rows.get((case.name, preset)) or known[key] for case, preset, key in wanted]
-    return [{**row, "set": case.set, "case": case.name} for row, (case, _, _) in zip(found, wanted, strict=True)]
+    told = {"set": "", "case": "", "place": "", "sensor": "", "kind": "", "scan": "", "day": 0}
+    about = [
+        told | {"set": c.set, "case": c.name, "place": c.place, "kind": c.building, "scan": c.key, "day": c.day}
+        for c, _, _ in wanted
+    ]
+    return with_agreement([{**known[w[2]], **a, "key": w[2]} for w, a in zip(wanted, about, strict=True)], out)
 
 
 def _short(row: Row) -> str:
-    if row.get("error"):
-        return str(row["error"])[:120]
-    return f"IoU {row['iou']:.3f} MCC {row['mcc']:.3f} doors {row['door_precision']:.2f}/{row['door_recall']:.2f} {row['seconds']:.1f} s"
+    if row.get("missing") or row.get("error"):
+        return str(row.get("missing") or row["error"])[:160]
+    if "iou" not in row:
+        return f"{row['found']} rooms, {row['seconds']:.1f} s"
+    doors = f"{row['door_precision']:.2f}/{row['door_recall']:.2f}"
+    return f"IoU {row['iou']:.3f} MCC {row['mcc']:.3f} doors {doors} {row['seconds']:.1f} s"
 
 
 def arguments(words: list[str] | None) -> argparse.Namespace:
+    """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--set", nargs="+", choices=sorted(SETS), default=[], help="sets of cases")
-    parser.add_argument("--dev", action="store_true", help="the set for development")
+    parser.add_argument("--set", nargs="+", choices=[*GROUPS, "all"], default=[], help="groups of cases; all: all but dev")
+    parser.add_argument("--dev", action="store_true", help="the set for development (the default)")
     parser.add_argument("--preset", default="default", help="one or more presets, with commas between them")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--limit", type=int, help="so many cases of each set")
+    parser.add_argument("--quick", action="store_true", help="two cases of each set")
     parser.add_argument("--only", default="", help="cases whose name contains this")
     parser.add_argument("--out", default=str(ROOT / "cache" / "extraction"))
     parser.add_argument("--scans", default=str(ROOT / "cache" / "scans"))
-    parser.add_argument("--pictures", action="store_true")
+    parser.add_argument("--pictures", action="store_true", help="a picture of each case, into OUT/pictures")
+    parser.add_argument("--fresh", action="store_true", help="make the scans again: the simulator has changed")
+    parser.add_argument("--write", type=Path, help="file whose section between the marks of the extraction is replaced")
     return parser.parse_args(words)
 
 
 def main(words: list[str] | None = None) -> int:
     settings = arguments(words)
-    names = settings.set or ["dev"]
-    cases = [c for name in names for c in SETS[name]()[: settings.limit] if settings.only in c.name]
+    names = [*settings.set, *(["dev"] if settings.dev or not settings.set else [])]
+    cases = [c for c in chosen(names, 2 if settings.quick else settings.limit) if settings.only in c.name]
     rows = results(cases, settings.preset.split(","), settings)
-    print(markdown(rows))
+    print(listing(rows), summary(rows), sep="\n\n")
+    if settings.write:
+        write(
+            settings.write, rows, " ".join(["python benchmarks/extraction.py", *(words if words is not None else sys.argv[1:])])
+        )
     return 0
 
 

@@ -10,15 +10,16 @@ Drift that the simulator put into a scan is taken out of the map first: a map ca
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from topomerge.datasets.building import Building
 from topomerge.datasets.walk import fill
 
 from topomerge.metrics import SAME, RoomScores, Scores, score_doors, score_edges, score_rooms, storeys_right
-from topomerge.types import Array, TopometricMap, TrueRoom
+from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
 
 CELL = 0.1  # m, of the raster
 SPREAD = 0.3  # m
@@ -45,6 +46,7 @@ class Truth:
         matrix: (4, 4) the scan's frame into the building's.
         anchors: (A, 3) places in the scan's frame.
         drift: (A, 3) what to add to a place there to undo the drift, in the scan's frame.
+        complete: () bool, are all rooms listed? If not, what the map finds elsewhere is neither right nor wrong.
     """
 
     raster: Array
@@ -57,6 +59,7 @@ class Truth:
     matrix: Array
     anchors: Array
     drift: Array
+    complete: Array
 
     def place(self, points: Array) -> Array:
         """(n, 3) points of the scan in the frame of the building, without the drift."""
@@ -71,6 +74,46 @@ class Truth:
         return ij, ((ij >= 0) & (ij < self.raster.shape[1:])).all(axis=1)
 
 
+def truth_of(
+    building: Building,
+    visited: Array,
+    points: Array,
+    anchors: Array | None = None,
+    drift: Array | None = None,
+    complete: bool = True,
+) -> Truth:
+    """What is true about a scan that is in the frame of its building (`in_frame` for another one).
+
+    Args:
+        visited: (T,) bool.
+        points: (n, 3) of the scan.
+        anchors, drift: as of `Truth`; None: the scan has no drift.
+    """
+    floors, none = building.storeys["floor"], np.zeros((0, 3))
+    raster, origin = draw_rooms(building.rooms, floors)
+    truth = Truth(
+        raster=raster,
+        origin=origin,
+        visited=visited,
+        floors=floors,
+        height=building.storeys["ceiling"] - floors,
+        doors=np.column_stack([building.doors["rooms"], building.doors["centre"]]).astype(float).reshape(-1, 5),
+        edges=building.edges(),
+        matrix=np.eye(4),
+        anchors=none if anchors is None else anchors,
+        drift=none if drift is None else drift,
+        complete=np.array(complete),
+    )
+    return replace(truth, raster=_judged(truth, truth.place(points)))
+
+
+def in_frame(truth: Truth, frame: Sim3) -> Truth:
+    """The truth about a scan after it was moved by a frame."""
+    turn = Sim3(frame.yaw).matrix[:3, :3] * frame.scale
+    matrix = truth.matrix @ frame.inverse().matrix
+    return replace(truth, matrix=matrix, anchors=frame.apply(truth.anchors), drift=truth.drift @ turn.T)
+
+
 def draw_rooms(rooms: tuple[TrueRoom, ...], floors: Array) -> tuple[Array, Array]:
     """(L, rows, columns) int32 raster of the rooms' floors, -1 elsewhere, and its origin (m)."""
     corners = np.concatenate([r.polygon for r in rooms])
@@ -83,22 +126,22 @@ def draw_rooms(rooms: tuple[TrueRoom, ...], floors: Array) -> tuple[Array, Array
     return raster, origin
 
 
-def judged(raster: Array, origin: Array, floors: Array, height: Array, points: Array) -> Array:
+def _judged(truth: Truth, places: Array) -> Array:
     """The raster without the columns that are not judged: walls, and what the scan has not seen.
 
     Args:
-        points: (n, 3) of the scan, in the building's frame, without drift.
+        places: (n, 3) of the scan, in the building's frame.
     """
-    out = raster.copy()
-    ij = np.floor((points[:, 1::-1] - origin[::-1]) / CELL).astype(np.int64)
-    inside = ((ij >= 0) & (ij < raster.shape[1:])).all(axis=1)
-    for k, floor in enumerate(floors):
-        level = inside & (points[:, 2] > floor - 0.3) & (points[:, 2] < floor + height[k] + 0.3)
-        seen = np.zeros(raster.shape[1:], bool)
+    out = truth.raster.copy()
+    ij, inside = truth.columns(places)
+    for k, floor in enumerate(truth.floors):
+        level = inside & (places[:, 2] > floor - 0.3) & (places[:, 2] < floor + truth.height[k] + 0.3)
+        seen = np.zeros(out.shape[1:], bool)
         seen[ij[level, 0], ij[level, 1]] = True
         near = ndimage.distance_transform_edt(~seen) * CELL <= NEAR if seen.any() else seen
-        walls = (raster[k] < 0) & (ndimage.distance_transform_edt(raster[k] < 0) * CELL <= WALLS)
-        out[k][walls | ((raster[k] >= 0) & ~near)] = NOWHERE
+        known = out[k] >= 0
+        walls = ~known & (ndimage.distance_transform_edt(~known) * CELL <= WALLS)
+        out[k][walls | (known & ~near) | (~known & ~truth.complete)] = NOWHERE
     return out
 
 
@@ -164,8 +207,8 @@ class Verdict:
 def judge(map: TopometricMap, truth: Truth, columns: Array | None = None) -> Verdict:
     """Score a map.
 
-    Expected are the visited rooms of which the scan saw `LEAST`. Rooms that the map calls glimpsed are not held against it,
-    and no more are doors that lead to one, or that are where a true door leads out of the visited rooms.
+    Expected are the visited rooms of which the scan saw `LEAST`. Rooms that the map calls glimpsed and that lie mostly outside of
+    those are not held against it, and no more are doors that lead to one, or that are where a true door leads out of the visited rooms.
 
     Args:
         columns: `said(map, truth)` where it is known already.
@@ -176,7 +219,11 @@ def judge(map: TopometricMap, truth: Truth, columns: Array | None = None) -> Ver
     true_count = len(truth.visited)
     seen = np.bincount(true[true >= 0], minlength=true_count) * CELL**2
     expected = truth.visited & (seen >= LEAST)
-    counted = ~map.rooms["glimpsed"]
+    own = np.bincount(labels[(labels >= 0) & np.append(expected, False)[true]], minlength=len(map.rooms))
+    all_of = np.bincount(labels[labels >= 0], minlength=len(map.rooms))
+    counted = ~map.rooms["glimpsed"] | (2 * own > all_of)
+    if not truth.complete:
+        counted &= all_of * CELL**2 >= LEAST
     rooms = score_rooms(np.where(true >= 0, true, -1), labels, true_count, counted, expected)
     ends = truth.doors[:, :2].astype(np.int64)
     wanted = ((ends >= 0) & np.append(expected, False)[ends]).all(axis=1)
