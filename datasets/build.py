@@ -1,8 +1,10 @@
 """Build a cached set of extracted pairs: ``python -m topomerge.datasets.build data=train_small``.
 
-The cache holds `pairs/<hash of the inputs>.npz` and a manifest `<name>.jsonl`. A build that was killed goes on where it was; the
-result has the same bytes. Work is shared out by joblib: over processes of this machine (``jobs=2``), or over a Dask cluster
-(``+cluster=tcp://host:8786``), whose workers must see the cache under the same path.
+The cache holds `pairs/<hash of the inputs>.npz`, or `.refused` with the reason, and a manifest `<name>.jsonl`. A build that
+was killed goes on where it was; the result has the same bytes. Work is shared out by joblib: over processes of this machine
+(``jobs=2``), or over a Dask cluster (``+cluster=tcp://host:8786``), whose workers must see the cache under the same path.
+Machines that share nothing make a part each (``part=[1,2]`` and ``part=[2,2]``); with the files of all parts in one cache, the
+build without a part writes the whole manifest.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from topomerge.datasets.example import Row, about, make_file
+from topomerge.datasets.example import Row, about, make_file, refusal
 from topomerge.datasets.plan import Plan
 from topomerge.datasets.recipe import Item, Recipe, check, draw_items, library, plans_of
 
@@ -34,12 +36,13 @@ Work = Callable[[Item, Plans, str], Row]
 
 @dataclass
 class Build:
-    """Settings of a build."""
+    """Settings of a build; `part` [k, n] makes every n-th pair from the k-th on."""
 
     data: Recipe = field(default_factory=Recipe)
     cache: str = "cache"
     jobs: int = 1
     cluster: str | None = None
+    part: list[int] = field(default_factory=lambda: [1, 1])
 
 
 @dataclass(frozen=True)
@@ -65,28 +68,34 @@ def build(settings: Build, say: Callable[[str], None] = lambda text: None, every
     check(settings.data)
     if settings.jobs < 1:
         raise InputError(f"jobs must be 1 or more, not {settings.jobs}")
+    if len(settings.part) != 2 or not 1 <= settings.part[0] <= settings.part[1]:
+        raise InputError(f"part must be [k, n] with 1 <= k <= n, not {settings.part}")
     folder = Path(settings.cache).resolve() / "pairs"
     folder.mkdir(parents=True, exist_ok=True)
     _tidy(folder)
     say("reading plans")
     plans = library(settings.data)
-    items = {item.name: item for item in draw_items(settings.data, plans)}
+    first, step = settings.part
+    items = {item.name: item for item in draw_items(settings.data, plans)[first - 1 :: step]}
     known = {name: told for name in items if (told := _kept(folder / f"{name}.npz")) is not None}
-    tasks = [(items[n], list(plans_of(items[n], plans)), str(folder)) for n in items if n not in known]
-    say(f"{len(known)} of {len(items)} pairs are in the cache")
+    refusals = {n: reason for n in items if n not in known and (reason := refusal(folder, n))}
+    tasks = [(items[n], list(plans_of(items[n], plans)), str(folder)) for n in items if n not in known and n not in refusals]
+    tasks.sort(key=lambda task: -task[0].rooms)  # the longest first, so that all workers end at about the same time
+    say(f"{len(known)} of {len(items)} pairs are in the cache, {len(refusals)} are known to be refused")
     rows = _run(tasks, settings, Progress(len(tasks), say, every))
+    made = sum(not row.reason for row in rows)
     known |= {row.name: about(folder / f"{row.name}.npz") for row in rows if not row.reason}
     manifest = folder.parent / f"{settings.data.name}.jsonl"
     with replacing(manifest) as beside:
         lines = [json.dumps(known[name], sort_keys=True, ensure_ascii=False) for name in sorted(known)]
         beside.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
-    refused = Counter(_kind(row.reason) for row in rows if row.reason)
+    refused = Counter(_kind(reason) for reason in (*refusals.values(), *(row.reason for row in rows)) if reason)
     seconds = sum(row.seconds for row in rows if not row.reason)
-    return Report(manifest, len(known), len(rows) - refused.total(), seconds, dict(refused.most_common()))
+    return Report(manifest, len(known), made, seconds, dict(refused.most_common()))
 
 
 def _tidy(folder: Path) -> None:
-    for path in folder.glob(".*.npz"):
+    for path in (p for ending in ("npz", "refused") for p in folder.glob(f".*.{ending}")):
         if time.time() - path.stat().st_mtime > OLD:
             path.unlink(missing_ok=True)
 

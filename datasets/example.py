@@ -25,6 +25,7 @@ from topomerge.embedding.graph import from_arrays, graph_arrays
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io import archive
+from topomerge.io.atomic import replacing
 from topomerge.io.listing import plain
 from topomerge.types import Array
 
@@ -34,6 +35,10 @@ if TYPE_CHECKING:
 
 FEWEST = 2  # rooms that must come out of each map
 LONGEST = 600.0  # s a pair: a hundred times what is usual, so that no slow machine makes another set
+
+
+class TooLongError(InputError):
+    """An item took too long; on another machine it may not."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,7 @@ class Example:
 
 
 def make_file(item: Item, plans: Sequence[Sequence[Plan]], folder: str) -> Row:
-    """Make an item's file in a folder. It never raises: what went wrong is in the row.
+    """Make an item's file in a folder, or one that tells why there is none. It never raises: what went wrong is in the row.
 
     One thread is used, so that as many workers as cores don't fight for them.
     """
@@ -76,7 +81,16 @@ def make_file(item: Item, plans: Sequence[Sequence[Plan]], folder: str) -> Row:
     except Exception as error:  # one bad item must not end a build
         reason = " ".join(str(error).split())[:200]
         reason = reason if isinstance(error, InputError) else f"{type(error).__name__}: {reason}"
+        if isinstance(error, InputError) and not isinstance(error, TooLongError):
+            with replacing(Path(folder) / f"{item.name}.refused") as beside:  # the same inputs would be refused again
+                beside.write_text(reason + "\n", encoding="utf-8")
     return Row(item.name, reason, time.perf_counter() - began)
+
+
+def refusal(folder: Path, name: str) -> str:
+    """Why an item was refused before; empty where it was not."""
+    path = folder / f"{name}.refused"
+    return path.read_text(encoding="utf-8").strip() if path.is_file() else ""
 
 
 @contextmanager
@@ -102,7 +116,7 @@ def time_limit(seconds: float) -> Iterator[None]:
         return
 
     def stop(*_: object) -> NoReturn:
-        raise InputError(f"takes longer than {seconds:g} s")
+        raise TooLongError(f"takes longer than {seconds:g} s")
 
     before = signal.signal(signal.SIGALRM, stop)
     signal.setitimer(signal.ITIMER_REAL, seconds)
