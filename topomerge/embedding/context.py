@@ -1,0 +1,60 @@
+"""k-step context: what lies around a room, appended to what it is (method, section 2; finished thesis).
+
+Averaging the neighbours' descriptors is cheaper but blurs: prototypes lost recall by it, so joining geometry is the default.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topomerge.embedding.room_cells import Descriptor, joined, neighbours
+from topomerge.errors import InputError
+from topomerge.types import Array, TopometricMap
+
+HOWS = ("join", "mean")
+
+
+def with_context(descriptor: Descriptor, k: int = 1, how: str = "join") -> Descriptor:
+    """A descriptor of (k + 1) D columns: the room's own, and that of its surroundings within 1, ..., k steps.
+
+    Args:
+        descriptor: of D columns.
+        k: steps over doors and stairs; 0 gives the descriptor back.
+        how: ``"join"``: the geometry of all rooms within reach is joined and described as one room (thesis); ``"mean"``: the
+            mean of their descriptors.
+
+    Raises:
+        InputError: k is no whole number of 0 or more, or `how` is unknown.
+    """
+    if not isinstance(k, int) or isinstance(k, bool) or k < 0:
+        raise InputError(f"steps of context must be a whole number, 0 or more, not {k}")
+    if how not in HOWS:
+        raise InputError(f"context {how!r}: {', '.join(HOWS)} are possible")
+    if k == 0:
+        return descriptor
+
+    def describe(map: TopometricMap) -> Array:
+        own = descriptor(map)
+        parts = [own]
+        for step in range(1, k + 1):
+            around = neighbours(map, step)
+            parts.append(_joined(descriptor, map, around, own) if how == "join" else _mean(own, around))
+        return np.concatenate(parts, axis=1)
+
+    return describe
+
+
+def _mean(own: Array, around: list[Array]) -> Array:
+    return np.stack([own[rooms].mean(axis=0) for rooms in around]) if len(own) else own
+
+
+def _joined(descriptor: Descriptor, map: TopometricMap, around: list[Array], own: Array) -> Array:
+    """Descriptor of each union; rooms with the same surroundings share the work."""
+    known: dict[tuple[int, ...], Array] = {}
+    out = np.zeros_like(own)
+    for room, rooms in enumerate(around):
+        key = tuple(rooms.tolist())
+        if key not in known:
+            known[key] = descriptor(joined(map, rooms))[0] if len(key) > 1 else own[room]
+        out[room] = known[key]
+    return out

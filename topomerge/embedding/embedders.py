@@ -1,0 +1,41 @@
+"""Embedders by name: what `match`, `merge` and the command line take."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from topomerge.embedding.context import with_context
+from topomerge.embedding.engineered import engineered
+from topomerge.embedding.feather import feather
+from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.shapedna import shapedna
+from topomerge.errors import InputError
+
+EMBEDDERS: dict[str, Callable[..., Descriptor]] = {"engineered": engineered, "shapedna": shapedna, "feather": feather}
+
+
+def embedder(name: str | Descriptor, k: int = 0, context: str = "join", **options: Any) -> Descriptor:
+    """A callable map -> (R, D) float64.
+
+    Args:
+        name: ``"engineered"``, ``"shapedna"``, ``"feather"``, or a descriptor.
+        k: steps of context (see `with_context`).
+        context: ``"join"`` or ``"mean"``.
+        options: those of the function of that name.
+
+    Raises:
+        InputError: unknown name or option.
+    """
+    if callable(name):
+        if options:
+            raise InputError(f"options {', '.join(options)} are for embedders that are named, not for a callable")
+        return with_context(name, k, context)
+    if name not in EMBEDDERS:
+        raise InputError(f"unknown descriptor {name!r}: {', '.join(EMBEDDERS)} are possible")
+    make = EMBEDDERS[name]
+    unknown = set(options) - set(inspect.signature(make).parameters)
+    if unknown:
+        raise InputError(f"{name} has no option {', '.join(sorted(unknown))}: {', '.join(inspect.signature(make).parameters)}")
+    return with_context(make(**options), k, context)

@@ -1,0 +1,68 @@
+"""Voronoi cells of points in their tangent planes: the weights of a Laplacian on a point cloud."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+CORNERS = 40  # of a cell, at most: each neighbour adds one
+
+
+@njit(cache=True)
+def _clip(corners, owner, count, x, y, half, name):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Keep of a convex polygon what has (x, y) . p <= half; the new side belongs to `name`. Gives the number of corners."""
+    cut, cut_owner = np.empty((CORNERS, 2)), np.empty(CORNERS, np.int64)
+    m = 0
+    for c in range(count):
+        d = (c + 1) % count
+        here = corners[c, 0] * x + corners[c, 1] * y - half
+        there = corners[d, 0] * x + corners[d, 1] * y - half
+        if here <= 0:
+            cut[m, 0], cut[m, 1], cut_owner[m] = corners[c, 0], corners[c, 1], owner[c]
+            m += 1
+        if (here <= 0) != (there <= 0):
+            t = here / (here - there)
+            for a in range(2):
+                cut[m, a] = corners[c, a] + t * (corners[d, a] - corners[c, a])
+            cut_owner[m] = name if here <= 0 else owner[c]
+            m += 1
+    for c in range(m):
+        corners[c, 0], corners[c, 1], owner[c] = cut[c, 0], cut[c, 1], cut_owner[c]
+    return m
+
+
+@njit(cache=True, parallel=True)
+def voronoi_weights(flat, spacing):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Area of each point's cell, and the weight of each of its neighbours: length of the common side over the distance.
+
+    Args:
+        flat: (n, k, 2) float64 neighbours in the tangent plane of each point, the point itself being the origin.
+        spacing: (n,) usual distance of neighbours. A cell that has none on one side ends there after half of it.
+
+    Returns:
+        area (n,), weight (n, k) float64; a point's weights are half the sum of two cotangents where the cells tile a surface.
+    """
+    n, k = flat.shape[:2]
+    area, weight = np.zeros(n), np.zeros((n, k))
+    for i in prange(n):
+        corners, owner = np.empty((CORNERS, 2)), np.empty(CORNERS, np.int64)
+        r = 2 * spacing[i]
+        for c in range(4):  # a square, counter-clockwise; the owner is that of the side that begins at a corner
+            corners[c, 0], corners[c, 1], owner[c] = r if c in (1, 2) else -r, r if c > 1 else -r, -1
+        count = 4
+        for j in range(k):
+            half = 0.5 * (flat[i, j, 0] ** 2 + flat[i, j, 1] ** 2)
+            if half > 1e-12:
+                count = _clip(corners, owner, count, flat[i, j, 0], flat[i, j, 1], half, j)
+        away_x, away_y = -flat[i, :, 0].sum(), -flat[i, :, 1].sum()
+        length = np.sqrt(away_x**2 + away_y**2)
+        if length > 1e-9 and (owner[:count] < 0).any():
+            count = _clip(corners, owner, count, away_x / length, away_y / length, 0.5 * spacing[i], -1)
+        for c in range(count):
+            d = (c + 1) % count
+            area[i] += 0.5 * (corners[c, 0] * corners[d, 1] - corners[d, 0] * corners[c, 1])
+            j = owner[c]
+            if j >= 0:
+                side = np.sqrt((corners[d, 0] - corners[c, 0]) ** 2 + (corners[d, 1] - corners[c, 1]) ** 2)
+                weight[i, j] += side / np.sqrt(flat[i, j, 0] ** 2 + flat[i, j, 1] ** 2)
+    return area, weight
