@@ -112,11 +112,10 @@ def plans() -> list[Case]:
     campus = ("school/Franch1", "school/Sabadell1", "school/Sabadell2", "school/Sabadell3")
     sensors = ("tls", "lidar", "depth", "tls")
     out = [Case("flats (real plans)", "r2v", name, s, TEST + i) for i, (name, s) in enumerate(zip(r2v, sensors, strict=True))]
-    out += [
+    return out + [
         Case("schools (real plans)", "campus", name, s, TEST + i, rooms=15)
         for i, (name, s) in enumerate(zip(campus, sensors, strict=True))
     ]
-    return [*out, Case("hotel (real plan)", "rmf", "rmf_demos_maps/maps/hotel/L1", "tls", TEST, rooms=15)]
 
 
 def grids() -> list[Case]:

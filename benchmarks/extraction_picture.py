@@ -7,6 +7,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import shapely
 from extraction_scans import Scan
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -49,7 +50,7 @@ def _storey(axes: Any, scan: Scan, map: TopometricMap, labels: Array, k: int, ve
     z = points[:, 2] - truth.floors[k]
     ij, inside = truth.columns(points[(z > 0.4) & (z < 1.9)])
     dark = np.bincount(ij[inside, 0] * labels.shape[1] + ij[inside, 1], minlength=labels.size).reshape(labels.shape)
-    image[dark > max(np.percentile(dark[dark > 0], 60), 2) if (dark > 0).any() else dark > 0] //= 2
+    image[dark > (min(np.percentile(dark[dark > 0], 60), dark.max() - 1) if dark.any() else 0)] //= 2
     axes.imshow(image, origin="lower", extent=extent, interpolation="nearest")
     for i, room in enumerate(scan.rooms):
         if room.storey == k:
@@ -57,7 +58,8 @@ def _storey(axes: Any, scan: Scan, map: TopometricMap, labels: Array, k: int, ve
             ring = np.concatenate([room.polygon, room.polygon[:1]])
             axes.plot(*ring.T, color="#c00000" if wanted else "#999999", linewidth=1.0, linestyle="-" if wanted else ":")
             if wanted:
-                value, at = verdict.rooms.each[i], room.polygon.mean(axis=0)
+                value = verdict.rooms.each[i]
+                at = shapely.get_coordinates(shapely.Polygon(room.polygon).buffer(0).point_on_surface())[0]
                 axes.text(*at, f"{value:.2f}", fontsize=6, ha="center", color="red" if value < 0.5 else "black", clip_on=True)
     edges = map.edges
     at = truth.place(edges["centre"])

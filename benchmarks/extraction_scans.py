@@ -15,7 +15,7 @@ from topomerge.datasets.scanner import moved
 from topomerge.io.atomic import replacing
 from topomerge.types import Array, PointCloud, Sim3, TrueRoom, VoxelGrid
 
-FORMAT = 2  # raise it when the same case gives other bytes
+FORMAT = 3  # raise it when the same case gives other bytes
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,8 @@ class Case:
     @property
     def name(self) -> str:
         """For people and file names."""
-        plan = "_".join(Path(self.building).parts[-2:])[-24:]
+        *above, plan = Path(self.building).parts
+        plan = plan if self.source != "r2v" else f"{above[-1][-6:]}_{plan}"
         words = [self.set, self.source if self.source != "procedural" else "", plan, self.seed or "", self.sensor, self.spoil]
         words += [f"{k}{getattr(self, k):g}" for k in ("day", "thin", "turn", "shuffle") if getattr(self, k)]
         words += [f"voxel{self.voxel:g}"] if self.voxel != 0.1 else []

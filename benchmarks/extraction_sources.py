@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -28,6 +29,7 @@ ANCHOR = 0.5  # m between places whose drift is kept
 COMMON = 0.6  # share of the rooms that the two sessions of a pair have in common
 ADRIFT = 1.5  # degrees about every 15 m: three times a hand-held camera's
 IPA, IPA_CELL = "grids_ipa_room_segmentation", 0.05
+IPA_ABOUT = "image: {image}\nresolution: {cell}\norigin: [0, 0, 0]\noccupied_thresh: 0.0197\nfree_thresh: 0.0197\nnegate: 0\n"
 GDC = "utexas_gdc_floors/maps/real"
 
 
@@ -42,10 +44,13 @@ def make(case: Case, data: Path | None) -> Scan:
     if data is None:
         raise InputError("set TOPOMERGE_DATA to the folder of the real data")
     if case.source == "ipa":
-        return raised(case, data / IPA / f"{case.building}.png", _ipa_plan(case.building, data), IPA_CELL)
+        with tempfile.TemporaryDirectory() as folder:  # only white is free in these images: walls may be light grey
+            about = Path(folder) / f"{case.building}.yaml"
+            about.write_text(IPA_ABOUT.format(image=(data / IPA / f"{case.building}.png").resolve(), cell=IPA_CELL))
+            return raised(case, about, _ipa_plan(case.building, data))
     if case.source == "gdc":
         folder = data / GDC / case.building
-        return raised(case, folder / f"{case.building}.yaml", folder / "locations.yaml", None)
+        return raised(case, folder / f"{case.building}.yaml", folder / "locations.yaml")
     if case.source == "file":
         path = data / case.building
         grid = path.suffix == ".png"
@@ -78,16 +83,16 @@ def plan_of(source: str, name: str, data: Path) -> Any:
     if source == "r2v":
         return read_plans(f"{folder / 'r2v_annotations.tar.xz'}::{name}")[0]
     if source == "campus":
-        return read_plans(folder / f"{name}.xml")[0]
+        return read_plans(next(folder.glob(f"{name}.xml"), folder / f"{name}_updated.xml"))[0]
     return next(plan for n, plan in iter_plans(folder) if n == name and not isinstance(plan, Refusal))
 
 
-def raised(case: Case, grid: Path, plan: Path, resolution: float | None) -> Scan:
+def raised(case: Case, grid: Path, plan: Path) -> Scan:
     """A robot's grid with its walls raised, and the rooms and doors of its plan. GDC's list of rooms is not complete."""
     from topomerge.datasets.erect import erect
     from topomerge.datasets.floorplans import read_plans
 
-    cloud = read_points(grid, resolution=resolution)
+    cloud = read_points(grid)
     building = erect(read_plans(plan), name=case.building, kind=case.source)
     every = np.ones(len(building.rooms), bool)
     points = cloud.points.astype(np.float64) + cloud.shift

@@ -56,15 +56,15 @@ def report(rows: list[Row], command: str) -> str:
 
 AGREEMENT = (
     "Agreement of two maps of one place: mean IoU of the rooms assigned to each other one to one, over the rooms of the map that "
-    "has more, on the floor that both saw. Two sessions have other sensors, other walks with 60 % of the rooms in common, and what "
-    "moved between them; the others are compared with the map of the same scan at 4 cm spacing in cells of 10 cm."
+    "has more, on the floor that both saw. Two sessions have other sensors, other walks with 60 % of the rooms in common, and "
+    "things moved between them; the others are compared with the map of the same scan at 4 cm spacing in cells of 10 cm."
 )
 
 
 def _about(rows: list[Row]) -> str:
     cases, places = len({r["case"] for r in rows}), len({r["place"] for r in rows})
     return (
-        f"{cases} maps of {places} buildings. Means over the maps of a set; in brackets 95 % intervals, drawn over its buildings. "
+        f"{cases} maps of {places} buildings. Means over the maps of a set; in brackets 95 % intervals over its buildings. "
         "P and R: precision and recall (rooms at IoU 0.5, doors within 0.5 m, pairs of rooms that are joined). Storeys: share of "
         "the maps with as many as there are, each within 0.5 m. Seconds on one core that other programs used, too."
     )

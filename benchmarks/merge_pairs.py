@@ -20,7 +20,6 @@ from topomerge.datasets.example import _first_pair, one_thread, time_limit
 from topomerge.datasets.pairs import Pair
 from topomerge.datasets.recipe import Item, Library, Recipe, draw_items, library, plans_of
 
-from topomerge.errors import InputError
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import archive
 from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
@@ -154,16 +153,17 @@ def sim3_of(matrix: Array) -> Sim3:
     return Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), (x, y, z), scale)
 
 
-def load(path: str | Path) -> GridPair:
-    """A cached pair."""
+def load(path: str | Path, mean: bool = False) -> GridPair:
+    """A cached pair; `mean`: with the middles of the points of each cell, which maps that were extracted do not have."""
     data = archive.read(path, "cached pair")
     told = json.loads(data["about"].tobytes())
     grids, free = [], []
     for side in "ab":
         shape = tuple(int(s) for s in data[f"{side}.shape"])
         cells, origin = data[f"{side}.cells"].astype(np.int32), data[f"{side}.origin"]
-        mean = origin + (cells + (data[f"{side}.mean"] + 0.5) / 256) * EDGE
-        grids.append(VoxelGrid(cells, origin, EDGE, shape, {"mean": mean.astype(np.float32)}))  # type: ignore[arg-type]
+        middle = origin + (cells + (data[f"{side}.mean"] + 0.5) / 256) * EDGE
+        known = {"mean": middle.astype(np.float32)} if mean else {}
+        grids.append(VoxelGrid(cells, origin, EDGE, shape, known))  # type: ignore[arg-type]
         empty = data.get(f"{side}.free")
         free.append(None if empty is None else VoxelGrid(empty.astype(np.int32), origin, EDGE, shape))  # type: ignore[arg-type]
     truth = None if np.isnan(data["truth"]).any() else sim3_of(data["truth"])
@@ -184,8 +184,8 @@ def make(split: str, pairs: int, seed: int = 0, cache: str = "cache/merge") -> I
                     told = {"difficulty": dict(item.difficulty), "source": item.source, "item": i}
                     archive.write(arrays_of(_first_pair(item, plans_of(item, plans)), told), path)
                 print(f"{path.name} {time.perf_counter() - began:.1f} s", flush=True)
-            except InputError as error:
-                refused.write_text(str(error))
+            except Exception as error:  # one bad item never ends a run
+                refused.write_text(f"{type(error).__name__}: {error}")
         if path.exists():
             yield path
 
