@@ -25,8 +25,9 @@ GAP = 1.9  # m of empty height between a floor and its ceiling
 LEAST_AREA = 3.0  # m2 of a storey
 LEAST_SHARE = 0.08  # of the largest storey
 SLICE = 0.6  # m; a map that is not higher is a slice
-NOMINAL = (2.7, 0.3, 1.25)  # m: floor to ceiling; a slice's height above the floor; and the height at which slices are drawn
+NOMINAL = (2.7, 0.3, 1.375)  # m: floor to ceiling; a slice's height above the floor; and the height at which slices are drawn
 FLAT = 1.5  # m, radius over which the floor may rise and fall
+SHORT = 1.3  # m; what a slice shows of less than this is furniture
 UNIT = np.uint32(1)
 
 
@@ -41,6 +42,7 @@ class Plan:
         floor, ceiling: heights, m; nan where not seen.
         bits: (H, W) uint32, occupied bands of heights (`BAND`, from `LOW`) above the floor.
         bands: uint32, the bands that the map observed at all.
+        height: (H, W) float32, m, the ceiling's height above the floor, or above 0 where no floor was seen; nan without ceiling.
         sliced: seen at one height only: `floor` is a guess.
     """
 
@@ -53,6 +55,7 @@ class Plan:
     ceiling: float
     bits: Array
     bands: int
+    height: Array
     sliced: bool = False
 
     @property
@@ -95,15 +98,18 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
     if free is not None and len(free):
         at = free.centroids()
         columns = np.floor(at[:, :2] / cell).astype(np.int64) - low
-        empty = (np.ascontiguousarray(columns[:, 0]), np.ascontiguousarray(columns[:, 1]), at[:, 2])
-    found = []
+        level = np.full(len(at), np.median(points[:, 2])) if _is_slice(grid) else at[:, 2]
+        empty = (np.ascontiguousarray(columns[:, 0]), np.ascontiguousarray(columns[:, 1]), level)
+    sliced, found = _is_slice(grid), []
+    z = np.full(len(points), np.median(points[:, 2])) if sliced else points[:, 2]
     for floor, ceiling, base in levels(grid):
         heights = np.full(shape, base)
-        if np.isfinite(floor):
-            heights = _local_floor(ix, iy, points[:, 2], heights)
-        occupied = column_bits(ix, iy, points[:, 2], heights, LOW, BAND)
+        if np.isfinite(floor) and not sliced:
+            heights = _local_floor(ix, iy, z, heights)
+        occupied = column_bits(ix, iy, z, heights, LOW, BAND)
         crossed = column_bits(*empty, heights, LOW, BAND) if empty else np.zeros(shape, np.uint32)
-        found.append(_plan(occupied, crossed, low * cell, cell, floor, ceiling, _is_slice(grid)))
+        height = _ceiling(ix, iy, z, base, ceiling, shape) - (heights if np.isfinite(floor) else 0.0)
+        found.append(_plan(occupied, crossed, low * cell, cell, floor, ceiling, height.astype(np.float32), sliced))
     return found
 
 
@@ -125,7 +131,7 @@ def levels(grid: VoxelGrid) -> list[tuple[float, float, float]]:
     """
     middle = grid.origin[2] + (grid.cells[:, 2].astype(np.float64) + 0.5) * grid.edge
     if _is_slice(grid):
-        z = float(np.median(middle))
+        z = float(np.median(cell_middles(grid)[:, 2]))
         return [(z - NOMINAL[1], np.nan, z - NOMINAL[2])]
     bottom, top = _gaps(grid)
     columns = len(np.unique(grid.cells[:, 0].astype(np.int64) * grid.shape[1] + grid.cells[:, 1]))
@@ -178,7 +184,18 @@ def _local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Array:
     return heights + np.where(many > 0.02, total / np.maximum(many, 1e-6), 0.0)
 
 
-def _plan(occupied: Array, crossed: Array, origin: Array, cell: float, floor: float, ceiling: float, sliced: bool) -> Plan:
+def _ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: float, shape: tuple[int, ...]) -> Array:
+    """(H, W) m: the highest cell of each column that may be this storey's ceiling; nan where none is."""
+    high = np.full(shape, -np.inf)
+    if np.isfinite(ceiling):
+        near = (z > base + 2.0) & (z < ceiling + 1.0)
+        np.maximum.at(high, (ix[near], iy[near]), z[near])
+    return np.where(np.isfinite(high), high, np.nan)
+
+
+def _plan(
+    occupied: Array, crossed: Array, origin: Array, cell: float, floor: float, ceiling: float, height: Array, sliced: bool
+) -> Plan:
     bands = _observed(occupied)
     body, walls = _mask(*BODY), _mask(*WALL) & bands
     need = max(int(np.ceil(FILLED * int(walls).bit_count())), 1)
@@ -188,8 +205,19 @@ def _plan(occupied: Array, crossed: Array, origin: Array, cell: float, floor: fl
     standing = (occupied & np.uint32(body)) > 0
     shut = (occupied & np.uint32(_mask(0, 3) | _mask(BODY[1], 32))) > 0
     rays = _count(crossed & np.uint32(body)) >= max(int(body & bands).bit_count() // 2, 1)
+    if sliced:
+        wall &= ~_small(wall, cell)
     free = ~standing & (rays | (shut & (not sliced)))
-    return Plan(origin, cell, wall, free, standing & ~wall, floor, ceiling, occupied, int(bands), sliced)
+    return Plan(origin, cell, wall, free, standing & ~wall, floor, ceiling, occupied, int(bands), height, sliced)
+
+
+def _small(mask: Array, cell: float) -> Array:
+    """Groups of columns that are too short for a wall: legs and chairs."""
+    label, _ = ndimage.label(ndimage.binary_dilation(mask, np.ones((3, 3))), np.ones((3, 3)))
+    boxes = ndimage.find_objects(label)
+    size = np.array([0.0] + [np.hypot(*(s.stop - s.start for s in box)) * cell for box in boxes])
+    small: Array = mask & (size[label] < SHORT)
+    return small
 
 
 def _mask(first: int, last: int) -> int:
