@@ -10,14 +10,15 @@ import numpy as np
 import shapely
 from topomerge.datasets.plan import Flight, Plan
 from topomerge.datasets.solids import rotation
-from topomerge.datasets.stairs import GAP, LANDING, MIN_TREAD, TREAD, risers, width_for
+from topomerge.datasets.stairs import GAP, LANDING, MIN_TREAD, TREAD, risers, staircase, width_for
 
+from topomerge.errors import InputError
 from topomerge.types import Array
 
 LEAST = 4.0  # m2 of a stairwell that both storeys have
 APRON = 0.9  # m of floor before a flight
 STEP = 0.15  # m between places that are tried
-SPARE = 0.2  # m, half of what a person needs beside the flight
+SPARE = 0.28  # m, half of what a person needs beside the flight
 DOORSTEP = 0.8  # m from a door's middle to the free floor
 TRIED = 60  # places of a kind of stairs
 
@@ -82,7 +83,7 @@ def fit_flight(
     if well is None or well.area < LEAST:
         return None
     if given is not None:
-        return given if _leaves_free(given, rooms, doors) else None
+        return given if _climbs(given, rise) and _leaves_free(given, rooms, doors) else None
     edges = np.diff(shapely.get_coordinates(well.minimum_rotated_rectangle), axis=0)
     first = float(np.arctan2(edges[0, 1], edges[0, 0]))
     for kind, width, length in _sizes(rise):
@@ -91,6 +92,14 @@ def fit_flight(
                 if _leaves_free(flight, rooms, doors):
                     return flight
     return None
+
+
+def _climbs(flight: Flight, rise: float) -> bool:
+    try:
+        staircase(flight, rise)
+    except InputError:
+        return False
+    return True
 
 
 def _sizes(rise: float) -> list[tuple[str, float, float]]:
