@@ -1,0 +1,31 @@
+// What happens when the page is opened.
+
+function startTheme(button) {
+  const root = document.documentElement;
+  const system = window.matchMedia("(prefers-color-scheme: dark)");
+  const dark = () => (root.dataset.theme ? root.dataset.theme === "dark" : system.matches);
+  const tell = () => {
+    button.textContent = dark() ? "Light" : "Dark";
+    button.title = dark() ? "Show on white" : "Show on black";
+    document.dispatchEvent(new CustomEvent("theme"));
+  };
+  button.addEventListener("click", () => { root.dataset.theme = dark() ? "light" : "dark"; tell(); });
+  system.addEventListener("change", tell);
+  button.hidden = false;
+  tell();
+}
+
+function whenNear(element, start) { // a large view is made when one comes near to it
+  const watch = new IntersectionObserver((seen) => {
+    if (!seen.some((entry) => entry.isIntersecting)) return;
+    watch.disconnect();
+    start(element);
+  }, { rootMargin: "400px" });
+  watch.observe(element);
+}
+
+startTheme(document.getElementById("theme"));
+startHighlights();
+document.querySelectorAll("table.sortable").forEach(startTable);
+document.querySelectorAll(".plan-view").forEach(startPlan);
+document.querySelectorAll("[data-scene]").forEach((place) => whenNear(place, startScene));

@@ -1,0 +1,297 @@
+// The 3D view: each cell a cube of which the three faces that can be seen are drawn, straight from its number.
+
+const VERTEX = `#version 300 es
+precision highp float;
+precision highp int;
+layout(location = 0) in uvec4 cell; // x, y, z and group
+uniform mat4 matrix;
+uniform vec3 eye; // m from the scene's corner
+uniform vec2 level; // m that the storey is lifted, cells below the cut
+uniform float edge, size, ground, tall;
+uniform sampler2D colours;
+flat out vec3 colour;
+void main() {
+  int face = gl_VertexID / 4, corner = gl_VertexID % 4;
+  vec3 middle = (vec3(cell.xyz) + 0.5) * edge + vec3(0.0, 0.0, level.x);
+  vec3 side = sign(eye - middle);
+  vec2 at = vec2(corner & 1, corner >> 1) * 2.0 - 1.0;
+  vec3 to = face == 0 ? vec3(side.x, at) : face == 1 ? vec3(at.x, side.y, at.y) : vec3(at, side.z);
+  gl_Position = float(cell.z) + 0.5 > level.y ? vec4(2.0, 2.0, 2.0, 1.0) : matrix * vec4(middle + to * 0.5 * edge * size, 1.0);
+  int group = int(cell.w);
+  vec3 paint = texelFetch(colours, ivec2(group & 255, group >> 8), 0).rgb;
+  float lit = face == 0 ? (side.x > 0.0 ? 0.80 : 0.68) : face == 1 ? (side.y > 0.0 ? 0.74 : 0.86) : 1.0;
+  float high = clamp((float(cell.z) * edge - ground) / tall, 0.0, 1.0);
+  colour = paint * lit * mix(0.86, 1.06, high);
+}`;
+const FRAGMENT = `#version 300 es
+precision highp float;
+flat in vec3 colour;
+out vec4 pixel;
+void main() { pixel = vec4(min(colour, 1.0), 1.0); }`;
+
+function decode(data) { // four 16-bit numbers a cell, storey after storey, each in an order without a pattern
+  const text = atob(data.data);
+  const [, ny, nz] = data.shape;
+  const storeys = data.storeys.map(() => 0);
+  for (const [storey, , , count] of data.groups) storeys[storey] += count;
+  const first = storeys.map((_, i) => storeys.slice(0, i).reduce((a, b) => a + b, 0));
+  const cells = new Uint16Array(data.drawn * 4);
+  const next = [...first];
+  let at = 0;
+  data.groups.forEach(([storey, , , count], group) => {
+    let number = 0;
+    for (let k = 0; k < count; k++) {
+      let step = 0, place = 1, byte;
+      do {
+        byte = text.charCodeAt(at++);
+        step += (byte & 127) * place; // not shifted: numbers go beyond 32 bits
+        place *= 128;
+      } while (byte & 128);
+      number += step;
+      const z = number % nz, rest = (number - z) / nz, y = rest % ny;
+      cells.set([(rest - y) / ny, y, z, group], 4 * next[storey]++);
+    }
+  });
+  storeys.forEach((count, i) => shuffle(cells.subarray(4 * first[i], 4 * (first[i] + count))));
+  return { cells, first, count: storeys };
+}
+
+function shuffle(cells) { // so that the first part of them is a sparse picture of all
+  let seed = 12345;
+  for (let i = cells.length / 4 - 1; i > 0; i--) {
+    seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0;
+    const j = Math.floor((seed / 4294967296) * (i + 1));
+    for (let k = 0; k < 4; k++) {
+      const kept = cells[4 * i + k];
+      cells[4 * i + k] = cells[4 * j + k];
+      cells[4 * j + k] = kept;
+    }
+  }
+}
+
+function program(gl) {
+  const made = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    gl.attachShader(made, shader);
+  }
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made) || "shaders");
+  return made;
+}
+
+function upload(gl, { cells, first, count }) { // one vertex array a storey
+  const buffer = gl.createBuffer();
+  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+  gl.bufferData(gl.ARRAY_BUFFER, cells, gl.STATIC_DRAW);
+  const corners = gl.createBuffer();
+  const faces = [0, 4, 8].flatMap((v) => [v, v + 1, v + 2, v + 2, v + 1, v + 3]);
+  return count.map((_, storey) => {
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, corners);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint16Array(faces), gl.STATIC_DRAW);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 4, gl.UNSIGNED_SHORT, 8, 8 * first[storey]);
+    gl.vertexAttribDivisor(0, 1);
+    return array;
+  });
+}
+
+const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
+
+function paint(gl, texture, colours) {
+  const rows = Math.max(Math.ceil(colours.length / 256), 1);
+  const pixels = new Uint8Array(256 * rows * 4);
+  colours.forEach((colour, i) => pixels.set([...colour, 255], 4 * i));
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 256, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+  for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+}
+
+function control(kind, words, settings, changed) {
+  const label = document.createElement("label"), input = document.createElement("input"), output = document.createElement("output");
+  Object.assign(input, { type: kind, ...settings });
+  input.addEventListener("input", () => changed(kind === "checkbox" ? input.checked : Number(input.value), output));
+  label.append(...(kind === "range" ? [words + " ", input, " ", output] : [input, " " + words]));
+  return label;
+}
+
+function startScene(place) {
+  const data = JSON.parse(document.getElementById(place.dataset.scene).textContent);
+  const stage = document.createElement("div"), canvas = document.createElement("canvas"), words = document.createElement("canvas");
+  stage.className = "stage";
+  words.className = "words";
+  stage.tabIndex = 0;
+  stage.append(canvas, words);
+  const gl = canvas.getContext("webgl2", { antialias: true, powerPreference: "high-performance" });
+  if (!gl || !data.drawn) return; // the words that stand there say why
+  const missing = place.querySelector(".missing");
+  canvas.addEventListener("webglcontextlost", () => { place.replaceChildren(missing); });
+  const made = program(gl), at = (name) => gl.getUniformLocation(made, name);
+  const cells = decode(data), arrays = upload(gl, cells), texture = gl.createTexture();
+  const extent = data.shape.map((n) => n * data.edge);
+  const [near, far] = data.look || [[0, 0, 0], extent];
+  const size = Math.hypot(far[0] - near[0], far[1] - near[1]);
+  const camera = makeCamera(near.map((v, i) => (v + far[i]) / 2), size, data.turn);
+  const start = { ...camera, target: [...camera.target] };
+  const shown = data.storeys.map(() => true);
+  const state = { cut: 2, apart: 0, numbers: true, colour: Object.keys(data.colours)[0], share: 1, still: true, timer: 0, asked: false };
+  let last = 0;
+
+  function recolour() {
+    const soft = rgb(hexOf("--seen"));
+    const room = lit && lit.startsWith("room ") ? lit.slice(5) : null;
+    const known = data.rooms.findIndex(([key]) => key === room);
+    const base = data.colours[state.colour].map(rgb);
+    paint(gl, texture, known < 0 ? base : base.map((c, i) => (data.groups[i][1] === known ? c : c.map((v, k) => 0.3 * v + 0.7 * soft[k]))));
+  }
+
+  function frame(time) {
+    state.asked = false;
+    if (!state.still && last) { // too slow while moving: draw fewer, larger cubes
+      const took = time - last;
+      if (took > 45) state.share = Math.max(state.share * 0.7, 0.04);
+      else if (took < 22) state.share = Math.min(state.share * 1.15, 1);
+    }
+    last = state.still ? 0 : time;
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    for (const one of [canvas, words]) {
+      const [w, h] = [Math.round(stage.clientWidth * ratio), Math.round(stage.clientHeight * ratio)];
+      if (one.width !== w || one.height !== h) [one.width, one.height] = [w, h];
+    }
+    if (!canvas.width) return;
+    const matrix = matrixOf(camera, canvas.width / canvas.height);
+    drawCells(matrix);
+    drawNumbers(matrix, ratio);
+  }
+
+  function drawCells(matrix) {
+    const share = state.still ? 1 : state.share;
+    gl.viewport(0, 0, canvas.width, canvas.height);
+    gl.clearColor(...rgb(hexOf("--faint")).map((v) => v / 255), 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.enable(gl.DEPTH_TEST);
+    gl.useProgram(made);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.uniformMatrix4fv(at("matrix"), false, matrix);
+    gl.uniform3fv(at("eye"), eyeOf(camera));
+    gl.uniform1f(at("edge"), data.edge);
+    gl.uniform1f(at("size"), Math.min(1 / Math.sqrt(share), 5));
+    gl.uniform1f(at("tall"), 2.5);
+    data.storeys.forEach(({ floor }, storey) => {
+      if (!shown[storey] || !cells.count[storey]) return;
+      const ground = floor - data.origin[2];
+      gl.uniform1f(at("ground"), ground);
+      gl.uniform2f(at("level"), state.apart * storey, state.cut === null ? 1e9 : (ground + state.cut) / data.edge);
+      gl.bindVertexArray(arrays[storey]);
+      gl.drawElementsInstanced(gl.TRIANGLES, 18, gl.UNSIGNED_SHORT, 0, Math.ceil(cells.count[storey] * share));
+    });
+  }
+
+  function drawNumbers(matrix, ratio) {
+    const pen = words.getContext("2d");
+    pen.clearRect(0, 0, words.width, words.height);
+    if (!state.numbers) return;
+    pen.font = `600 ${12 * ratio}px system-ui, sans-serif`;
+    pen.textAlign = "center";
+    pen.textBaseline = "middle";
+    pen.lineWidth = 3 * ratio;
+    pen.lineJoin = "round";
+    pen.strokeStyle = hexOf("--halo");
+    pen.fillStyle = hexOf("--ink");
+    const taken = [];
+    const top = shown.lastIndexOf(true);
+    for (const [key, storey, x, y] of data.rooms) {
+      if (!shown[storey] || (storey < top && state.apart < 0.15 * size)) continue; // those above would stand on those below
+      const z = data.storeys[storey].floor - data.origin[2] + 0.6 + state.apart * storey;
+      const spot = project(matrix, [x - data.origin[0], y - data.origin[1], z], words.width, words.height);
+      if (!spot || taken.some(([u, v]) => Math.abs(u - spot[0]) < 20 * ratio && Math.abs(v - spot[1]) < 13 * ratio)) continue;
+      taken.push(spot);
+      pen.strokeText(key, spot[0], spot[1]);
+      pen.fillText(key, spot[0], spot[1]);
+    }
+  }
+
+  function ask() {
+    if (!state.asked) requestAnimationFrame(frame);
+    state.asked = true;
+  }
+
+  function moved() { // fewer cubes now, all of them once it rests
+    state.still = false;
+    clearTimeout(state.timer);
+    state.timer = setTimeout(() => { state.still = true; ask(); }, 180);
+    ask();
+  }
+
+  function controls() {
+    const bar = document.createElement("div");
+    bar.className = "controls";
+    const tallest = Math.ceil(10 * Math.max(...data.storeys.map(({ floor }, i) => (data.storeys[i + 1] ? data.storeys[i + 1].floor : data.origin[2] + extent[2]) - floor))) / 10;
+    state.cut = Math.min(2, tallest * 0.75);
+    const cut = control("range", "Cut at", { min: 0.1, max: tallest + 0.1, step: 0.1, value: state.cut }, (value, output) => {
+      state.cut = value > tallest ? null : value;
+      output.textContent = state.cut === null ? "nothing" : `${value.toFixed(1)} m`;
+      ask();
+    });
+    const parts = [cut];
+    if (data.storeys.length > 1) {
+      const most = Math.max(size * 0.6, 4);
+      parts.push(control("range", "Storeys apart", { min: 0, max: most, step: most / 100, value: most * 0.4 }, (value, output) => {
+        state.apart = value;
+        output.textContent = `${value.toFixed(1)} m`;
+        ask();
+      }));
+      const boxes = document.createElement("span");
+      boxes.className = "layers";
+      boxes.append("Storeys", ...data.storeys.map(({ name }, i) => control("checkbox", name, { checked: true }, (on) => { shown[i] = on; ask(); })));
+      parts.push(boxes);
+    }
+    const names = Object.keys(data.colours);
+    if (names.length > 1) {
+      const choice = document.createElement("select");
+      choice.append(...names.map((name) => new Option(name)));
+      choice.addEventListener("change", () => { state.colour = choice.value; recolour(); ask(); });
+      const label = document.createElement("label");
+      label.append("Colour by ", choice);
+      parts.push(label);
+    }
+    parts.push(control("checkbox", "numbers", { checked: true }, (on) => { state.numbers = on; ask(); }));
+    const views = document.createElement("span");
+    views.className = "zoom";
+    for (const [name, pitch] of [["From above", Math.PI / 2 - 0.001], ["Aslant", start.pitch]]) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = name;
+      button.style.width = "auto";
+      button.style.padding = "3px 10px";
+      button.addEventListener("click", () => {
+        Object.assign(camera, start, { target: [...start.target], pitch });
+        ask();
+      });
+      views.append(button);
+    }
+    bar.append(...parts, views);
+    for (const input of bar.querySelectorAll('input[type="range"]')) input.dispatchEvent(new Event("input"));
+    return bar;
+  }
+
+  recolour();
+  const told = document.createElement("p");
+  told.className = "told";
+  const merged = data.merged > 1 ? ` Of ${data.cells.toLocaleString("en")} cells, cubes of ${data.merged} × ${data.merged} × ${data.merged} are drawn as one.` : "";
+  told.textContent = `Drag to turn, with shift to move; click, then scroll to zoom.${merged}`;
+  place.replaceChildren(controls(), stage, told);
+  startCamera(stage, camera, moved);
+  document.addEventListener("lit", () => { recolour(); ask(); });
+  document.addEventListener("theme", () => { recolour(); ask(); });
+  new ResizeObserver(ask).observe(stage);
+}
+
+function hexOf(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
