@@ -1,0 +1,137 @@
+"""Two maps -> which rooms are the same (seeds 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from topomerge.embedding.embedders import embedder as make_embedder
+from topomerge.embedding.room_cells import Descriptor
+from topomerge.errors import InputError
+from topomerge.matching.assignment import assign
+from topomerge.matching.consistency import hypotheses
+from topomerge.matching.costs import descriptor_costs, similarities, usual_best
+from topomerge.matching.growing import align, grow
+from topomerge.matching.result import Hypothesis, Matching
+from topomerge.types import Array, TopometricMap
+
+METHODS = ("consistent", "growing", "assignment", "thesis")
+THESIS: dict[str, Any] = {"laplacian": "graph", "values": 256, "normalise": "first", "k": 1}
+LEAST = 0.05  # probability of a match that is worth telling
+KEPT = 10  # hypotheses
+
+
+def match(
+    a: TopometricMap,
+    b: TopometricMap,
+    embedder: str | Descriptor = "engineered",
+    method: str = "consistent",
+    *,
+    k: int = 0,
+    scale_free: bool = False,
+    largest_cost: float | None = None,
+    c_max: float | None = None,
+    de_max: float = 2.5,
+    **options: Any,
+) -> Matching:
+    """Rooms of a that are rooms of b.
+
+    Args:
+        embedder: ``"engineered"``, ``"shapedna"``, ``"feather"`` or a callable map -> (R, D).
+        method: ``"consistent"``: sets of matches that one transform explains; ``"growing"``: from each pair to its neighbours;
+            ``"assignment"``: by cost alone; ``"thesis"``: ShapeDNA with one step of context, and growing (embedder and k are the
+            thesis' then).
+        k: steps of context.
+        scale_free: the scale of b is unknown (only ``"consistent"`` knows what to do about it).
+        largest_cost: of the assignment; pairs above it stay alone. Twice the usual cost of a room's best partner if None.
+        c_max, de_max: limits of the growing.
+        options: of the embedder.
+
+    Raises:
+        InputError: one map twice, a map without rooms, or an unknown method, embedder or option.
+    """
+    if method not in METHODS:
+        raise InputError(f"matching method {method!r}: {', '.join(METHODS)} are possible")
+    check(a, b)
+    describe = make_embedder("shapedna", **THESIS) if method == "thesis" else make_embedder(embedder, k, **options)
+    cost = descriptor_costs(*(checked(describe, m) for m in (a, b)))
+    similarity = similarities(cost)
+    told = {"rooms_a": float(len(a.rooms)), "rooms_b": float(len(b.rooms)), "median_cost": float(np.median(cost))}
+    told["usual_best_cost"] = usual_best(cost)
+    if method == "assignment":
+        pairs = assign(cost, 2 * usual_best(cost) if largest_cost is None else largest_cost)
+        return Matching(pairs, similarity[tuple(pairs.T)], statistics=told)
+    found: tuple[Hypothesis, ...]
+    if method == "consistent":
+        found = hypotheses(a, b, cost, similarity, scale_free, KEPT)
+    else:
+        found = _from_growing(a, b, cost, similarity, c_max, de_max)
+    if method != "consistent":  # one hypothesis wins as a whole, as in the thesis
+        rooms = found[0].rooms if found else np.zeros((0, 2), np.int64)
+        return Matching(rooms, found[0].fit if found else np.zeros(0), found[0].transform if found else None, found, told)
+    rooms, probability = marginal(found, likelihood(similarity))
+    return Matching(rooms, probability, found[0].transform if found else None, found, told)
+
+
+def check(a: TopometricMap, b: TopometricMap) -> None:
+    """Refuse what can't be matched.
+
+    Raises:
+        InputError: names the map.
+    """
+    for which, m in (("first", a), ("second", b)):
+        if not len(m.rooms):
+            raise InputError(f"{m.source or f'the {which} map'}: no rooms in it, nothing can be matched")
+    same_cells = len(a.grid) == len(b.grid) and a.grid.cells.tobytes() == b.grid.cells.tobytes()
+    if a is b or (same_cells and np.array_equal(a.grid.origin, b.grid.origin) and a.grid.edge == b.grid.edge):
+        raise InputError(f"{b.source or 'the second map'}: is the same map as {a.source or 'the first'}; give two different maps")
+
+
+def checked(describe: Descriptor, map: TopometricMap) -> Array:
+    """What an embedder gives, if it is a finite row for each room.
+
+    Raises:
+        InputError: it is not.
+    """
+    rows = np.asarray(describe(map), np.float64)
+    if rows.ndim != 2 or len(rows) != len(map.rooms) or not np.isfinite(rows).all():
+        raise InputError(f"the embedder must give a finite row for each of {len(map.rooms)} rooms, not {rows.shape}")
+    return rows
+
+
+def marginal(found: tuple[Hypothesis, ...], likely: Callable[[int, int], float]) -> tuple[Array, Array]:
+    """Matches of the best hypothesis, and all whose probability over the hypotheses is above 0.05 and that exclude none of those.
+
+    The probability of a match is the sum over the hypotheses that have it of theirs times how well it fits.
+    """
+    total: dict[tuple[int, int], float] = {}
+    for h in found:
+        for (i, j), fit in zip(h.rooms.tolist(), h.fit.tolist(), strict=True):
+            total[i, j] = total.get((i, j), 0.0) + h.probability * min(1.0, fit + 0.3) * likely(i, j)
+    best = {(i, j) for i, j in found[0].rooms.tolist()} if found else set()
+    taken = ({i for i, _ in best}, {j for _, j in best})
+    others = {(i, j) for (i, j), p in total.items() if p >= LEAST and i not in taken[0] and j not in taken[1]}
+    chosen = sorted(best | {p for p in others if total[p] > 0.5})
+    return np.array(chosen, np.int64).reshape(-1, 2), np.array([min(total[p], 1.0) for p in chosen])
+
+
+def likelihood(similarity: Array) -> Callable[[int, int], float]:
+    """How much a descriptor's similarity speaks for a pair that geometry proposes: 0.8 if not at all, 1 if fully."""
+    return lambda i, j: 0.8 + 0.2 * float(similarity[i, j])
+
+
+def _from_growing(
+    a: TopometricMap, b: TopometricMap, cost: Array, similarity: Array, c_max: float | None, de_max: float
+) -> tuple[Hypothesis, ...]:
+    """Hypotheses of the growing; their probability goes with the square of the number of matches."""
+    grown = grow(a, b, cost, c_max, de_max)[:KEPT]
+    weight = np.array([len(p) ** 2 for p in grown], float)
+    found = []
+    for pairs, share in zip(grown, weight / max(weight.sum(), 1.0), strict=True):
+        rooms = np.array(pairs, np.int64)
+        pose, error = align(a.rooms["centroid"][rooms[:, 0]], b.rooms["centroid"][rooms[:, 1]])
+        fit = similarity[tuple(rooms.T)]
+        found.append(Hypothesis(pose, rooms, fit, float(share), float(len(rooms)), {"error_m": error}))
+    return tuple(found)
