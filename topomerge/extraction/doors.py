@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from topomerge.extraction.components import connected_components
 from topomerge.extraction.convolution import sphere
+from topomerge.extraction.rooms import Floor
 from topomerge.types import EDGE_DTYPE, Array, VoxelGrid
 
 DOOR_WIDTH = 1.6  # m: what is wider is an opening
@@ -19,21 +20,19 @@ SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
 NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
 
 
-def find_edges(
-    navigable: VoxelGrid, room: Array, storey_of_room: Array, floor_to_ceiling: Array, body: float
-) -> Array:
+def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceiling: Array) -> Array:
     """Edges between rooms that have adjacent navigable cells (seeds 2.7), one for each place where they meet.
 
     Args:
-        navigable: the navigable volume.
-        room: (m,) room of each of its cells, -1 none.
+        floor: of all storeys.
+        room: (m,) room (or area) of each of its cells, -1 none.
         storey_of_room: (R,) storey of each room.
         floor_to_ceiling: (m,) m of empty space above each cell, 0 where nothing was seen.
-        body: width of the body that the navigable volume was made for, m: a door is that much wider than what is navigable.
 
     Returns:
         (E,) EDGE_DTYPE, sorted by rooms and place.
     """
+    navigable, body = floor.cells, floor.body
     cells = navigable.cells.astype(np.int64)
     first, second = [], []
     for step in NEIGHBOURS:

@@ -18,13 +18,12 @@ from topomerge.extraction.dilation import dilate_upwards
 from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.extraction.floors import floor_components, largest_component
 from topomerge.extraction.gaps import bridge_gaps
-from topomerge.extraction.necks import merge_across_wide_necks
 from topomerge.extraction.noise import without_flying_cells
 from topomerge.extraction.propagation import propagate_labels
-from topomerge.extraction.rooms import split_rooms
+from topomerge.extraction.plan_rooms import rooms_of_plans
+from topomerge.extraction.rooms import Floor, navigable_floor, split_rooms
 from topomerge.extraction.similarity import jaccard_similarity
-from topomerge.extraction.storeys import find_storeys
-from topomerge.extraction.topology import floor_to_ceiling, topometric_map
+from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.unobstructed import unobstructed
 from topomerge.extraction.views import best_of_tiles, local_maxima, raise_views
 from topomerge.extraction.visibility import visible_cells
@@ -62,8 +61,8 @@ class Preset:
     propagation_rounds: int = 10
     least_volume: float = 0.128  # of a room's occupied cells, m3
     absorb: bool = True  # give smaller pieces to the room they touch
-    neck: float = 0.6  # rooms are merged where their connection has this share of the narrower one's width; 0: never
-    opening: float = 1.8  # or where it is wider than this and has no lintel
+    door: float = 0.5  # narrowings of the floor that are doors with this probability part rooms; 0: rooms come from the views
+    narrow: float = 0.2  # and with this one areas of a room
 
 
 PRESETS = {
@@ -79,7 +78,7 @@ PRESETS = {
         view_clearance=0.0,
         tolerance=0.0,
         absorb=False,
-        neck=0.0,
+        door=0.0,
     ),
 }
 
@@ -127,31 +126,23 @@ def _extract(
         grid = _grid(source, voxel_size, known)
     with clock("navigable volume", 0.3):
         navigable = navigable_volume(grid, p)
-    with clock("views", 0.4):
-        views = optimal_views(grid, navigable, p)
-    with clock("visibility", 0.45):
-        visibility = visible_cells(grid, views, p.range, p.tolerance, clock.part(0.45, 0.65))
-    with clock("similarity", 0.65):
-        similarity = jaccard_similarity(visibility, p.least_similarity, views, 2 * p.range, grid.cells[:, 2])
-    with clock("clusters", 0.75):
-        cluster, inflation = cluster_views(similarity, p.inflations)
-    with clock("rooms", 0.85):
-        labels = vote(visibility, cluster)
-        labels = propagate_labels(grid, labels, sphere(p.propagation_cells, 1.0), p.propagation_rounds)
-        room = split_rooms(grid, labels, p.least_volume, p.absorb)
-        room = merge_rooms(grid, room, navigable, p)
-    with clock("topology", 0.95):
-        result = topometric_map(grid, room, navigable, p.body_width, p.stem_height + p.body_height)
+    parameters = {**asdict(p), "voxel_size": grid.edge, "preset": preset if isinstance(preset, str) else "custom"}
+    if p.door:
+        with clock("rooms", 0.4):
+            floor = rooms_of_plans(grid, navigable, p.door, p.narrow, p.stem_height + p.body_height)
+    else:
+        floor, parameters["inflation"] = rooms_of_views(grid, navigable, p, clock)
+    with clock("topology", 0.9):
+        result = topometric_map(grid, floor, p.stem_height + p.body_height)
     if grid.edge > COARSE:
         known["warnings"].append(f"cells of {grid.edge:g} m are coarse: doors may be lost, {COARSE} m or less finds them")
     if not len(result.rooms):
         known["warnings"].append("no room was found: take larger voxels if the points are sparse, smaller ones if they are dense")
-    parameters = {**asdict(p), "voxel_size": grid.edge, "preset": preset if isinstance(preset, str) else "custom"}
     return replace(
         result,
         free=known.get("free"),
         source=name if name is not None else known.get("source", ""),
-        parameters={**parameters, "inflation": inflation},
+        parameters=parameters,
         seconds=clock.seconds,
         warnings=tuple(known["warnings"]),
     )
@@ -191,13 +182,21 @@ def optimal_views(grid: VoxelGrid, navigable: VoxelGrid, p: Preset) -> Array:
     return raise_views(grid, navigable.cells[rows], p.view_height, p.view_clearance or None)
 
 
-def merge_rooms(grid: VoxelGrid, room: Array, navigable: VoxelGrid, p: Preset) -> Array:
-    """Rooms that no door parts are one: not in the thesis."""
-    if not p.neck:
-        return room
-    above = floor_to_ceiling(grid, navigable, p.stem_height + p.body_height)
-    _, storey = find_storeys(navigable, above)
-    return merge_across_wide_necks(grid, room, navigable, storey, above, p.body_width, p.neck, p.opening)
+def rooms_of_views(grid: VoxelGrid, navigable: VoxelGrid, p: Preset, clock: _Clock) -> tuple[Floor, float]:
+    """Rooms as clusters of views that see the same cells (seeds 2.4 to 2.6), and the inflation of the clustering."""
+    with clock("views", 0.4):
+        views = optimal_views(grid, navigable, p)
+    with clock("visibility", 0.45):
+        visibility = visible_cells(grid, views, p.range, p.tolerance, clock.part(0.45, 0.65))
+    with clock("similarity", 0.65):
+        similarity = jaccard_similarity(visibility, p.least_similarity, views, 2 * p.range, grid.cells[:, 2])
+    with clock("clusters", 0.75):
+        cluster, inflation = cluster_views(similarity, p.inflations)
+    with clock("rooms", 0.85):
+        labels = vote(visibility, cluster)
+        labels = propagate_labels(grid, labels, sphere(p.propagation_cells, 1.0), p.propagation_rounds)
+        room = split_rooms(grid, labels, p.least_volume, p.absorb)
+    return navigable_floor(grid, room, navigable, p.stem_height + p.body_height, p.body_width), inflation
 
 
 def stick_kernel(grid: VoxelGrid, p: Preset) -> Kernel:

@@ -2,11 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from topomerge.extraction.components import connected_components, spread_labels
 from topomerge.extraction.convolution import moore
+from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.types import Array, VoxelGrid
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """The floors of all storeys, cut into rooms.
+
+    Args:
+        cells: the navigable volume, and the floor under furniture where rooms have such. Its property `standing` (bool) tells
+            where a body fits; absent, it fits everywhere.
+        storeys: (S,) STOREY_DTYPE.
+        storey, room, area: (m,) int32 of each cell, -1 none.
+        room_of_area: (A,) int32.
+        label: (n,) int32 room of each occupied cell of the grid, -1 none.
+        body: m, how much wider than its cells a passage is: where they tell where a body's middle may be, the body's width.
+        probability: that a door parts two rooms, as far as it is known.
+    """
+
+    cells: VoxelGrid
+    storeys: Array
+    storey: Array
+    room: Array
+    area: Array
+    room_of_area: Array
+    label: Array
+    body: float = 0.0
+    probability: dict[tuple[int, int], float] = field(default_factory=dict)
 
 
 def split_rooms(grid: VoxelGrid, labels: Array, least_volume: float, absorb: bool = False) -> Array:
@@ -32,8 +61,18 @@ def split_rooms(grid: VoxelGrid, labels: Array, least_volume: float, absorb: boo
     return room.astype(np.int32)
 
 
-def navigable_rooms(grid: VoxelGrid, room: Array, navigable: VoxelGrid) -> Array:
-    """(m,) int32 room of each navigable cell: its own where it is occupied, otherwise that of the nearest navigable cell."""
+def navigable_floor(grid: VoxelGrid, room: Array, navigable: VoxelGrid, body_height: float, body: float) -> Floor:
+    """The navigable volume as the floor of rooms that were found as sets of occupied cells.
+
+    A navigable cell has the room of the occupied cell in its place, otherwise that of the nearest navigable cell.
+
+    Args:
+        room: (n,) room of each occupied cell.
+        body_height, body: of the body that the navigable volume was made for, m.
+    """
     row = grid.rows(navigable.cells)
     label = np.where(row >= 0, room[np.maximum(row, 0)], -1)
-    return spread_labels(navigable, label).astype(np.int32)
+    label = spread_labels(navigable, label).astype(np.int32)
+    storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, body_height))
+    none = np.full(len(navigable), -1, np.int32)
+    return Floor(navigable, storeys, storey, label, none, np.zeros(0, np.int32), room, body)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from topomerge.kernels.columns import first_occupied
 from topomerge.types import STOREY_DTYPE, Array, VoxelGrid
 
 LEAST_AREA = 3.0  # m2
 LEAST_SHARE = 0.04  # of the largest storey
+HIGHEST_CEILING = 30.0  # m
 LEAST_HEIGHT = 1.9  # m between floors: nobody stands upright in less
 
 
@@ -46,6 +48,13 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
         ceiling = height + (ceiling_height(floor_to_ceiling[near]) or np.nan)
         storeys[s] = (height, ceiling, len(rows) * navigable.edge**2)
     return storeys, storey
+
+
+def floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> Array:
+    """(m,) m of empty space between each navigable cell and the first occupied one above it; 0 where there is none."""
+    start = max(int(body_height / grid.edge), 1)
+    limit = int(HIGHEST_CEILING / grid.edge)
+    return first_occupied(*grid._bricks, navigable.cells.astype(np.int64), start, 1, limit) * grid.edge
 
 
 def ceiling_height(above: Array) -> float:

@@ -7,69 +7,75 @@ from scipy import ndimage
 
 from topomerge.extraction.completeness import GLIMPSED, completeness
 from topomerge.extraction.doors import find_edges
-from topomerge.extraction.rooms import navigable_rooms
-from topomerge.extraction.storeys import ceiling_height, find_storeys, lowest_of_column
-from topomerge.kernels.columns import first_occupied
-from topomerge.types import ROOM_DTYPE, Array, TopometricMap, VoxelGrid
-
-HIGHEST_CEILING = 30.0  # m
+from topomerge.extraction.rooms import Floor
+from topomerge.extraction.storeys import ceiling_height, floor_to_ceiling, lowest_of_column
+from topomerge.types import AREA_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid
 
 
-def topometric_map(grid: VoxelGrid, room: Array, navigable: VoxelGrid, body: float, body_height: float) -> TopometricMap:
+def topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> TopometricMap:
     """The graph of rooms over the voxel grid (seeds 2.7).
 
-    A room in which nobody can stand has no place in the graph: its cells lose their label.
+    A room without a floor has no place in the graph: its cells lose their label.
 
     Args:
         grid: occupied cells.
-        room: (n,) room of each.
-        navigable: the navigable volume.
-        body: width (m) of the body it was made for.
-        body_height: height (m) of that body: whatever is lower than this above the floor is no ceiling.
+        floor: of all storeys, cut into rooms.
+        body_height: m, whatever is lower than this above the floor is no ceiling.
     """
-    label = navigable_rooms(grid, room, navigable)
-    above = floor_to_ceiling(grid, navigable, body_height)
-    storeys, storey = find_storeys(navigable, above)
-    floor = label[lowest_of_column(navigable)]
-    used = np.bincount(floor[floor >= 0], minlength=int(room.max(initial=-1)) + 1) > 0
+    lowest = floor.room[lowest_of_column(floor.cells)]
+    used = np.bincount(lowest[lowest >= 0], minlength=int(max(floor.label.max(initial=-1), lowest.max(initial=-1))) + 1) > 0
     number = np.append(np.where(used, np.cumsum(used) - 1, -1), -1).astype(np.int32)
-    room, label = number[room], number[label]
-    rooms = _measure(grid, room, navigable, label, storey, above, body)
-    edges = find_edges(navigable, label, rooms["storey"], above, body)
-    return TopometricMap(grid, room, navigable, label, rooms, edges, storeys)
+    room, label = number[floor.label], number[floor.room]
+    above = floor_to_ceiling(grid, floor.cells, body_height)
+    rooms = _measure(grid, room, floor, label, above)
+    edges = find_edges(floor, label, rooms["storey"], above)
+    for edge in edges:
+        a, b = np.flatnonzero(used)[edge["rooms"]].tolist()
+        edge["confidence"] = floor.probability.get((min(a, b), max(a, b)), 1.0)
+    area = np.where(number[floor.room_of_area][floor.area] >= 0, floor.area, -1) if len(floor.room_of_area) else floor.area
+    areas, area = _areas(floor, label, area)
+    narrows = find_edges(floor, area, rooms["storey"][areas["room"]], above)
+    narrows = narrows[areas["room"][narrows["rooms"][:, 0]] == areas["room"][narrows["rooms"][:, 1]]]
+    return TopometricMap(grid, room, floor.cells, label, rooms, edges, floor.storeys, areas, area, narrows)
 
 
-def floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> Array:
-    """(m,) m of empty space between each navigable cell and the first occupied one above it; 0 where there is none."""
-    start = max(int(body_height / grid.edge), 1)
-    limit = int(HIGHEST_CEILING / grid.edge)
-    return first_occupied(*grid._bricks, navigable.cells.astype(np.int64), start, 1, limit) * grid.edge
+def _areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array]:
+    """(A,) AREA_DTYPE and the areas renumbered."""
+    kept = np.unique(area[area >= 0])
+    number = np.append(np.searchsorted(kept, np.arange(int(area.max(initial=-1)) + 1)), -1)
+    area = number[area].astype(np.int32)
+    areas = np.zeros(len(kept), AREA_DTYPE)
+    lowest = lowest_of_column(floor.cells)
+    for a in range(len(kept)):
+        rows = lowest[area[lowest] == a]
+        rows = rows if len(rows) else np.flatnonzero(area == a)
+        areas[a] = (label[rows[0]], floor.cells.centroids(floor.cells.cells[rows]).mean(axis=0), len(rows) * floor.cells.edge**2)
+    return areas, area
 
 
-def _measure(
-    grid: VoxelGrid, room: Array, navigable: VoxelGrid, label: Array, storey: Array, above: Array, body: float
-) -> Array:
+def _measure(grid: VoxelGrid, room: Array, floor: Floor, label: Array, above: Array) -> Array:
     """(R,) ROOM_DTYPE."""
     count = int(label.max(initial=-1)) + 1
+    cells = floor.cells
     rooms = np.zeros(count, ROOM_DTYPE)
-    rooms["completeness"] = completeness(grid, navigable, label, count, body)
+    rooms["completeness"] = completeness(grid, cells, label, count, floor.body)
     rooms["glimpsed"] = rooms["completeness"] < GLIMPSED
-    floor = lowest_of_column(navigable)
-    order = floor[np.argsort(label[floor], kind="stable")]
+    lowest = lowest_of_column(cells)
+    order = lowest[np.argsort(label[lowest], kind="stable")]
     floor_of = np.split(order, np.searchsorted(label[order], np.arange(count + 1)))[1:-1]
     order = np.argsort(room, kind="stable")
     cells_of = np.split(order, np.searchsorted(room[order], np.arange(count + 1)))[1:-1]
     for r in range(count):
-        rows, cells = floor_of[r], grid.cells[cells_of[r]]
-        rooms["storey"][r] = np.bincount(storey[rows]).argmax()
-        rooms["centroid"][r] = navigable.centroids(navigable.cells[rows]).mean(axis=0)
-        rooms["area"][r] = _area(navigable.cells[rows, :2], navigable.edge, body)
+        rows, occupied = floor_of[r], grid.cells[cells_of[r]]
+        rooms["storey"][r] = np.bincount(floor.storey[rows]).argmax()
+        rooms["centroid"][r] = cells.centroids(cells.cells[rows]).mean(axis=0)
+        rooms["area"][r] = _area(cells.cells[rows, :2], cells.edge, floor.body)
         rooms["height"][r] = ceiling_height(above[rows])
         rooms["volume"][r] = rooms["area"][r] * rooms["height"][r]
-        box = cells if len(cells) else navigable.cells[rows]
+        box = occupied if len(occupied) else cells.cells[rows]
         rooms["lo"][r] = grid.origin + box.min(axis=0) * grid.edge
         rooms["hi"][r] = grid.origin + (box.max(axis=0) + 1) * grid.edge
-        rooms["cells"][r] = len(cells)
+        rooms["cells"][r] = len(occupied)
     return rooms
 
 

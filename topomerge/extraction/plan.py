@@ -1,0 +1,199 @@
+"""A storey seen from above: its floor, its walls, its ceiling and where it is open, a raster of columns (beyond the thesis).
+
+Rooms end at walls, whatever stands in them: furniture hides the floor and obstructs the body of the stick kernel, but a wall alone
+fills a column up to the ceiling (findings.md, "Rooms").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import edt
+import numpy as np
+from scipy import ndimage
+
+from topomerge.extraction.storeys import lowest_of_column
+from topomerge.kernels.profile import BELOW, LEVELS, lowest_bit, profiles
+from topomerge.types import Array, VoxelGrid
+
+BANDS = np.linspace(0.5, 2.0, 7)  # m above the floor: a wall is seen in most of these
+WALL_BANDS = 4 / 6
+OBSERVED = 0.2  # of the fullest band's columns: below, the sensor did not look at that height
+UPRIGHT = 1.9  # m: nothing lower is a ceiling
+OVER_FURNITURE = 2.05  # m: cupboards end below
+BLOCK = 0.5  # m: ceilings are measured on tiles of this size
+CLUTTER = 0.9  # m: free-standing pieces of wall shorter than this are pillars and the like
+FLOOR_REACH = 1.5  # m: so far from a seen floor a column still has its height
+LEAST_FLOOR = 0.5  # m2 of seen floor in a part
+HOLE = 4.0  # m2: gaps this small in what is known are filled
+TOUCHES = 0.25  # m: pieces this close to a longer wall belong to it
+MARGIN = 0.6  # m
+SLAB = 0.2  # m between a ceiling and the floor above it
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """One storey as rasters (nx, ny) of columns; heights are in m above the local floor."""
+
+    edge: float  # m
+    low: Array  # (2,) int64 column of the grid that is element (0, 0)
+    base: Array  # int64 level of the floor in the grid
+    top: Array  # int64 level of the grid up to which it goes
+    profile: Array  # uint64, see `kernels.profile`
+    wall: Array  # bool
+    inside: Array  # bool: known and no wall
+    ceiling: Array  # float64, smoothed over lamps, beams and lintels; nan where none was seen
+    clear: Array  # float64, height of the first thing above 1.9 m; nan where nothing was seen
+
+    def columns(self, cells: Array) -> Array:
+        """(m, 2) elements of the rasters that hold the given cells of the grid; they may lie outside."""
+        return np.asarray(cells)[:, :2].astype(np.int64) - self.low
+
+
+def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, known: Array | None = None) -> Plan:
+    """The plan of storey `k`.
+
+    Args:
+        grid: occupied cells.
+        navigable: the navigable volume.
+        storey: (m,) storey of each of its cells.
+        known: (j, 3) cells that are known to be free, if any are.
+    """
+    e = grid.edge
+    floor = lowest_of_column(navigable)
+    cells = navigable.cells[floor].astype(np.int64)
+    mine = cells[storey[floor] == k]
+    margin = int(np.ceil(MARGIN / e))
+    low = mine[:, :2].min(axis=0) - margin
+    size = mine[:, :2].max(axis=0) + margin + 1 - low
+    base, seen, far = _heights(mine, low, size)
+    above = cells[storey[floor] == k + 1]
+    top = base + LEVELS
+    if len(above):
+        nominal = int(np.median(above[:, 2]))
+        upper, _, near = _heights(above[_within(above[:, :2] - low, size)], low, size, nominal)
+        top = np.minimum(top, np.where(near * e < 1.0, upper, nominal) - int(np.ceil(SLAB / e)))
+    profile = np.zeros(size, np.uint64)
+    profiles(grid.cells, low, base, top, profile)
+    wall_like = _bands(profile, e)
+    clear = _first_above(profile, e, UPRIGHT)
+    ceiling = _ceiling(np.where(wall_like, np.nan, clear), e)
+    wall = wall_like & ~_below_ceiling(profile, ceiling, e)
+    wall = _without_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
+    on_floor = (profile & _bits(-0.3, 0.3, e)) != 0
+    inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (~np.isnan(clear) & (far * e <= 2 * FLOOR_REACH))
+    if known is not None and len(known):
+        at = known[:, :2] - low
+        at = at[_within(at, size)]
+        inside[tuple(at.T)] = True
+    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), e)
+    return Plan(e, low, base, top, profile, wall, inside, ceiling, clear)
+
+
+def _within(at: Array, size: Array) -> Array:
+    return ((at >= 0) & (at < size)).all(axis=1)
+
+
+def _heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[Array, Array, Array]:
+    """Level of the nearest of the given floor cells, where there is one, and how many columns away it is."""
+    if not len(cells):
+        return np.full(size, nominal), np.zeros(size, bool), np.full(size, 1e9)
+    order = np.argsort(-cells[:, 2], kind="stable")  # the lowest is written last
+    at = tuple((cells[order, :2] - low).T)
+    base = np.zeros(size, np.int64)
+    base[at] = cells[order, 2]
+    seen = np.zeros(size, bool)
+    seen[at] = True
+    far, nearest = ndimage.distance_transform_edt(~seen, return_indices=True)
+    return base[tuple(nearest)], seen, far
+
+
+def _bits(low: float, high: float, edge: float) -> np.uint64:
+    """Mask of the levels from `low` up to, not including, `high` m above the floor."""
+    a = min(max(round(low / edge) + BELOW, 0), LEVELS)
+    b = min(max(round(high / edge) + BELOW, a + 1), LEVELS)
+    return np.uint64(((1 << b) - 1) & ~((1 << a) - 1))
+
+
+def _bands(profile: Array, edge: float) -> Array:
+    """Is the column filled like a wall, at the heights at which the sensor looked?"""
+    filled = np.stack([(profile & _bits(a, b, edge)) != 0 for a, b in zip(BANDS[:-1], BANDS[1:], strict=True)])
+    count = filled.sum(axis=(1, 2))
+    filled = filled[count >= OBSERVED * count.max()]
+    need = np.ceil(WALL_BANDS * len(filled) - 1e-6)
+    own = filled.sum(axis=0)
+    around = np.stack([ndimage.maximum_filter(f, 3) for f in filled]).sum(axis=0)
+    return np.asarray((own >= need) | ((own >= 0.5 * need) & (around > need)))
+
+
+def _first_above(profile: Array, edge: float, height: float) -> Array:
+    """Height (m) of the lower side of the first thing above `height`; nan where there is none."""
+    bit = lowest_bit(profile.ravel(), round(height / edge) + BELOW).reshape(profile.shape)
+    return np.where(bit >= 0, (bit - BELOW) * edge, np.nan)
+
+
+def _ceiling(clear: Array, edge: float) -> Array:
+    """Ceiling of each column: the median of a few tiles around it, which lamps and lintels don't reach."""
+    tile = max(round(BLOCK / edge), 1)
+    nx, ny = (-(-s // tile) for s in clear.shape)
+    padded = np.full((nx * tile, ny * tile), np.nan)
+    padded[: clear.shape[0], : clear.shape[1]] = clear
+    blocks = padded.reshape(nx, tile, ny, tile).transpose(0, 2, 1, 3).reshape(nx, ny, -1)
+    middle = _nanmedian(blocks)
+    around = np.pad(middle, 2, constant_values=np.nan)
+    smooth = _nanmedian(np.stack([around[i : i + nx, j : j + ny] for i in range(5) for j in range(5)], axis=-1))
+    return np.repeat(np.repeat(smooth, tile, 0), tile, 1)[: clear.shape[0], : clear.shape[1]]
+
+
+def _nanmedian(values: Array) -> Array:
+    """Median along the last axis of what is a number; nan where fewer than a tenth are."""
+    ordered = np.sort(values, axis=-1)  # nan last
+    count = (~np.isnan(ordered)).sum(axis=-1)
+    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[..., None] // 2, axis=-1)[..., 0]
+    return np.where(count * 10 >= values.shape[-1], middle, np.nan)
+
+
+def _below_ceiling(profile: Array, ceiling: Array, edge: float) -> Array:
+    """Columns over which the ceiling was seen with empty space below it: what stands there is no wall."""
+    height = np.where(np.isnan(ceiling), 0.0, ceiling)
+    out = np.zeros(profile.shape, bool)
+    for level in np.unique(np.round(height / edge)):
+        top = level * edge
+        if top < OVER_FURNITURE + 0.25:
+            continue
+        here = np.round(height / edge) == level
+        empty = (profile & _bits(OVER_FURNITURE, max(top - 0.25, OVER_FURNITURE + 0.1), edge)) == 0
+        out |= here & empty & ((profile & _bits(top - 0.15, top + 0.35, edge)) != 0)
+    return out
+
+
+def _without_clutter(wall: Array, edge: float) -> Array:
+    """The walls without short pieces that stand free."""
+    piece, count = ndimage.label(wall, np.ones((3, 3)))
+    boxes = ndimage.find_objects(piece)
+    length = np.array([max(b[0].stop - b[0].start, b[1].stop - b[1].start) for b in boxes]) * edge
+    keep = np.concatenate([[False], length > CLUTTER])
+    if keep.any():
+        gap = edt.edt((~keep[piece]).view(np.uint8), parallel=1) * edge
+        keep[1:] |= np.asarray(ndimage.minimum(gap, piece, np.arange(1, count + 1))) < TOUCHES
+    return keep[piece]
+
+
+def _filled(inside: Array, wall: Array, seen: Array, edge: float) -> Array:
+    """What is known, without small holes and without scraps in which no floor was seen."""
+    reach = max(round(0.2 / edge), 1)
+    closed = ndimage.binary_closing(np.pad(inside | wall, reach), np.ones((2 * reach + 1,) * 2))[reach:-reach, reach:-reach]
+    hole, count = ndimage.label(~closed)
+    if count:
+        area = np.bincount(hole.ravel(), minlength=count + 1) * edge**2
+        border = np.unique(np.concatenate([hole[0], hole[-1], hole[:, 0], hole[:, -1]]))
+        small = area <= HOLE
+        small[border] = False
+        small[0] = False
+        closed |= small[hole]
+    inside = closed & ~wall
+    piece, count = ndimage.label(inside)
+    floor = np.bincount(piece[seen & inside], minlength=count + 1)
+    keep = floor * edge**2 >= LEAST_FLOOR
+    keep[0] = False
+    return keep[piece]
