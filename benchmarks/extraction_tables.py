@@ -66,7 +66,7 @@ def _about(rows: list[Row]) -> str:
     return (
         f"{cases} maps of {places} buildings. Means over the maps of a set; in brackets 95 % intervals over its buildings. "
         "P and R: precision and recall (rooms at IoU 0.5, doors within 0.5 m, pairs of rooms that are joined). Storeys: share of "
-        "the maps with as many as there are, each within 0.5 m. Seconds on one core that other programs used, too."
+        "the maps with as many as there are, each within 0.5 m. Seconds of work of one core."
     )
 
 

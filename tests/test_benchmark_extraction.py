@@ -1,0 +1,60 @@
+"""The benchmark of the extraction runs, goes on where it was, and writes its tables between the marks."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    return importlib.import_module("extraction")
+
+
+def test_one_small_case(benchmark, tmp_path, capsys, monkeypatch) -> None:
+    page = tmp_path / "results.md"
+    page.write_text("# Results\nbefore\n<!-- extraction:begin -->\nold\n<!-- extraction:end -->\nafter\n")
+    words = [
+        "--dev",
+        "--only",
+        "house-2",
+        "--preset",
+        "thesis",
+        "--out",
+        str(tmp_path / "out"),
+        "--scans",
+        str(tmp_path / "scans"),
+    ]
+    words += ["--write", str(page), "--pictures"]
+    assert benchmark.main(words) == 0
+    row = json.loads((tmp_path / "out" / "results.jsonl").read_text())
+    assert not row["error"] and 0 <= row["iou"] <= 1 and row["rooms"] >= 3
+    assert len(list((tmp_path / "out" / "pictures").glob("*.png"))) == len(list((tmp_path / "scans").iterdir())) == 1
+    text = page.read_text()
+    assert "before" in text and "after" in text and "old" not in text and "| dev | 1 |" in text
+    monkeypatch.setattr(benchmark, "measure", None)  # the second time nothing is left to do
+    assert benchmark.main(words) == 0
+    assert f"{row['iou']:.2f}" in capsys.readouterr().out
+
+
+def test_sets_keep_to_their_buildings(benchmark) -> None:
+    """Development sees training buildings only, everything else test buildings; no two maps share a name."""
+    from topomerge.datasets.splits import split_of
+
+    cases = importlib.import_module("extraction_cases")
+    for name, group in cases.GROUPS.items():
+        found = group()
+        assert len({c.name for c in found}) == len(found)
+        for case in found:
+            if case.source in ("procedural", "r2v", "campus"):
+                of = split_of(case.source, str(case.seed) if case.source == "procedural" else case.building)
+                assert of == ("train" if name == "dev" else "test"), case.name
+    assert len(cases.chosen(["all"], 1)) == len({c.set for c in cases.chosen(["all"])})
