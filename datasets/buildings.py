@@ -150,7 +150,9 @@ def _storey(
     draft = Draft(wall, rng, round(float(np.random.default_rng(seeds[1]).uniform(0.94, 1.08)), 3))
     corridors = draw(layout, draft, "corridor", merge)
     fronts: list[tuple[int, int]] = []  # rooms and their corridors
-    deck = Deck(profile.upper if k and profile.upper else profile.rooms, seeds[1] if profile.same else None, rng, difficulty.spread)
+    deck = Deck(
+        profile.upper if k and profile.upper else profile.rooms, seeds[1] if profile.same else None, rng, difficulty.spread
+    )
     inner = Deck(INNER, None, rng)
     for row in layout.rows:
         for core in row.cores:

@@ -14,7 +14,7 @@ class Difficulty:
     Args:
         lintels: share of doors with a lintel; the others reach the ceiling.
         ceiling_spread: m, standard deviation of the rooms' ceilings about the storey's.
-        furniture: density; 0 is an empty building, 1 usual, 2 crammed.
+        furniture: density; 0 is an empty building, 1 a tidy one, 2 crammed.
         clutter: boxes, bags and bins on the floor of 10 m2.
         windows: share of the windows that are there.
         glass: share of the walls to corridors that are glazed.
@@ -30,21 +30,21 @@ class Difficulty:
         gone: share of the movable things that are gone at the next session.
         doors_moved: share of the doors that stand differently at the next session.
         people: persons a room at the next session.
-        ducts: share of the rooms with ducts or trays hanging below the ceiling.
+        ducts: share of the rooms with ducts, trays or rows of panels under the ceiling.
         closets: share of the larger rooms beside a corridor out of which a closet is cut.
         spread: how much rooms of a kind differ in width: share that are half as wide again or more.
     """
 
     lintels: float = 0.9
     ceiling_spread: float = 0.1
-    furniture: float = 1.0
-    clutter: float = 0.3
+    furniture: float = 1.3
+    clutter: float = 0.8
     windows: float = 0.9
     glass: float = 0.05
     open: float = 0.6
     half: float = 0.2
     lamps: float = 0.4
-    beams: float = 0.1
+    beams: float = 0.2
     columns: float = 0.3
     slopes: float = 0.1
     curved: float = 0.1
@@ -54,7 +54,7 @@ class Difficulty:
     gone: float = 0.1
     doors_moved: float = 0.3
     people: float = 0.2
-    ducts: float = 0.15
+    ducts: float = 0.25
     closets: float = 0.12
     spread: float = 0.2
 

@@ -204,11 +204,15 @@ def _ducts(
     if rng.random() >= difficulty.ducts or space.plan.kind in PLAIN or spare < 0.25:
         return
     middle, yaw, long, wide = frame
-    for _ in range(int(rng.integers(1, 4))):
-        across = bool(rng.random() < 0.25)
-        reach, offset = (wide, rng.uniform(-0.4, 0.4) * long) if across else (long, rng.uniform(-0.4, 0.4) * wide)
-        broad, high = float(rng.uniform(0.1, 0.7)), float(min(rng.uniform(0.08, 0.4), spare))
-        drop = float(rng.uniform(0.0, min(0.4, spare - high)))
+    rows = rng.random() < 0.3  # panels of one make, side by side; else ducts and pipes, each by itself
+    number = int(rng.integers(3, 7)) if rows else int(rng.integers(1, 4))
+    sizes = rng.uniform([0.1, 0.08, 0.0], [0.7, 0.4, 1.0], (number, 3))
+    sizes = np.tile([sizes[0, 0], 0.1, sizes[0, 2]], (number, 1)) if rows else sizes
+    for k, (broad, high, deep) in enumerate(sizes.tolist()):
+        high = min(high, spare)
+        across = bool(not rows and rng.random() < 0.25)
+        offset = ((k + 0.5) / number - 0.5 if rows else rng.uniform(-0.4, 0.4)) * (long if across else wide)
+        reach, drop = (wide if across else long), deep * min(0.6 if rows else 0.4, spare - high)
         place = middle + (np.array([offset, 0.0]) if across else np.array([0.0, offset])) @ rotation(yaw)
         turn, reach = yaw + np.pi / 2 * across, max(reach - 0.02, 0.5)
         box = shapely.Polygon(footprints(place[None], np.array([turn]), (reach, broad))[0]).intersection(space.shape)

@@ -1,4 +1,4 @@
-"""Simulated maps and real ones, side by side: ``python -m topomerge.datasets.realism [--fast]`` prints the table of `docs/data.md`.
+"""Simulated maps and real ones, side by side: ``python -m topomerge.datasets.realism [--fast]`` prints what `docs/data.md` shows.
 
 Rooms are true ones wherever there are any (plans, spaces of a model, labelled grids); of the real clouds without them the room is
 the outline of the points. Nothing here goes through the extraction. Simulated maps come from training seeds and training plans;

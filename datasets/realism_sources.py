@@ -24,8 +24,8 @@ from topomerge.io.points import read_points
 from topomerge.types import Array, PointCloud, TrueRoom
 
 SENSED = ("tls", "lidar", "depth", "tablet")
-SEEDS = 20  # buildings of a kind whose rooms are counted
-MAPS = 2  # buildings of a kind that each sensor scans
+SEEDS = 10  # buildings of a kind whose rooms are counted
+MAPS = 1  # buildings of a kind that each sensor scans
 VISITED = 8  # rooms a map
 SKIPPED = ("void", "lift")
 REAL_PLANS = {"GDC floors 1–4": "utexas_gdc_floors", "IFC models": "ifc_buildings", "IPA grids": "grids_ipa_room_segmentation"}

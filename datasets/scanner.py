@@ -31,7 +31,7 @@ def scan(
     spacing: float | None = None,
     budget: int | None = None,
     frame: Sim3 | None = None,
-    unfinished: float = 0.5,
+    unfinished: float = 0.35,
 ) -> PointCloud:
     """A partial map of a building.
 
@@ -147,7 +147,7 @@ def _poses(walk: Walk, sensor: Sensor, visited: Sequence[int], rng: np.random.Ge
     """(K, 4, 4) true poses of the sensor, in the order of the walk, and metres walked to each; only in the rooms asked for."""
     along = walk.along
     at = list(walk.stops) * sensor.turns
-    turn = [k * 2 * np.pi / sensor.turns for k in range(sensor.turns) for _ in walk.stops]
+    turn = [k * 2 * np.pi * sensor.look / sensor.turns for k in range(sensor.turns) for _ in walk.stops]
     turn = [t + o for t, o in zip(turn, np.tile(rng.uniform(0, 2 * np.pi, len(walk.stops)), sensor.turns), strict=True)]
     heading = _heading(walk.points)
     if sensor.step:

@@ -21,7 +21,7 @@ class Sensor:
         beams: rays above one another; 0: as many as make square pixels.
         height: above the floor; carried sensors sway by 5 cm.
         step: metres between poses; 0: only where the surveyor stops.
-        turns: poses at a stop, spread over a full turn.
+        turns: poses at a stop, spread over `look` of a full turn.
         pitch: of the sensor; mobile cameras swing by `swing` about it, and to both sides.
         spacing: the distance between points that is aimed at.
         noise: standard deviation of a range at 0 m, and what each metre (laser) adds.
@@ -48,6 +48,7 @@ class Sensor:
     height: float = 1.6
     step: float = 0.0
     turns: int = 1
+    look: float = 1.0
     pitch: float = 0.0
     swing: float = 0.0
     spacing: float = 0.04
@@ -90,7 +91,7 @@ SENSORS = {
         Sensor(
             "depth", (0.4, 5.0), 72, (-28, 28), height=1.45, step=0.35, turns=10, pitch=-4, swing=24, spacing=0.05,
             noise=(0.003, 0.0), quadratic=0.0025, grazing=12, dark=0.08, lost=0.03, glass=0.02, mixed=0.5, drift=0.5, tilt=0.4,
-            jitter=(0.01, 0.25), ghost=0.02,
+            jitter=(0.015, 0.4), ghost=0.02,
         ),
         Sensor(
             "mono", (0.6, 8.0), 80, (-30, 30), height=1.5, step=0.5, turns=8, pitch=-4, swing=20, spacing=0.12,
@@ -102,9 +103,9 @@ SENSORS = {
             jitter=(0.01, 0.1),
         ),
         Sensor(
-            "tablet", (0.3, 5.0), 62, (-24, 24), height=1.4, step=0.4, turns=6, pitch=34, swing=12, spacing=0.05,
-            noise=(0.010, 0.003), quadratic=0.001, grazing=10, dark=0.05, lost=0.02, glass=0.05, mixed=0.5, drift=0.5, tilt=0.3,
-            lowest=1.0, jitter=(0.012, 0.3), ghost=0.02,
+            "tablet", (0.3, 5.0), 62, (-24, 24), height=1.4, step=0.4, turns=4, look=0.5, pitch=34, swing=12,
+            spacing=0.05, noise=(0.010, 0.003), quadratic=0.001, grazing=10, dark=0.05, lost=0.02, glass=0.05, mixed=0.5,
+            drift=0.5, tilt=0.3, lowest=1.0, jitter=(0.012, 0.3), ghost=0.02,
         ),
     )
 }  # fmt: skip

@@ -21,7 +21,7 @@ CELL = 0.1  # m, of the floor that is walked on
 BODY = 0.2  # m, half a person's width
 BLOCKED = 40.0  # what a step through furniture costs: only taken where there is no other way
 FOREIGN = 8.0  # what a step in a room that was not asked for costs
-SIGHT = (3.5, 6.0)  # m; every part of a room is that close to a stop: thorough surveyors and hasty ones
+SIGHT = (3.5, 5.0)  # m; every part of a room is that close to a stop: thorough surveyors and hasty ones
 LONG = 8.0  # m; a room whose parts lie farther from a stop than that may be left half-way
 WALKED = (0.2, 0.8)  # share of the stops of such a room that are made
 STEP_UP = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
@@ -101,7 +101,7 @@ def fill(raster: Array, polygon: Array, value: int) -> None:
     raster[low[1] : high[1], low[0] : high[0]][inside] = value
 
 
-def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator, unfinished: float = 0.5) -> Walk:
+def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator, unfinished: float = 0.35) -> Walk:
     """A walk into all the given rooms, from one of them.
 
     The way follows one shortest-path tree, so the surveyor returns through the corridors as people do. Shut doors are opened in

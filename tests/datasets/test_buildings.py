@@ -115,3 +115,32 @@ def test_wrong_arguments_are_refused(wrong: tuple[str, int, int], reason: str) -
         make_building(*wrong)
     with pytest.raises(InputError, match="shape 'star'"):
         make_building("office", 1, shape="star")
+
+
+def test_rooms_of_a_kind_differ_and_closets_are_cut_out() -> None:
+    def areas(difficulty: Difficulty) -> np.ndarray:
+        rooms = [r for seed in range(4) for r in make_building("office", seed, 1, difficulty, shape="double").rooms]
+        return np.array([shapely.Polygon(r.polygon).area for r in rooms if r.kind != "corridor"])
+
+    plain, mixed = areas(replace(EMPTY, closets=0, spread=0)), areas(replace(EMPTY, closets=0.5, spread=0.5))
+    assert (plain < 5).mean() < 0.02 < 0.08 < (mixed < 5).mean()
+    assert np.quantile(mixed, 0.9) > 1.2 * np.quantile(plain, 0.9)
+
+
+def test_furniture_in_rows_is_not_aligned_to_the_millimetre() -> None:
+    building = make_building("school", 3, 1, Difficulty(closets=0))
+    seats = building.things[building.things["kind"] == "seat"]
+    turn = (seats["yaw"] + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    assert len(seats) > 10 and 0.01 < turn.std() < 0.06
+
+
+def test_ducts_hang_below_the_ceiling_and_above_the_heads() -> None:
+    building = make_building("lab", 5, 1, replace(EMPTY, lamps=0, beams=0, ducts=1.0, slopes=0))
+    low = building.vertices[building.triangles[building.labels == SURFACES.index("beam")], 2].min(axis=1)
+    assert len(low) > 12 and low.min() > 2.1 and low.max() < max(r.ceiling for r in building.rooms)
+
+
+def test_each_building_has_its_own_make_of_doors() -> None:
+    widths = [make_building("school", seed, 1, EMPTY).doors["width"] for seed in range(3)]
+    assert len({round(float(np.median(w)), 2) for w in widths}) > 1
+    assert all(len(np.unique(np.round(w, 2))) > 3 for w in widths)

@@ -191,3 +191,31 @@ def test_a_scan_of_a_storey_is_quick(office: Building) -> None:
     start = time.process_time()
     scan(office, "tls")
     assert time.process_time() - start < 4.0  # 0.9 s on an idle core
+
+
+def test_a_long_room_may_be_left_half_way(office: Building) -> None:
+    corridor = max(range(len(office.rooms)), key=lambda i: float(np.ptp(office.rooms[i].polygon, axis=0).max()))
+    whole, half = (plan_walk(office, [corridor], np.random.default_rng(1), unfinished=u) for u in (0.0, 1.0))
+    reach = [float(np.ptp(w.points[:, :2], axis=0).max()) for w in (whole, half)]
+    assert reach[1] < 0.85 * reach[0] and len(half.stops) < len(whole.stops)
+    every = plan_walk(office, list(range(len(office.rooms))), np.random.default_rng(1), unfinished=1.0)
+    assert set(every.room.tolist()) >= set(range(len(office.rooms))), "every room that was asked for is entered"
+
+
+def test_a_pane_mirrors_the_room_behind_it() -> None:
+    building = erect([one_room()], BARE)
+    cloud = scan(building, replace(SENSORS["tls"], **{**PERFECT, "glass": 0.0, "ghost": 1.0}))
+    ghosts = cloud.points[cloud.labels == -1].astype(float)
+    assert len(ghosts) > 50 and (ghosts[:, 1] < -0.14).all()
+    image = ghosts * [1, -1, 1] + [0, -0.3, 0]  # the pane stands at y = -0.15
+    inside = image[image[:, 1] > 0.05]
+    assert len(inside) > 50 and np.quantile(off_the_walls(inside), 0.9) < 0.01, "but for the reveals of door and window"
+    assert not (scan(building, replace(SENSORS["tls"], **PERFECT, glass=1.0)).labels == -1).any()
+
+
+def test_jitter_makes_walls_thick_where_views_overlap(closed: Building) -> None:
+    still = {"noise": (0.0, 0.0), "quadratic": 0.0, "drift": 0.0, "tilt": 0.0, "mixed": 0.0}
+    off = [
+        off_the_walls(scan(closed, replace(SENSORS["depth"], **still, jitter=(j, 0.0)), seed=3).points).std() for j in (0.0, 0.02)
+    ]
+    assert off[0] < 1e-3 and 0.008 < off[1] < 0.04
