@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from boxes import room
 from topomerge.datasets import build as module
 from topomerge.datasets import example
 from topomerge.datasets.build import Build, build, main
 from topomerge.datasets.example import PairSet, Row, load_example
-from topomerge.datasets.plan import Plan
-from topomerge.datasets.recipe import Item, Recipe, check, draw_items
+from topomerge.datasets.plan import Opening, Plan
+from topomerge.datasets.recipe import Item, Recipe, check, draw_items, plans_of
 
 from topomerge.config import compose
 from topomerge.errors import InputError
@@ -111,6 +112,36 @@ def test_one_bad_item_ends_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     report = build(Build(SMALL, str(tmp_path)))
     assert report.pairs == report.made == 0 and report.refused == {"KeyError: 'x'": 2, "# has no such rooms": 1}
     assert (tmp_path / "small.jsonl").read_text() == ""
+    assert [p.name for p in (tmp_path / "pairs").iterdir()] == [f"{bad}.refused"], "a KeyError is no reason for good"
+    asked: list[str] = []
+    monkeypatch.setattr(example, "make_arrays", lambda item, plans: asked.append(item.name))
+    assert build(Build(SMALL, str(tmp_path))).refused["# has no such rooms"] == 1 and bad not in asked and len(asked) == 2
+
+
+def test_parts_make_the_whole(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    made: list[list[str]] = []
+    monkeypatch.setattr(example, "make_arrays", lambda item, plans: made[-1].append(item.name))
+    for k in (1, 2):
+        made.append([])
+        build(Build(SMALL, str(tmp_path / str(k)), part=[k, 2]))
+    names = [i.name for i in draw_items(SMALL, {})]
+    assert set(made[0]) == set(names[::2]) and made[1] == names[1::2]
+    with pytest.raises(InputError, match=r"part must be \[k, n\]"):
+        build(Build(SMALL, str(tmp_path), part=[3, 2]))
+
+
+def test_real_storeys_are_stacked_where_the_recipe_says_so() -> None:
+    wall = Opening("door", (4.1, 2.0), (4.1, 2.9), 0.2)
+    one = Plan((room("a", 0, 0, 4, 5), room("b", 4.2, 0, 8, 5)), openings=(wall,))
+    plans = {"campus": {"x": (one,), "y": (one,), "x + y": (one, one)}}
+    recipe = replace(SMALL, pairs=200, sources={"campus": 1.0}, stacks=0.4, over_stairs=0.5)
+    items = draw_items(recipe, plans)
+    stacked = [i for i in items if i.storeys == 2]
+    assert 0.3 < len(stacked) / 200 < 0.5 and all(set(i.buildings) == {"x + y"} for i in stacked)
+    assert all(set(i.buildings) <= {"x", "y"} for i in items if i.storeys == 1)
+    assert 0.3 < np.mean([i.over_stairs for i in stacked]) < 0.7 and not any(i.over_stairs for i in items if i.storeys == 1)
+    assert not any(i.storeys == 2 for i in draw_items(replace(recipe, stacks=0.0), plans))
+    assert plans_of(stacked[0], plans)[0] == (one, one)
 
 
 def test_what_takes_too_long_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
