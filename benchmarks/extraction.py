@@ -41,7 +41,8 @@ NOTHING: Row = {
 
 def code_hash() -> str:
     """Of all that the numbers depend on beside the scan."""
-    files = [f for name in CODE for f in (sorted((ROOT / name).rglob("*.py")) if (ROOT / name).is_dir() else [ROOT / name])]
+    paths = [ROOT / name for name in CODE]
+    files = [f for p in paths for f in (sorted(p.rglob("*.*")) if p.is_dir() else [p]) if f.suffix in (".py", ".json")]
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
 
 

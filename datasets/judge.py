@@ -4,7 +4,8 @@ Places are the columns of a raster, one a storey, of the true rooms' floors: tho
 (within `NEAR` of a point of that storey), and columns outside of all true rooms and their walls that the map says are of a room.
 The map's word for a column is the room of the navigable cell there, or of the nearest one within `SPREAD`, so that neither the
 strip along a wall, where no body fits, nor a turned raster counts against anyone; further from where one can stand, the room of
-most of the occupied cells between floor and ceiling (furniture belongs to a room), or of the nearest such within `SPREAD`.
+most of the occupied cells between floor and ceiling (furniture belongs to a room), or of the nearest such within `SPREAD`. In
+rooms that were not visited, and outside, only the navigable cells themselves speak.
 Drift that the simulator put into a scan is taken out of the map first: a map can't be better than its points.
 """
 
@@ -162,7 +163,7 @@ def said(map: TopometricMap, truth: Truth) -> Array:
         z = filled[0][:, 2] - floor
         level = (z > -0.3) & (z < truth.height[k] + 0.3)
         over = _most(truth, filled[0][level], filled[1][level])
-        floor_of = truth.raster[k] >= 0
+        floor_of = np.append(truth.visited, False)[truth.raster[k]] & (truth.raster[k] >= 0)
         wide = np.where(floor_of, _spread(stood, SPREAD), _spread(stood, CELL))  # a turned raster has holes
         wide = np.where(wide >= 0, wide, np.where(floor_of, over, -1))
         out[k] = np.where(floor_of, _spread(wide, SPREAD), wide)
