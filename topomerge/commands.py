@@ -107,6 +107,7 @@ def _outputs(args: argparse.Namespace) -> list[tuple[str, str]]:
     if args.figure and Path(args.figure).suffix.lower() not in FIGURE_FORMATS:
         raise InputError(f"{args.figure}: unknown kind of figure; end the name with one of {' '.join(FIGURE_FORMATS)}")
     writers = {"output": "save_map", "json": "save_json", "ply": "save_rooms_ply", "figure": "save_figure"}
+    writers["report"] = "save_report"
     return [(getattr(args, name), writer) for name, writer in writers.items() if getattr(args, name)]
 
 
@@ -140,6 +141,66 @@ def simulate_command(args: argparse.Namespace) -> int:
     return 0
 
 
+def embed_command(args: argparse.Namespace) -> int:
+    """`topomerge embed`: a row of numbers for each room."""
+    check_outputs([args.output], [args.input])
+    from topomerge.embedding.embedders import embedder
+
+    describe = embedder(args.descriptor, args.k)
+    rows = describe(_map_from(args.input, args))
+    import numpy as np
+
+    def save(path: Path) -> None:
+        with path.open("wb") as file:  # np.save would add .npy to another name
+            np.save(file, rows, allow_pickle=False)
+
+    write_all([(args.output, save)])
+    if not args.quiet:
+        print(f"{len(rows)} rooms, {rows.shape[1]} numbers each -> {args.output}")
+    return 0
+
+
+def match_command(args: argparse.Namespace) -> int:
+    """`topomerge match`: which rooms of two maps are the same."""
+    from topomerge.io.listing import json_text
+    from topomerge.matching.listing import matching_to_json, matching_to_text
+    from topomerge.matching.match import check, match
+
+    if Path(args.a).resolve() == Path(args.b).resolve():
+        raise InputError(f"{args.b}: is given twice; give two different maps")
+    a, b = _map_from(args.a, args), _map_from(args.b, args)
+    check(a, b)
+    alone = [path for path, m in ((args.a, a), (args.b, b)) if len(m.rooms) == 1]
+    warn(f"{path}: has one room: only its shape and doors can be compared" for path in alone)
+    found = match(a, b, args.descriptor, args.method, k=args.k, scale_free=args.scale_of_b == "free")
+    sys.stdout.write(json_text(matching_to_json(found, a, b)) if args.json else matching_to_text(found, a, b) + "\n")
+    return 0
+
+
+def _map_from(path: str, args: argparse.Namespace) -> Any:
+    """The map in a .tmap, or the one that is extracted from anything else."""
+    from topomerge.io.maps import load_map
+
+    if Path(path).suffix.lower() == ".tmap":
+        found = load_map(path)
+    else:
+        from topomerge.extraction.extract import extract
+        from topomerge.io.points import read_chunks
+
+        with Bars(enabled=not getattr(args, "quiet", False)) as bars:
+            chunks = read_chunks(path, **_given(args, "up", "unit"), progress=bars.task("read"))
+            found = extract(chunks, **_given(args, "voxel_size"), name=path, progress=bars.task("extract"))
+    warn(found.warnings)
+    return found
+
+
+MAPS = (
+    option("--descriptor", choices=("engineered", "shapedna", "feather"), default="engineered", help="default engineered"),
+    option("--k", type=_count, default=0, metavar="K", help="steps of context around each room (default 0)"),
+    option("--voxel-size", type=_above_zero, metavar="E", help="edge length of a cell where a cloud is given, m (default 0.1)"),
+    *(o for o in READING if o[0][0] in ("--up", "--unit")),
+)
+
 COMMANDS = (
     Command(
         "extract",
@@ -152,12 +213,13 @@ COMMANDS = (
             option("--json", metavar="A.json", default=None, help="also write rooms, doors and storeys as JSON"),
             option("--ply", metavar="A.ply", default=None, help="also write the occupied cells with their room as PLY"),
             option("--figure", metavar="A.png", default=None, help="also draw the plan of each storey"),
+            option("--report", metavar="A.html", default=None, help="also write plans, tables and a 3D view as one web page"),
             option("--voxel-size", type=_above_zero, metavar="E", help="edge length of a cell, m (default 0.1)"),
             option("--preset", choices=("default", "thesis"), help="parameters: ours (default) or those of the thesis"),
             *READING,
             option("-q", "--quiet", action="store_true", default=False, help="no table, no progress; only warnings"),
         ),
-        paths=("input", "output", "json", "ply", "figure"),
+        paths=("input", "output", "json", "ply", "figure", "report"),
         description="Find the rooms, doors and storeys of one partial map, and print a table of them.",
     ),
     Command(
@@ -171,6 +233,43 @@ COMMANDS = (
         ),
         paths=("input",),
         description="Print the rooms, storeys, doors and times of a map.",
+    ),
+    Command(
+        "embed",
+        embed_command,
+        "describe each room of a map by numbers",
+        "topomerge embed a.tmap --descriptor shapedna --k 1 -o a.npy",
+        (
+            option("input", metavar="A", help="a .tmap, or a cloud, which is extracted first"),
+            option("-o", "--output", required=True, metavar="A.npy", default=None, help="NumPy array, a row for each room"),
+            *MAPS,
+            option("-q", "--quiet", action="store_true", default=False, help="print nothing"),
+        ),
+        paths=("input", "output"),
+        description="Describe each room of a map by numbers: rooms that look alike get rows that are close.",
+    ),
+    Command(
+        "match",
+        match_command,
+        "find the rooms that two maps have in common",
+        "topomerge match a.tmap b.tmap --json",
+        (
+            option("a", metavar="A", help="a .tmap, or a cloud, which is extracted first"),
+            option("b", metavar="B", help="the other one"),
+            option("--json", action="store_true", default=False, help="print JSON instead of tables"),
+            option(
+                "--method",
+                choices=("consistent", "growing", "assignment", "thesis"),
+                default="consistent",
+                help="sets of matches that one transform explains (default), or simpler ways",
+            ),
+            option(
+                "--scale", dest="scale_of_b", choices=("free", "known"), default="known", help="free: the scale of b is unknown"
+            ),
+            *MAPS,
+        ),
+        paths=("a", "b"),
+        description="Print which rooms of two maps are the same, with probabilities, and the transforms that would make them so.",
     ),
     Command(
         "simulate",

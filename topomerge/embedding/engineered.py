@@ -13,7 +13,7 @@ from functools import cache
 from importlib import resources
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from topomerge.embedding.room_cells import Descriptor, room_cells, rows_of
 from topomerge.errors import InputError
@@ -44,7 +44,7 @@ GRAPH_FEATURES = (
 FEATURES = (*THESIS_FEATURES, *GRAPH_FEATURES)
 SCALINGS = ("matched", "standard", "none")
 NEIGHBOURS = 32
-SAMPLES = 1500  # cells of a room whose roughness is measured
+SAMPLES = 500  # cells of a room whose roughness is measured
 
 
 def engineered(features: str = "all", scaling: str = "matched") -> Descriptor:
@@ -103,7 +103,8 @@ def thesis_features(cells: Array, edge: float) -> Array:
     values, axes = np.linalg.eigh(away.T @ away / len(points))
     values = np.maximum(values[::-1], 0.0)
     s1, s2, s3 = np.sqrt(values) + 1e-9
-    columns = np.unique(cells[:, :2], axis=0)
+    wide = np.unique(cells[:, 0].astype(np.int64) << 32 | cells[:, 1])
+    columns = np.stack([wide >> 32, wide & 0xFFFFFFFF], axis=1)
     height = float(np.ptp(cells[:, 2]) + 1) * edge
     return np.array(
         [
@@ -125,11 +126,10 @@ def thesis_features(cells: Array, edge: float) -> Array:
 
 def _smallest_rectangle(columns: Array) -> float:
     """Area, in cells, of the smallest rectangle about columns (n, 2)."""
-    corners = (columns[:, None] + np.array([(0, 0), (1, 0), (0, 1), (1, 1)])[None]).reshape(-1, 2).astype(float)
-    try:
-        hull = corners[ConvexHull(corners).vertices]
-    except QhullError:  # never: a cell has four corners
-        return float(np.prod(np.ptp(corners, axis=0)))
+    first = np.flatnonzero(np.diff(columns[:, 0], prepend=-1))  # columns ascend: of each row only the ends can be corners
+    ends = columns[np.concatenate([first, np.append(first[1:], len(columns)) - 1])]
+    corners = (ends[:, None] + np.array([(0, 0), (1, 0), (0, 1), (1, 1)])[None]).reshape(-1, 2).astype(float)
+    hull = corners[ConvexHull(corners).vertices]
     sides = np.roll(hull, -1, axis=0) - hull
     along = sides / np.linalg.norm(sides, axis=1, keepdims=True)
     extents = [np.ptp(hull @ np.array([(c, -s), (s, c)]), axis=0) for c, s in along]
@@ -137,7 +137,7 @@ def _smallest_rectangle(columns: Array) -> float:
 
 
 def roughness(points: Array) -> float:
-    """Mean distance (m) of points (n, 3) to the plane of their 32 nearest; of at most 1,500 of them, evenly spread."""
+    """Mean distance (m) of points (n, 3) to the plane of their 32 nearest; of at most 500 of them, evenly spread."""
     if len(points) < 4:
         return 0.0
     some = points[np.linspace(0, len(points) - 1, min(SAMPLES, len(points))).astype(int)]

@@ -74,5 +74,5 @@ def smallest_eigenvalues(laplacian: Laplacian, number: int) -> Array:
         else:
             usual = float(matrix.diagonal().mean()) / len(kept)  # of the order of the first eigenvalues
             start = np.random.default_rng(0).standard_normal(len(kept))
-            values = np.sort(eigsh(matrix, wanted, sigma=-usual, v0=start, return_eigenvectors=False, tol=1e-6))
+            values = np.sort(eigsh(matrix, wanted, sigma=-usual, v0=start, return_eigenvectors=False, tol=1e-10))
     return np.maximum(values[1:], 0.0)

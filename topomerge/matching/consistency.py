@@ -15,7 +15,6 @@ from topomerge.kernels.poses import pose_evidence
 from topomerge.matching.assignment import by_overlap
 from topomerge.matching.costs import best_partners
 from topomerge.matching.door_poses import Poses, door_poses, joined_poses, middle_poses, scaled_poses
-from topomerge.matching.growing import align
 from topomerge.matching.result import Hypothesis
 from topomerge.matching.topdown import TopDown, top_down
 from topomerge.types import Array, Sim3, TopometricMap
@@ -24,13 +23,15 @@ CANDIDATES = 5  # partners of a room
 COARSE, FINE = 300, 2000  # samples of walls and of floor
 SIGMAS = (0.25, 0.15)  # m, of agreement: of the first look and of the last
 REFINED = 60  # poses that are moved until walls meet
+COLUMNS = 20_000  # of floor, laid over each other to find the rooms in common
 TRIMS = (0.8, 0.6, 0.45, 0.35, 0.3, 0.3)  # m, walls farther apart do not count, round by round
+FEWEST = 10  # walls that meet; fewer move nothing
 STOREY = 0.7  # m by which floors of one storey may differ
-CONFLICT = 0.7  # weight of a metre that disagrees against one that agrees
-FLOOR = 0.15  # m of wall that a m2 of floor in common is worth
+CONFLICT = 2.0  # weight of a metre that disagrees against one that agrees
+FLOOR = 0.1  # m of wall that a m2 of floor in common is worth
 SAME = (0.5, np.radians(5), 0.05)  # m, rad, share: poses closer than this are one
 SHORTLIST = 0.6  # of the best agreement
-SHARPNESS, NONE = 6.0, 12.0  # m of score by which odds grow e-fold; score at which "none" is as likely
+ODDS = (5.71, -3.52, -5.10, 2.52)  # of a hypothesis against "none": see `odds_features`; from benchmarks/matching_odds.py
 
 
 class Sampled(NamedTuple):
@@ -135,21 +136,24 @@ def refined(poses: Poses, plans: tuple[TopDown, TopDown], scale_free: bool) -> P
     places, storey, is_wall, _ = plans[1].samples(FINE)
     places, storey = places[is_wall], storey[is_wall]
     storeys = storey_map(poses, plans[0].floors, plans[1].floors)
-    points = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
-    yaw, shift, scale = poses.yaw.copy(), poses.shift.copy(), poses.scale.copy()
-    for h in range(len(yaw)):
+    points = places[:, 0] + 1j * places[:, 1]
+    turn = poses.scale * np.exp(1j * poses.yaw)  # complex numbers: u -> turn * u + move
+    move = poses.shift[:, 0] + 1j * poses.shift[:, 1]
+    for h in range(len(turn)):
         for trim in TRIMS:
-            at = Sim3(float(yaw[h]), (float(shift[h, 0]), float(shift[h, 1]), 0.0), float(scale[h])).apply(points)
-            target, away = plans[0].nearest_wall(at[:, :2], storeys[h][storey])
+            at = turn[h] * points + move[h]
+            target, away = plans[0].nearest_wall(np.stack([at.real, at.imag], axis=1), storeys[h][storey])
             near = away < trim
-            if near.sum() < 10:
+            if near.sum() < FEWEST:
                 break
-            target = np.concatenate([target, np.zeros((len(target), 1))], axis=1)
-            step, _ = align(target[near], at[near], scale_free)
-            yaw[h] += step.yaw
-            shift[h, :2] = step.apply(np.append(shift[h, :2], 0.0)[None])[0, :2]
-            scale[h] *= step.scale
-    return Poses(yaw, shift, scale, poses.weight)
+            to = target[near, 0] + 1j * target[near, 1]
+            p, q = at[near] - at[near].mean(), to - to.mean()
+            fit = np.vdot(p, q)
+            step = fit / np.vdot(p, p) if scale_free else fit / max(abs(fit), 1e-12)
+            move[h] = step * (move[h] - at[near].mean()) + to.mean()
+            turn[h] *= step
+    shift = np.stack([move.real, move.imag, poses.shift[:, 2]], axis=1)
+    return Poses(np.angle(turn), shift, np.abs(turn), poses.weight)
 
 
 def rank(poses: Poses, evidence: Array, plans: tuple[TopDown, TopDown]) -> tuple[Hypothesis, ...]:
@@ -157,7 +161,7 @@ def rank(poses: Poses, evidence: Array, plans: tuple[TopDown, TopDown]) -> tuple
     agree = evidence[:, 1] + FLOOR * evidence[:, 3]
     short = agree >= SHORTLIST * agree.max()
     order = np.lexsort((-evidence[:, 0], ~short))
-    odds = np.exp(np.clip((evidence[:, 0] - NONE) / SHARPNESS, -50, 50)) * np.where(short, 1.0, 0.1)
+    odds = np.exp(np.clip(odds_features(evidence[:, 1:]) @ ODDS, -50, 50))
     chance = odds / (odds.sum() + 1)
     found = []
     for h in order.tolist():
@@ -170,10 +174,20 @@ def rank(poses: Poses, evidence: Array, plans: tuple[TopDown, TopDown]) -> tuple
     return tuple(found)
 
 
+def odds_features(evidence: Array) -> Array:
+    """(H, 4) what the odds of a hypothesis depend on: 1, the amount of evidence, the share that conflicts, and the score, from
+    metres that agree, metres that conflict and m2 of floor in common (H, 3)."""
+    agree, conflict, floor = evidence.T
+    score = agree - CONFLICT * conflict + FLOOR * floor
+    return np.stack([np.ones(len(agree)), np.log1p(agree), conflict / (agree + 3), score / 10], axis=1)
+
+
 def matches_under(transform: Sim3, plans: tuple[TopDown, TopDown], storeys: Array) -> tuple[Array, Array]:
     """(M, 2) rooms that share floor under a transform and (M,) how well they fit (see `by_overlap`)."""
     a, b = plans
     storey, x, y = np.nonzero(b.floor)
+    every = max(len(x) // COLUMNS, 1)
+    storey, x, y = storey[::every], x[::every], y[::every]
     room = b.label[storey, x, y]
     places = b.origin + (np.stack([x, y], axis=1) + 0.5) * b.edge
     at = transform.apply(np.concatenate([places, np.zeros((len(places), 1))], axis=1))[:, :2]
@@ -183,5 +197,5 @@ def matches_under(transform: Sim3, plans: tuple[TopDown, TopDown], storeys: Arra
     other = a.label[on[inside], cell[inside, 0], cell[inside, 1]]
     hit = other >= 0
     common = np.zeros((len(a.areas), len(b.areas)))
-    np.add.at(common, (other[hit], room[inside][hit]), (transform.scale * b.edge) ** 2)
+    np.add.at(common, (other[hit], room[inside][hit]), every * (transform.scale * b.edge) ** 2)
     return by_overlap(common, a.areas, b.areas * transform.scale**2)

@@ -1,0 +1,103 @@
+"""Descriptors: a row for each room, the same from every side, and what is written on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.embedding.test_graph import turned
+from tests.scenes_map import building
+from topomerge.embedding.context import with_context
+from topomerge.embedding.embedders import EMBEDDERS, embedder
+from topomerge.embedding.engineered import FEATURES, raw_features
+from topomerge.embedding.feather import feather, walk_matrix
+from topomerge.embedding.room_cells import joined, neighbours
+from topomerge.errors import InputError
+from topomerge.types import TopometricMap
+
+FAST = {"engineered": {}, "shapedna": {"values": 8, "spacing": 0.5}, "feather": {}}
+
+
+@pytest.fixture(scope="module")
+def map() -> TopometricMap:
+    return building(2)
+
+
+def permuted(map: TopometricMap, order: np.ndarray) -> TopometricMap:
+    """The map with its rooms in another order: new room r is old room order[r]."""
+    new = np.argsort(order).astype(np.int32)
+    labels = [np.where(r >= 0, new[r], -1).astype(np.int32) for r in (map.room, map.navigable_room)]
+    edges = map.edges.copy()
+    edges["rooms"] = new[edges["rooms"]]
+    return replace(map, room=labels[0], navigable_room=labels[1], rooms=map.rooms[order], edges=edges)
+
+
+@pytest.mark.parametrize("name", EMBEDDERS)
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_rows_and_columns(map: TopometricMap, name: str, k: int):
+    rows = embedder(name, k, **FAST[name])(map)
+    assert rows.dtype == np.float64 and len(rows) == len(map.rooms) and np.isfinite(rows).all()
+    assert rows.shape[1] == (k + 1) * embedder(name, **FAST[name])(map).shape[1]
+
+
+@pytest.mark.parametrize("name", EMBEDDERS)
+def test_order_of_rooms(map: TopometricMap, name: str):
+    order = np.array([3, 0, 4, 1, 2])
+    describe = embedder(name, 1, **FAST[name])
+    assert np.allclose(describe(permuted(map, order)), describe(map)[order], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["engineered", "feather"])
+def test_turns_change_nothing(map: TopometricMap, name: str):
+    describe = embedder(name, 1)
+    other, storeys = turned(map), map.storeys.copy()
+    storeys["floor"] += other.grid.origin[2] - map.grid.origin[2]
+    assert np.allclose(describe(replace(other, storeys=storeys)), describe(map), atol=0.02)
+
+
+def test_engineered_by_hand(map: TopometricMap):
+    rows = raw_features(map)
+    of = dict(zip(FEATURES, rows[0], strict=True))
+    assert np.expm1(of["area"]) == pytest.approx(20.0) and of["clear_height"] == pytest.approx(2.9)
+    assert np.expm1(of["projection"]) == pytest.approx(20.0) and of["step"] == pytest.approx(0.05, abs=0.11)
+    assert np.allclose(np.expm1(rows[4, [FEATURES.index("degree"), FEATURES.index("doors")]]), 4)
+
+
+def test_twin_rooms_are_alike(map: TopometricMap):
+    rows = embedder("engineered")(map)
+    apart = np.linalg.norm(rows[:, None] - rows[None], axis=2)
+    assert apart[0, 1] < 0.1 * apart[0, 4]
+
+
+def test_context_of_nothing_is_the_room(map: TopometricMap):
+    describe = embedder("engineered", features="thesis")
+    alone = replace(map, edges=map.edges[:0])
+    rows = with_context(describe, 1)(alone)
+    assert np.array_equal(rows[:, :12], rows[:, 12:])
+    mean = with_context(describe, 1, "mean")(map)
+    assert np.allclose(mean[0, 12:], describe(map)[[0, 4]].mean(axis=0))
+
+
+def test_joined_and_neighbours(map: TopometricMap):
+    assert neighbours(map, 1)[0].tolist() == [0, 4] and neighbours(map, 2)[0].tolist() == [0, 1, 2, 3, 4]
+    one = joined(map, np.array([0, 4]))
+    assert len(one.rooms) == 1 and one.rooms["area"][0] == pytest.approx(map.rooms["area"][[0, 4]].sum())
+    assert len(one.grid) == np.isin(map.room, [0, 4]).sum()
+
+
+def test_feather_is_the_formula(map: TopometricMap):
+    values = np.arange(len(map.rooms), dtype=float)[:, None]
+    rows = feather(lambda _: values, steps=2, points=1, largest=0.3)(map)
+    walk = walk_matrix(map)
+    assert np.allclose(walk.sum(axis=1), 1)
+    waves = np.exp(0.3j * values[:, 0])
+    expected = np.stack([(walk @ waves).real, (walk @ waves).imag, (walk @ walk @ waves).real, (walk @ walk @ waves).imag], axis=1)
+    assert np.allclose(rows, expected[:, [0, 2, 1, 3]])
+
+
+def test_bad_names():
+    for wrong in ({"name": "x"}, {"name": "engineered", "k": -1}, {"name": "shapedna", "value": 3}, {"name": "feather", "steps": 0}):
+        with pytest.raises(InputError):
+            embedder(**wrong)
