@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,19 @@ class GridPair:
     truth: Sim3 | None
     common: float
     about: dict[str, object]
+
+    @cached_property
+    def anchor(self) -> Array:
+        """(3,) a point of b in the middle of what both maps saw: drift bends maps, and no pose is right everywhere."""
+        cells = self.b.centroids()
+        if self.truth is not None:
+            a = np.unique(np.floor(self.a.centroids() / 0.5).astype(np.int64), axis=0)
+            b = np.floor(self.truth.apply(cells) / 0.5).astype(np.int64)
+            key = [k[:, 0] * 2**42 + k[:, 1] * 2**21 + k[:, 2] for k in (a, b)]
+            both = np.isin(key[1], key[0])
+            cells = cells[both] if both.sum() > 50 else cells
+        middle: Array = cells.mean(axis=0)
+        return middle
 
 
 def recipe(split: str, pairs: int, seed: int = 0) -> Recipe:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.kernels.plan import column_bits
+from topomerge.kernels.plan import column_bits, on_lines
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
 CELL = 0.1  # m
@@ -25,9 +25,10 @@ GAP = 1.9  # m of empty height between a floor and its ceiling
 LEAST_AREA = 3.0  # m2 of a storey
 LEAST_SHARE = 0.08  # of the largest storey
 SLICE = 0.6  # m; a map that is not higher is a slice
+LAYER = 0.1  # share of the cells that a layer of a map of slices holds at least
 NOMINAL = (2.7, 0.3, 1.375)  # m: floor to ceiling; a slice's height above the floor; and the height at which slices are drawn
 FLAT = 1.5  # m, radius over which the floor may rise and fall
-SHORT = 1.3  # m; what a slice shows of less than this is furniture
+STRAIGHT = 1.2  # m; what a slice shows in no straight run of this length is furniture
 UNIT = np.uint32(1)
 
 
@@ -42,7 +43,7 @@ class Plan:
         floor, ceiling: heights, m; nan where not seen.
         bits: (H, W) uint32, occupied bands of heights (`BAND`, from `LOW`) above the floor.
         bands: uint32, the bands that the map observed at all.
-        height: (H, W) float32, m, the ceiling's height above the floor, or above 0 where no floor was seen; nan without ceiling.
+        high, low: (H, W) float32, heights of the ceiling (nan: none) and of the floor (a guess where it was not seen), m.
         sliced: seen at one height only: `floor` is a guess.
     """
 
@@ -55,7 +56,8 @@ class Plan:
     ceiling: float
     bits: Array
     bands: int
-    height: Array
+    high: Array
+    low: Array
     sliced: bool = False
 
     @property
@@ -98,18 +100,22 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
     if free is not None and len(free):
         at = free.centroids()
         columns = np.floor(at[:, :2] / cell).astype(np.int64) - low
-        level = np.full(len(at), np.median(points[:, 2])) if _is_slice(grid) else at[:, 2]
-        empty = (np.ascontiguousarray(columns[:, 0]), np.ascontiguousarray(columns[:, 1]), level)
-    sliced, found = _is_slice(grid), []
-    z = np.full(len(points), np.median(points[:, 2])) if sliced else points[:, 2]
-    for floor, ceiling, base in levels(grid):
+        empty = (np.ascontiguousarray(columns[:, 0]), np.ascontiguousarray(columns[:, 1]), at[:, 2])
+    layers, found = slices(grid), []
+    storeys = [(z - NOMINAL[1], np.nan, z - NOMINAL[2]) for z in layers] if layers else levels(grid)
+    for floor, ceiling, base in storeys:
+        z, crossing = points[:, 2], empty
+        if layers:  # all that is near the layer is drawn at one height
+            level = base + NOMINAL[2]
+            z = np.where(np.abs(z - level) <= SLICE / 2, level, np.nan)
+            crossing = empty and (*empty[:2], np.where(np.abs(empty[2] - level) <= SLICE / 2, level, np.nan))
         heights = np.full(shape, base)
-        if np.isfinite(floor) and not sliced:
+        if np.isfinite(floor) and not layers:
             heights = _local_floor(ix, iy, z, heights)
         occupied = column_bits(ix, iy, z, heights, LOW, BAND)
-        crossed = column_bits(*empty, heights, LOW, BAND) if empty else np.zeros(shape, np.uint32)
-        height = _ceiling(ix, iy, z, base, ceiling, shape) - (heights if np.isfinite(floor) else 0.0)
-        found.append(_plan(occupied, crossed, low * cell, cell, floor, ceiling, height.astype(np.float32), sliced))
+        crossed = column_bits(*crossing, heights, LOW, BAND) if crossing else np.zeros(shape, np.uint32)
+        high = _ceiling(ix, iy, z, base, ceiling, shape)
+        found.append(_plan(occupied, crossed, low * cell, cell, floor, ceiling, (high, heights), bool(layers)))
     return found
 
 
@@ -119,8 +125,32 @@ def cell_middles(grid: VoxelGrid) -> Array:
     return grid.centroids() if mean is None else np.asarray(mean, np.float64)
 
 
-def _is_slice(grid: VoxelGrid) -> bool:
-    return float(np.ptp(grid.cells[:, 2]) + 1) * grid.edge <= SLICE
+def slices(grid: VoxelGrid) -> list[float]:
+    """Heights of the layers of a map that was seen at one height a storey only, lowest first; none for other maps.
+
+    Nearly all cells lie in a few thin layers, and these show lines, where floors and ceilings would show areas.
+    """
+    z = cell_middles(grid)[:, 2]
+    if float(np.ptp(z)) + grid.edge <= SLICE:
+        return [float(np.median(z))]
+    thick = max(round(SLICE / 2 / grid.edge), 1)
+    many = np.convolve(np.bincount(grid.cells[:, 2], minlength=grid.shape[2]), np.ones(thick), "same")
+    layers: list[int] = []
+    for k in np.argsort(-many, kind="stable"):
+        if many[k] < LAYER * len(grid):
+            break
+        if all(abs(int(k) - other) * grid.edge >= GAP for other in layers):
+            layers.append(int(k))
+    inside = [np.abs(grid.cells[:, 2] - k) <= thick / 2 for k in layers]
+    if not layers or sum(int(i.sum()) for i in inside) < 0.7 * len(grid):
+        return []
+    flat = grid.cells[np.logical_or.reduce(inside)][:, :2].astype(np.int64)
+    columns = len(np.unique(flat[:, 0] << 32 | flat[:, 1]))
+    side = max(round(0.5 / grid.edge), 1)
+    blocks = len(np.unique((flat[:, 0] // side) << 32 | (flat[:, 1] // side)))
+    if columns > 0.6 * blocks * side**2:
+        return []
+    return sorted(float(np.median(z[i])) for i in inside)
 
 
 def levels(grid: VoxelGrid) -> list[tuple[float, float, float]]:
@@ -129,14 +159,12 @@ def levels(grid: VoxelGrid) -> list[tuple[float, float, float]]:
     A floor and its ceiling bound empty columns; where hardly any column has both, the largest level is a floor if most of the
     map lies above it, else a ceiling.
     """
-    middle = grid.origin[2] + (grid.cells[:, 2].astype(np.float64) + 0.5) * grid.edge
-    if _is_slice(grid):
-        z = float(np.median(cell_middles(grid)[:, 2]))
-        return [(z - NOMINAL[1], np.nan, z - NOMINAL[2])]
     bottom, top = _gaps(grid)
     columns = len(np.unique(grid.cells[:, 0].astype(np.int64) * grid.shape[1] + grid.cells[:, 1]))
     if len(bottom) > 0.15 * columns:
-        return _closed(grid, bottom, top)
+        found = _closed(grid, bottom, top)
+        if found:
+            return found
     area = np.convolve(np.bincount(grid.cells[:, 2], minlength=grid.shape[2]), np.ones(3), "same")
     level = int(area.argmax())
     z = grid.origin[2] + (level + 0.5) * grid.edge
@@ -158,10 +186,14 @@ def _closed(grid: VoxelGrid, bottom: Array, top: Array) -> list[tuple[float, flo
     area = np.convolve(np.bincount(bottom, minlength=grid.shape[2]).astype(float), np.ones(3), "same") * grid.edge**2
     least = min(max(LEAST_AREA, LEAST_SHARE * area.max()), area.max())
     floors: list[int] = []
+    level = np.bincount(grid.cells[:, 2], minlength=grid.shape[2])
+    near, far = round(0.3 / grid.edge), round(1.6 / grid.edge)
     for z in np.argsort(-area, kind="stable"):
         if area[z] < least:
             break
-        if all(abs(int(z) - f) * grid.edge >= GAP for f in floors):
+        # An upper side of a ceiling, as a map shows that lacks all that is low, has hardly anything standing on it.
+        hollow = level[z + near : z + far].sum() < 0.5 * level[max(z - far, 0) : max(z - near, 0)].sum()
+        if not hollow and all(abs(int(z) - f) * grid.edge >= GAP for f in floors):
             floors.append(int(z))
     found = []
     for z in sorted(floors):
@@ -194,7 +226,7 @@ def _ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: float, shape:
 
 
 def _plan(
-    occupied: Array, crossed: Array, origin: Array, cell: float, floor: float, ceiling: float, height: Array, sliced: bool
+    occupied: Array, crossed: Array, origin: Array, cell: float, floor: float, ceiling: float, heights: tuple[Array, Array], sliced: bool
 ) -> Plan:
     bands = _observed(occupied)
     body, walls = _mask(*BODY), _mask(*WALL) & bands
@@ -206,18 +238,17 @@ def _plan(
     shut = (occupied & np.uint32(_mask(0, 3) | _mask(BODY[1], 32))) > 0
     rays = _count(crossed & np.uint32(body)) >= max(int(body & bands).bit_count() // 2, 1)
     if sliced:
-        wall &= ~_small(wall, cell)
+        wall = _straight(wall, cell)
     free = ~standing & (rays | (shut & (not sliced)))
-    return Plan(origin, cell, wall, free, standing & ~wall, floor, ceiling, occupied, int(bands), height, sliced)
+    return Plan(origin, cell, wall, free, standing & ~wall, floor, ceiling, occupied, int(bands), *(h.astype(np.float32) for h in heights), sliced)
 
 
-def _small(mask: Array, cell: float) -> Array:
-    """Groups of columns that are too short for a wall: legs and chairs."""
-    label, _ = ndimage.label(ndimage.binary_dilation(mask, np.ones((3, 3))), np.ones((3, 3)))
-    boxes = ndimage.find_objects(label)
-    size = np.array([0.0] + [np.hypot(*(s.stop - s.start for s in box)) * cell for box in boxes])
-    small: Array = mask & (size[label] < SHORT)
-    return small
+def _straight(mask: Array, cell: float) -> Array:
+    """What a slice shows of walls: straight runs. Legs and chairs are as dense, but do not line up."""
+    angles = np.pi * np.arange(24) / 24
+    long = max(round(STRAIGHT / cell), 3)
+    found: Array = on_lines(mask, np.cos(angles), np.sin(angles), long, long - 1)
+    return found
 
 
 def _mask(first: int, last: int) -> int:

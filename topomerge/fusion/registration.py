@@ -1,0 +1,144 @@
+"""Registration of two whole maps by their geometry: search, judge, refine, believe or not (method 3; no rooms, no learning)."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.fusion.evidence import cell_middles, plans
+from topomerge.fusion.refine import refine_pose, surface
+from topomerge.fusion.scale import search_scaled
+from topomerge.fusion.search import View, search
+from topomerge.fusion.verify import MARGIN_CAP, Judge, model, probability, rank
+from topomerge.types import Sim3, TopometricMap, VoxelGrid
+
+log = logging.getLogger(__name__)
+ALTERNATIVES = 10
+DRIFTED = (0.5, np.radians(3.0))  # m, rad: a refinement that moves the middle by more has lost its way
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A hypothesis: T_ab, log odds that it is right seen by itself, and what it was judged by."""
+
+    transform: Sim3
+    plausibility: float
+    features: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Where map b lies in the frame of map a, and whether to believe it.
+
+    Args:
+        transform: T_ab of the best hypothesis, believed or not; None where there was none.
+        probability: that it is right, calibrated on simulated pairs; 0 without a hypothesis.
+        accepted: is the probability above the threshold that kept every training pair from a wrong merge?
+        features: what it was judged by (`verify.Judge`), with ``margin`` and ``rmse`` (m).
+        alternatives: the hypotheses, best first; the first one is the best before its fine registration.
+        reason: in words.
+        seconds: step -> s.
+    """
+
+    transform: Sim3 | None
+    probability: float
+    accepted: bool
+    features: dict[str, float] = field(default_factory=dict)
+    alternatives: tuple[Alternative, ...] = ()
+    reason: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+Map = TopometricMap | VoxelGrid
+
+
+def register(
+    a: Map,
+    b: Map,
+    *,
+    scale: str = "fixed",
+    hypotheses: Sequence[Sim3] = (),
+    free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
+    yaws: Sequence[float] = (),
+) -> Registration:
+    """The pose of map b in map a's frame. `register(b, a)` gives its inverse.
+
+    Args:
+        a, b: topometric maps or occupied cells.
+        scale: "fixed", or "free" where b's unit may differ (found between 0.5 and 2).
+        hypotheses: poses T_ab from matched rooms, tried beside those found by correlation.
+        free: cells of a and of b known to be empty; topometric maps bring their own.
+        yaws: further turns of b to try, rad.
+
+    Raises:
+        InputError: an empty map, or another word for the scale.
+    """
+    if scale not in ("fixed", "free"):
+        raise InputError(f"scale must be fixed or free, not {scale!r}")
+    if _order(b) < _order(a):  # so that nothing depends on which comes first
+        back = register(b, a, scale=scale, hypotheses=[h.inverse() for h in hypotheses], free=(free[1], free[0]), yaws=[-y for y in yaws])
+        return _inverse(back)
+    began = time.perf_counter()
+    first, second = ([View(p) for p in plans(m, f)] for m, f in zip((a, b), free, strict=True))
+    seconds = {"plans": time.perf_counter() - began}
+    began = time.perf_counter()
+    candidates = (search_scaled if scale == "free" else search)(first, second, hypotheses, yaws)
+    seconds["search"] = time.perf_counter() - began
+    if not candidates:
+        return Registration(None, 0.0, False, reason="the maps show no walls that could be compared", seconds=seconds)
+    began = time.perf_counter()
+    judge = Judge(first, second)
+    ranked = rank(candidates, judge)
+    seconds["verify"] = time.perf_counter() - began
+    margin = ranked[0][2] - ranked[1][2] if len(ranked) > 1 else MARGIN_CAP
+    best, features, _ = ranked[0]
+    began = time.perf_counter()
+    pose, rmse = best.pose, float("nan")
+    if not any(v.plan.sliced for v in (*first, *second)):
+        pose, rmse = _fine(_grid(a), _grid(b), best.pose, scale == "free")
+    seconds["refine"] = time.perf_counter() - began
+    chance = probability(features, margin)
+    accepted = chance >= model()["threshold"]
+    said = "believed" if accepted else "not believed"
+    reason = (
+        f"{said}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of free floor seen by both, "
+        f"{100 * features['conflict_share']:.1f} % of the walls stand on free floor of the other map"
+    )
+    others = tuple(Alternative(c.pose, s, f) for c, f, s in ranked[:ALTERNATIVES])
+    return Registration(pose, chance, bool(accepted), {**features, "margin": margin, "rmse": rmse}, others, reason, seconds)
+
+
+def _grid(m: Map) -> VoxelGrid:
+    return m.grid if isinstance(m, TopometricMap) else m
+
+
+def _order(m: Map) -> tuple[int, str]:
+    """Larger maps come first; among equal ones the order is arbitrary, but always the same."""
+    grid = _grid(m)
+    digest = hashlib.sha256(np.ascontiguousarray(grid.cells).tobytes() + grid.origin.tobytes()).hexdigest()
+    return -len(grid), digest
+
+
+def _fine(a: VoxelGrid, b: VoxelGrid, start: Sim3, scaled: bool) -> tuple[Sim3, float]:
+    """Point-to-plane refinement, unless it runs away."""
+    found = refine_pose(surface(a), surface(b), start, scaled)
+    middle = cell_middles(b).mean(axis=0)[None]
+    moved = float(np.linalg.norm(found.pose.apply(middle) - start.apply(middle)))
+    turned = abs((found.pose.yaw - start.yaw + np.pi) % (2 * np.pi) - np.pi)
+    if not np.isfinite(found.rmse) or moved > DRIFTED[0] or turned > DRIFTED[1]:
+        log.debug("refinement moved %.2f m, %.1f degrees: left out", moved, np.degrees(turned))
+        return start, float("nan")
+    return found.pose, found.rmse
+
+
+def _inverse(found: Registration) -> Registration:
+    """The same registration seen from the other map."""
+    others = tuple(replace(o, transform=o.transform.inverse()) for o in found.alternatives)
+    transform = None if found.transform is None else found.transform.inverse()
+    return replace(found, transform=transform, alternatives=others)
