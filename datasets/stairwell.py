@@ -20,6 +20,7 @@ APRON = 0.9  # m of floor before a flight
 STEP = 0.15  # m between places that are tried
 SPARE = 0.28  # m, half of what a person needs beside the flight
 DOORSTEP = 0.8  # m from a door's middle to the free floor
+POCKET = 0.5  # m2 of free floor that a flight may cut off
 TRIED = 60  # places of a kind of stairs
 
 
@@ -130,7 +131,7 @@ def _places(well: shapely.Polygon, kind: str, width: float, length: float, headi
 
 
 def _leaves_free(flight: Flight, rooms: tuple[shapely.Polygon, shapely.Polygon], doors: tuple[Array, Array]) -> bool:
-    """Can one walk from every door of both rooms to the flight's landings?"""
+    """Can one walk from every door of both rooms to the flight's landings, and to all of the floor?"""
     turn = rotation(flight.heading - np.pi / 2)
 
     def place(points: Array) -> Array:
@@ -144,6 +145,8 @@ def _leaves_free(flight: Flight, rooms: tuple[shapely.Polygon, shapely.Polygon],
         free = room.difference(body.buffer(0.02)).buffer(-SPARE, join_style="mitre")
         parts = [p for p in shapely.get_parts(free) if p.distance(shapely.Point(landing)) < 0.3]
         reached = max(parts, key=lambda p: p.area, default=None)
-        if reached is None or not len(middles) or shapely.distance(reached, shapely.points(middles)).max() > DOORSTEP:
+        if reached is None or free.area - reached.area > POCKET or not len(middles):
+            return False
+        if shapely.distance(reached, shapely.points(middles)).max() > DOORSTEP:
             return False
     return True
