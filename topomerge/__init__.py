@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from topomerge.types import VoxelGrid as VoxelGrid
     from topomerge.viz.figures import plan_figure as plan_figure
     from topomerge.viz.figures import save_figure as save_figure
+    from topomerge.viz.report import save_report as save_report
 
 __version__ = "0.1.0"
 
@@ -49,6 +50,7 @@ _HOMES = {
     "save_figure": "topomerge.viz.figures",
     "save_json": "topomerge.io.listing",
     "save_map": "topomerge.io.maps",
+    "save_report": "topomerge.viz.report",
     "save_rooms_ply": "topomerge.io.rooms_ply",
     "voxelise": "topomerge.extraction.voxels",
 }

@@ -94,9 +94,9 @@ def test_same_map_same_file(tmp_path: Path) -> None:
 def test_maps_with_little_in_them(tmp_path: Path) -> None:
     save_figure(without_rooms(building(1, 1)), tmp_path / "walls.png")
     grid = VoxelGrid.from_cells(np.zeros((0, 3), np.int32))
-    empty = without_rooms(
-        replace(building(1, 1), grid=grid, room=np.zeros(0, np.int32), navigable=grid, navigable_room=np.zeros(0, np.int32))
-    )
+    none = np.zeros(0, np.int32)
+    cells = {"room": none, "navigable_room": none, "navigable_area": none}
+    empty = without_rooms(replace(building(1, 1), grid=grid, navigable=grid, **cells))
     save_figure(replace(empty, source="$x^2$"), tmp_path / "empty.png")
     assert len(list(tmp_path.iterdir())) == 2
 

@@ -65,8 +65,8 @@ def wall_outline(plan: StoreyPlan, sheet: Sheet) -> str:
 
 
 def seen_outline(plan: StoreyPlan, sheet: Sheet) -> str:
-    """All that was seen of the storey, as the `d` of an SVG path."""
-    patches, count = ndimage.label(plan.floor)
+    """What was seen of the storey outside rooms, as the `d` of an SVG path."""
+    patches, count = ndimage.label(plan.floor & (whole_rooms(plan, sheet.frame) < 0))
     large = np.bincount(patches.ravel(), minlength=count + 1) >= SPECK / sheet.frame.size**2
     large[0] = False
     return trace(large[patches].astype(np.float32), sheet)

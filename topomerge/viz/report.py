@@ -104,7 +104,7 @@ def summary(map: TopometricMap) -> Markup:
     glimpsed = int(map.rooms["glimpsed"].sum())
     stairs = int((~way).sum())
     figures = [
-        (str(len(map.rooms)), "rooms", f"{glimpsed} only glimpsed" if glimpsed else ""),
+        (str(len(map.rooms)), "room" if len(map.rooms) == 1 else "rooms", f"{glimpsed} only glimpsed" if glimpsed else ""),
         (f"{float(map.rooms['area'].sum()):,.0f} m²".replace(",", "\u202f"), "floor area", ""),
         (str(len(map.storeys)), "storey" if len(map.storeys) == 1 else "storeys", ""),
         (str(int(way.sum())), "doors and openings", f"{shut} shut" if shut else ""),
@@ -146,7 +146,7 @@ def storey_names(map: TopometricMap) -> list[tuple[str, str]]:
 def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan]) -> Markup:
     """All storeys' plans, as `lay_out` made them; the page's script shows one at a time, zooms and switches layers."""
     names = storey_names(map)
-    choices = [element("button", name, type="button", data_storey=i) for i, (name, _) in enumerate(names)]
+    choices = [element("button", name, type="button", data_storey=i) for i, (name, _) in enumerate(names) if len(names) > 1]
     layers = [("labels", "numbers", True), ("graph", "graph", True), ("doors", "doors", True)]
     if len(names) > 1:
         layers.append(("all", "rooms of all storeys", False))
@@ -160,8 +160,8 @@ def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan]) -> 
         element("button", sign, type="button", data_zoom=step, title=words, aria_label=words)
         for sign, step, words in (("+", "in", "Zoom in"), ("−", "out", "Zoom out"), ("⤢", "all", "Show all"))
     ]
-    bar = element("div", element("div", *choices, class_="choices"), element("div", *boxes, class_="layers"),
-                  element("div", *zoom, class_="zoom"), class_="controls")  # fmt: skip
+    groups = [("choices", choices), ("layers", boxes), ("zoom", zoom)]
+    bar = element("div", *(element("div", *parts, class_=name) for name, parts in groups if parts), class_="controls")
     figures = [
         element("figure", element("figcaption", element("b", name), f" {words}"), drawing, data_storey=i)
         for i, ((name, words), drawing) in enumerate(zip(names, plan_svgs(map, sheet, plans), strict=True))

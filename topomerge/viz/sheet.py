@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class Sheet:
         turned = np.asarray(points, np.float64).reshape(-1, np.shape(points)[-1])[:, :2] @ rotation(self.turn).T
         return np.round(100 * (turned - self.corner) * (1, -1)).astype(np.int64)
 
-    def at(self, point: Array) -> tuple[int, int]:
+    def at(self, point: Any) -> tuple[int, int]:
         """The place on the paper of one point."""
         x, y = self.cm(np.asarray([point]))[0].tolist()
         return x, y

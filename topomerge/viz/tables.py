@@ -53,6 +53,8 @@ def rooms_table(map: TopometricMap, key: str = "") -> Markup:
     """All rooms; rows carry `data-room` and `data-storey`."""
     names = ("room", "storey", "area m²", "height m", "seen", "doors")
     columns = [*((name, "number") for name in names), ("leads to", "text")]
+    many = len(map.storeys) > 1
+    columns = [column for column in columns if many or column[0] != "storey"]
     colours = room_colours(map)
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
     rows = []
@@ -64,7 +66,7 @@ def rooms_table(map: TopometricMap, key: str = "") -> Markup:
         leads = join([*words, *(room_link(key, other) for other in beside)], " ")
         cells = [
             cell(join([swatch, str(i)]), i),
-            cell(str(room["storey"]), int(room["storey"])),
+            *([cell(str(room["storey"]), int(room["storey"]))] if many else []),
             measure(room["area"], 1),
             measure(room["height"], 2, room["height"] > 0),
             cell(seen, float(room["completeness"])),

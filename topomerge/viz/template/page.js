@@ -15,17 +15,9 @@ function startTheme(button) {
   tell();
 }
 
-function whenNear(element, start) { // a large view is made when one comes near to it
-  const watch = new IntersectionObserver((seen) => {
-    if (!seen.some((entry) => entry.isIntersecting)) return;
-    watch.disconnect();
-    start(element);
-  }, { rootMargin: "400px" });
-  watch.observe(element);
-}
-
 startTheme(document.getElementById("theme"));
 startHighlights();
 document.querySelectorAll("table.sortable").forEach(startTable);
 document.querySelectorAll(".plan-view").forEach(startPlan);
-document.querySelectorAll("[data-scene]").forEach((place) => whenNear(place, startScene));
+// The page is shown before the cells are read.
+requestAnimationFrame(() => setTimeout(() => document.querySelectorAll("[data-scene]").forEach(openScene)));

@@ -120,6 +120,17 @@ function control(kind, words, settings, changed) {
   return label;
 }
 
+function openScene(place) {
+  const missing = place.querySelector(".missing");
+  try {
+    if (!startScene(place)) place.replaceChildren(missing);
+    place.dataset.state = place.contains(missing) ? "missing" : "shown";
+  } catch (error) { // a driver that compiles nothing
+    place.replaceChildren(missing);
+    place.dataset.state = `missing: ${error.message}`;
+  }
+}
+
 function startScene(place) {
   const data = JSON.parse(document.getElementById(place.dataset.scene).textContent);
   const stage = document.createElement("div"), canvas = document.createElement("canvas"), words = document.createElement("canvas");
@@ -128,18 +139,18 @@ function startScene(place) {
   stage.tabIndex = 0;
   stage.append(canvas, words);
   const gl = canvas.getContext("webgl2", { antialias: true, powerPreference: "high-performance" });
-  if (!gl || !data.drawn) return; // the words that stand there say why
+  if (!gl || !data.drawn) return false; // the words that stand there say why
   const missing = place.querySelector(".missing");
-  canvas.addEventListener("webglcontextlost", () => { place.replaceChildren(missing); });
+  canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); stopped(place, missing); });
   const made = program(gl), at = (name) => gl.getUniformLocation(made, name);
   const cells = decode(data), arrays = upload(gl, cells), texture = gl.createTexture();
   const extent = data.shape.map((n) => n * data.edge);
   const [near, far] = data.look || [[0, 0, 0], extent];
   const size = Math.hypot(far[0] - near[0], far[1] - near[1]);
-  const camera = makeCamera(near.map((v, i) => (v + far[i]) / 2), size, data.turn);
+  const camera = makeCamera(near.map((v, i) => (v + far[i]) / 2), size, data.turn, data.storeys.length);
   const start = { ...camera, target: [...camera.target] };
   const shown = data.storeys.map(() => true);
-  const state = { cut: 2, apart: 0, numbers: true, colour: Object.keys(data.colours)[0], share: 1, still: true, timer: 0, asked: false };
+  const state = { cut: 2, apart: 0, numbers: true, colour: Object.keys(data.colours)[0], share: 1, rest: 1, still: true, timer: 0, asked: false };
   let last = 0;
 
   function recolour() {
@@ -169,8 +180,7 @@ function startScene(place) {
     drawNumbers(matrix, ratio);
   }
 
-  function drawCells(matrix) {
-    const share = state.still ? 1 : state.share;
+  function drawCells(matrix, share = state.still ? state.rest : Math.min(state.share, state.rest)) {
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.clearColor(...rgb(hexOf("--faint")).map((v) => v / 255), 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
@@ -192,6 +202,18 @@ function startScene(place) {
     });
   }
 
+  function measure() { // where a computer draws without a graphics card, not all cells in one go: it would stand still
+    const matrix = matrixOf(camera, 1), pixel = new Uint8Array(4);
+    let began = 0;
+    for (const share of [0.001, 0.05]) { // the first also makes the shaders ready
+      began = performance.now();
+      drawCells(matrix, share);
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // waits for the drawing
+    }
+    state.rest = Math.min(Math.max((0.05 * 500) / Math.max(performance.now() - began, 1), 0.05), 1);
+    state.share = state.rest;
+  }
+
   function drawNumbers(matrix, ratio) {
     const pen = words.getContext("2d");
     pen.clearRect(0, 0, words.width, words.height);
@@ -206,7 +228,7 @@ function startScene(place) {
     const taken = [];
     const top = shown.lastIndexOf(true);
     for (const [key, storey, x, y] of data.rooms) {
-      if (!shown[storey] || (storey < top && state.apart < 0.15 * size)) continue; // those above would stand on those below
+      if (!shown[storey] || (storey < top && state.apart < 0.1 * size)) continue; // those above would stand on those below
       const z = data.storeys[storey].floor - data.origin[2] + 0.6 + state.apart * storey;
       const spot = project(matrix, [x - data.origin[0], y - data.origin[1], z], words.width, words.height);
       if (!spot || taken.some(([u, v]) => Math.abs(u - spot[0]) < 20 * ratio && Math.abs(v - spot[1]) < 13 * ratio)) continue;
@@ -241,7 +263,10 @@ function startScene(place) {
     const parts = [cut];
     if (data.storeys.length > 1) {
       const most = Math.max(size * 0.6, 4);
-      parts.push(control("range", "Storeys apart", { min: 0, max: most, step: most / 100, value: most * 0.4 }, (value, output) => {
+      parts.push(control("range", "Storeys apart", { min: 0, max: most, step: most / 100, value: most * 0.2 }, (value, output) => {
+        const rise = ((value - state.apart) * (data.storeys.length - 1)) / 2; // the middle stays in the middle
+        camera.target[2] += rise;
+        start.target[2] += rise;
         state.apart = value;
         output.textContent = `${value.toFixed(1)} m`;
         ask();
@@ -286,10 +311,22 @@ function startScene(place) {
   const merged = data.merged > 1 ? ` Of ${data.cells.toLocaleString("en")} cells, cubes of ${data.merged} × ${data.merged} × ${data.merged} are drawn as one.` : "";
   told.textContent = `Drag to turn, with shift to move; click, then scroll to zoom.${merged}`;
   place.replaceChildren(controls(), stage, told);
+  [canvas.width, canvas.height] = [stage.clientWidth, stage.clientHeight];
+  measure();
   startCamera(stage, camera, moved);
   document.addEventListener("lit", () => { recolour(); ask(); });
   document.addEventListener("theme", () => { recolour(); ask(); });
   new ResizeObserver(ask).observe(stage);
+  return true;
+}
+
+function stopped(place, missing) {
+  const again = document.createElement("button");
+  again.type = "button";
+  again.textContent = "Show it again";
+  again.addEventListener("click", () => openScene(place));
+  missing.replaceChildren("The browser stopped the 3D view. ", again);
+  place.replaceChildren(missing);
 }
 
 function hexOf(name) {

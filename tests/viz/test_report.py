@@ -1,0 +1,323 @@
+"""Reports: what stands in them, that nothing from outside becomes markup, and that a browser shows them without a word."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes import two_rooms
+from tests.scenes_map import HEIGHT, building
+from tests.viz.test_figures import without_rooms
+from topomerge.cli import main
+from topomerge.errors import InputError
+from topomerge.types import AREA_DTYPE, EDGE_DTYPE, TopometricMap, VoxelGrid
+from topomerge.viz.markup import element, join, json_data
+from topomerge.viz.outline import whole_rooms
+from topomerge.viz.plan import frame_of, storey_plans
+from topomerge.viz.report import report_html, save_report
+from topomerge.viz.scene import leb128, scene_data
+from topomerge.viz.sheet import direction, lay_out
+
+EVIL = "</script><img src=x onerror=alert(1)>\"'&{{script}}<!--.ply"
+
+
+class Page(HTMLParser):
+    """The elements of a page, and that each is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.feed(text)
+        assert not self.open, self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in ("meta", "input", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def all(self, tag: str, name: str | None = None) -> list[dict[str, str | None]]:
+        found = [about for t, about in self.found if t == tag]
+        return [a for a in found if name is None or name in (a.get("class") or "").split()]
+
+
+def data_of(text: str) -> dict:
+    found = re.search(r'<script type="application/json" id="scene-data">(.*?)</script>', text, re.S)
+    assert found
+    return json.loads(found[1])
+
+
+def decoded(data: dict) -> np.ndarray:
+    """(n, 6): x, y, z, storey, room, seen; the way that the page's script reads them, slowly."""
+    numbers, rest, place = [], 0, 0
+    for byte in base64.b64decode(data["data"]):
+        rest, place = rest | (byte & 127) << place, place + 7
+        if byte < 128:
+            numbers.append(rest)
+            rest = place = 0
+    rows, at = [], 0
+    _, ny, nz = data["shape"]
+    for storey, room, seen, count in data["groups"]:
+        for number in np.cumsum(numbers[at : at + count]).tolist():
+            rows.append((number // (ny * nz), number // nz % ny, number % nz, storey, room, seen))
+        at += count
+    assert at == len(numbers) == data["drawn"]
+    return np.array(rows)
+
+
+def test_every_room_and_door_is_in_plan_and_table() -> None:
+    map = building(2, 2)
+    page = Page(report_html(map))
+    rows = page.all("tr")
+    assert [row["data-room"] for row in rows if "data-room" in row] == [str(i) for i in range(10)]
+    assert sorted(int(p["data-room"] or -1) for p in page.all("path", "room")) == list(range(10))
+    assert sorted(int(p["data-room"] or -1) for p in page.all("g", "label")) == list(range(10))
+    assert {row["data-edge"] for row in rows if "data-edge" in row} == {str(i) for i in range(len(map.edges))}
+    assert len(page.all("g", "door")) == len(map.edges) + 1  # the stairs stand on both storeys
+    assert len(page.all("svg", "plan")) == 2
+    assert [p["data-room"] for p in page.all("path", "glimpsed")] == ["0"]
+
+
+def test_one_file_without_a_network() -> None:
+    text = report_html(building(1, 1))
+    page = Page(text)
+    for _, about in page.found:
+        assert not {"src", "srcset", "action", "data", "ping"} & set(about)
+        assert (about.get("href") or "#") == "#"
+        assert not [name for name in about if name.startswith("on")]
+    assert "http://" not in text and "https://" not in text and "@import" not in text
+    policy = next(m["content"] for m in page.all("meta") if m.get("http-equiv") == "Content-Security-Policy")
+    assert policy and "default-src 'none'" in policy and "sha256-" in policy and "unsafe-inline'; script" in policy
+
+
+def test_names_stay_text() -> None:
+    map = building(1, 1)
+    odd = replace(map, source=f"/tmp/{EVIL}", warnings=(EVIL, "\udcff\x00"), parameters={EVIL: EVIL}, seconds={EVIL: 1.0})
+    plain, found = Page(report_html(map)), Page(report_html(odd))
+    assert not found.all("img")
+    assert len(found.all("script")) == len(plain.all("script")) == 2
+    assert report_html(odd).count("{{script}}") >= 4  # told as it is, not filled in
+    assert data_of(report_html(odd)) == data_of(report_html(map))
+
+
+def test_markup_escapes() -> None:
+    made = element("a", "<b>", element("i", "x&y"), class_="k", data_x='"<', title=None, hidden=True)
+    assert made == '<a class="k" data-x="&quot;&lt;" hidden>&lt;b&gt;<i>x&amp;y</i></a>'
+    assert join(["<", element("b")], "&") == "&lt;&<b></b>"  # what stands between is the program's own
+    data = json_data({"a": "</script><!--&\u2028"}, "x")
+    assert "</script>" not in data[:-9] and "<!--" not in data and "\u2028" not in data
+    assert json.loads(re.sub("<[^>]*>", "", data))["a"] == "</script><!--&\u2028"
+
+
+def test_same_map_same_bytes_written_whole(tmp_path: Path) -> None:
+    for name in ("a.html", "b.html"):
+        save_report(building(2, 2), tmp_path / name)
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "b.html"]
+    with pytest.raises(InputError, match="can't be written"):
+        save_report(building(1, 1), tmp_path / "absent" / "a.html")
+
+
+def test_size() -> None:
+    big = building(30, 1)  # 1,300 m2
+    assert big.rooms["area"].sum() > 1250
+    assert len(report_html(big)) < 3e6
+
+
+def test_cells_come_back() -> None:
+    map = building(1, 2)
+    found = decoded(scene_data(map))
+    cells = map.grid.cells - map.grid.cells.min(axis=0)
+    want = np.column_stack([cells, map.storey_of_cells(), map.room])
+    assert sorted(map_rows(found[:, :5])) == sorted(map_rows(want))
+
+
+def map_rows(rows: np.ndarray) -> list[tuple[int, ...]]:
+    return [tuple(row) for row in rows.tolist()]
+
+
+def test_many_cells_are_merged() -> None:
+    map = building(2, 1)
+    data = scene_data(map, most=len(map.grid) // 2, seen=np.arange(len(map.grid)) % 2)
+    assert data["merged"] == 2 and data["edge"] == 0.2 and data["cells"] == len(map.grid)
+    found = decoded(data)
+    assert len(found) <= len(map.grid) // 2
+    want = {tuple(row) for row in ((map.grid.cells - map.grid.cells.min(axis=0)) // 2).tolist()}
+    assert {row[:3] for row in map_rows(found)} == want and len(found) == len(want)
+    assert len(data["groups"]) == len(data["colours"]["room"])
+
+
+def test_leb128() -> None:
+    assert leb128(np.array([0, 127, 128, 300, 1 << 40])) == bytes([0, 127, 128, 1, 172, 2, 128, 128, 128, 128, 128, 32])
+    assert leb128(np.zeros(0, np.int64)) == b""
+
+
+@pytest.mark.parametrize("degrees", [-40, -20, 0, 10, 30, 44])
+def test_walls_run_along_the_paper(degrees: float) -> None:
+    i, j = np.indices((240, 240)) - 120
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    x, y = np.abs(c * i + s * j), np.abs(-s * i + c * j)
+    walls = ((x < 80) & (y < 50)) & ~((x < 77) & (y < 47))
+    assert np.degrees(direction(walls)) == pytest.approx(degrees, abs=1.0)
+
+
+def test_paper_and_building() -> None:
+    sheet, _ = lay_out(building(1, 1))
+    a, b, c, d, e, f = sheet.back
+    for point in ((2.5, -1.0), (6.0, 3.25)):
+        x, y = sheet.at(np.array(point))
+        assert (a * x + b * y + c, d * x + e * y + f) == pytest.approx(point, abs=0.006)
+    turned = replace(sheet, turn=0.4)
+    a, b, c, d, e, f = turned.back
+    x, y = turned.at(np.array([2.5, -1.0]))
+    assert (a * x + b * y + c, d * x + e * y + f) == pytest.approx((2.5, -1.0), abs=0.008)
+
+
+def test_small_gaps_are_filled_and_no_room_takes_from_another() -> None:
+    map = building(1, 1)
+    frame = frame_of(map)
+    plan = storey_plans(map, frame)[0]
+    holed = plan.room.copy()
+    holed[10:14, 10:30] = -1
+    found = whole_rooms(replace(plan, room=holed), frame)
+    assert (found[10:14, 10:30] == plan.room[10:14, 10:30]).all()
+    known = plan.room >= 0
+    assert (found[known] == plan.room[known]).all()
+
+
+def test_areas_and_stairs_are_drawn() -> None:
+    map = building(1, 2)
+    areas = np.zeros(2, AREA_DTYPE)
+    areas["room"] = 2
+    narrow = np.zeros(1, EDGE_DTYPE)
+    narrow["rooms"], narrow["centre"], narrow["width"] = (0, 1), map.rooms["centroid"][2], 1.8
+    edges = map.edges.copy()
+    stairs = edges["kind"] == "stairs"
+    edges["lower"][stairs] = edges["centre"][stairs] - (2, 0, 0)
+    edges["upper"][stairs] = edges["centre"][stairs] + (2, 0, HEIGHT * 0.1)
+    edges["open"][0] = False
+    page = Page(report_html(replace(map, areas=areas, narrows=narrow, edges=edges)))
+    assert len(page.all("line", "narrow")) == 1
+    assert len(page.all("path", "flight")) == 2 and len(page.all("path", "tread")) == 2
+    assert len(page.all("g", "shut")) == 1
+
+
+def nothing() -> TopometricMap:
+    grid = VoxelGrid.from_cells(np.zeros((0, 3), np.int32))
+    none = np.zeros(0, np.int32)
+    return without_rooms(replace(building(1, 1), grid=grid, room=none, navigable=grid, navigable_room=none, navigable_area=none))
+
+
+def test_maps_with_little_in_them() -> None:
+    for map in (without_rooms(building(1, 1)), nothing()):
+        page = Page(report_html(map))
+        assert len(page.all("svg", "plan")) == 1
+
+
+def test_a_map_of_two_far_cells() -> None:
+    grid = VoxelGrid.from_cells(np.array([[0, 0, 0], [200_000, 5, 3]]))
+    map = without_rooms(replace(building(1, 1), grid=grid, room=np.full(2, -1, np.int32)))
+    assert max(scene_data(map)["shape"]) <= 65_536 and scene_data(map)["drawn"] == 2
+
+
+def test_command_line_writes_it(tmp_path: Path) -> None:
+    np.save(tmp_path / "scan.npy", two_rooms().points())
+    words = ["extract", str(tmp_path / "scan.npy"), "-o", str(tmp_path / "a.tmap"), "--report", str(tmp_path / "a.html"), "-q"]
+    assert main(words) == 0
+    page = Page((tmp_path / "a.html").read_text(encoding="utf-8"))
+    assert len(page.all("path", "room")) == 2
+
+
+# In a browser ---------------------------------------------------------------------------------------------------------
+
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--enable-logging=stderr", "--virtual-time-budget=4000", "--window-size=1440,1500"),
+)
+# Presses the page's own buttons, then writes what it saw into its title.
+PROBE = """
+window.addEventListener("load", () => setTimeout(() => {
+  const seen = {};
+  const shown = () => [...document.querySelectorAll(".sheet figure")].map((figure) => !figure.hidden);
+  seen.first = shown();
+  document.querySelectorAll("button[data-storey]")[1].click();
+  seen.second = shown();
+  seen.rows = [...document.querySelectorAll("#plan tr[data-room]")].filter((row) => row.offsetParent).length;
+  const over = (element) => element.dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
+  over(document.querySelector('#plan tr[data-room="7"]'));
+  seen.lit = document.querySelector('path.room[data-room="7"]').classList.contains("on");
+  over(document.querySelector('path.room[data-room="8"]'));
+  seen.row = document.querySelector('#plan tr[data-room="8"]').classList.contains("on");
+  seen.told = document.querySelector(".told").textContent;
+  const heads = document.querySelectorAll("#plan thead button");
+  heads[2].click();
+  heads[2].click();
+  seen.areas = [...document.querySelectorAll("#plan tbody tr")].map((row) => Number(row.cells[2].dataset.value));
+  document.getElementById("theme").click();
+  seen.theme = getComputedStyle(document.body).backgroundColor;
+  seen.scene = document.querySelector(".scene").dataset.state;
+  document.title = JSON.stringify(seen);
+}, 500));
+"""
+
+
+def browser() -> str:
+    for name in ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"):
+        path = shutil.which(name)
+        if path:
+            return path
+    pytest.skip("no Chromium here: apt-get install chromium")
+
+
+def browse(page: Path, *more: str) -> tuple[str, list[str]]:
+    """The page after its scripts, and what they wrote to the console."""
+    profile = page.parent / "profile"
+    command = [browser(), *FLAGS, f"--user-data-dir={profile}", *more, page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True, errors="replace")
+    lines = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    return done.stdout, [line for line in lines if "GPU stall due to ReadPixels" not in line]  # of software drawing
+
+
+def with_probe(text: str) -> str:
+    digest = base64.b64encode(hashlib.sha256(PROBE.encode()).digest()).decode()
+    text = text.replace("script-src ", f"script-src 'sha256-{digest}' ")
+    return text.replace("</body>", f"<script>{PROBE}</script></body>")
+
+
+def test_in_a_browser(tmp_path: Path) -> None:
+    page = tmp_path / "a.html"
+    map = replace(building(2, 2), source=EVIL, warnings=(EVIL,))
+    page.write_text(with_probe(report_html(map)), encoding="utf-8")
+    text, console = browse(page, "--dump-dom")
+    assert console == []
+    title = re.search("<title>(.*?)</title>", text)
+    assert title
+    seen = json.loads(title[1].replace("&quot;", '"'))
+    assert (seen["first"], seen["second"]) == ([True, False], [False, True])
+    assert seen["rows"] == 5 and seen["lit"] and seen["row"]
+    assert seen["told"].startswith("room 8 · storey 1 · area")
+    assert seen["areas"] == sorted(seen["areas"], reverse=True)
+    assert seen["theme"] == "rgb(19, 21, 23)"
+    assert seen["scene"] == "shown"
+
+
+def test_without_webgl_words_stand_there(tmp_path: Path) -> None:
+    page = tmp_path / "a.html"
+    save_report(building(1, 1), page)
+    text, console = browse(page, "--dump-dom", "--disable-3d-apis")
+    assert 'data-state="missing"' in text and "does not offer" in text
+    assert console == []
