@@ -72,7 +72,8 @@ class Truth:
     def columns(self, places: Array) -> tuple[Array, Array]:
         """(n, 2) rows and columns of places in the building's frame, and which of them are on the raster."""
         ij = np.floor((places[:, 1::-1] - self.origin[::-1]) / CELL).astype(np.int64)
-        return ij, ((ij >= 0) & (ij < self.raster.shape[1:])).all(axis=1)
+        inside: Array = np.all((ij >= 0) & (ij < self.raster.shape[1:]), axis=1)
+        return ij, inside
 
 
 def truth_of(
@@ -183,8 +184,8 @@ def _most(truth: Truth, places: Array, room: Array) -> Array:
     out = np.full(truth.raster.shape[1:], -1, np.int32)
     ij, inside = truth.columns(places)
     if inside.any():
-        count = int(room.max()) + 1
-        key = (ij[inside, 0] * out.shape[1] + ij[inside, 1]) * count + room[inside]
+        count, columns = int(room.max()) + 1, truth.raster.shape[2]
+        key = (ij[inside, 0] * columns + ij[inside, 1]) * count + room[inside]
         key, votes = np.unique(key, return_counts=True)
         key = key[np.argsort(votes, kind="stable")]
         out.ravel()[key // count] = key % count
