@@ -299,8 +299,8 @@ def _closet(draft: Draft, row: Row, span: Range, rng: np.random.Generator) -> in
     """A closet in the corner of a room, beside the corridor."""
     a, b = span
     wide, deep = np.round(rng.uniform(1.6, min(2.4, (b - a) / 2.1)), 2), np.round(rng.uniform(1.75, 2.8), 2)
-    left = rng.random() < 0.5
-    return draft.room(row.outline(*((a, a + wide) if left else (b - wide, b)), min(deep, row.depth(a) * 0.6)), "storage")
+    start = a if rng.random() < 0.5 else b - wide
+    return draft.room(row.outline(start, start + wide, min(deep, row.depth(a) * 0.6)), "storage")
 
 
 def _ensuite(draft: Draft, row: Row, span: Range, kind: str, corridor: int) -> list[tuple[int, int]]:

@@ -22,13 +22,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PIXEL = 0.04  # m
-PICTURES = {  # file -> slice (m above the floor), and columns: (real cloud) or (kind, seed, kind of room, sensor)
-    "realism_depth": ((0.3, 2.0), [("octomap fr078",), ("lab", 101, "lab", "depth"), ("office", 103, "office", "depth")]),
+Column = str | tuple[str, int, str, str]  # a real cloud, or kind and seed of a building, kind of room, and sensor
+PICTURES: dict[str, tuple[tuple[float, float], list[Column]]] = {  # file -> slice (m above the floor) and columns
+    "realism_depth": ((0.3, 2.0), ["octomap fr078", ("lab", 101, "lab", "depth"), ("office", 103, "office", "depth")]),
     "realism_tablet": (
         (1.8, 4.0),
-        [("iPad pix4d_user 470_user",), ("iPad user 808-60",), ("lab", 100, "lab", "tablet"), ("lab", 109, "lab", "tablet")],
+        ["iPad pix4d_user 470_user", "iPad user 808-60", ("lab", 100, "lab", "tablet"), ("lab", 109, "lab", "tablet")],
     ),
-    "realism_laser": ((0.3, 2.0), [("apartment cloud_0",), ("apartment cloud_1",), ("apartment", 104, "bedroom", "tls")]),
+    "realism_laser": ((0.3, 2.0), ["apartment cloud_0", "apartment cloud_1", ("apartment", 104, "bedroom", "tls")]),
 }  # fmt: skip
 AROUND = 1.2  # m about a simulated room
 
@@ -37,7 +38,7 @@ View = tuple[str, Array, float]  # title, points (n, 3) m, height of the floor
 
 def real(folder: Path) -> dict[str, View]:
     """The real clouds of the pictures, turned so that their longer side lies across, about their room where it was drawn."""
-    wanted = {column[0] for _, columns in PICTURES.values() for column in columns if len(column) == 1}
+    wanted = {column for _, columns in PICTURES.values() for column in columns if isinstance(column, str)}
     out = {}
     for title, cloud, floor, _ in real_clouds(folder):
         if title in wanted:
@@ -78,7 +79,7 @@ def draw(folder: Path, out: Path) -> list[Path]:
 
     clouds, paths = real(folder), []
     for name, (heights, columns) in PICTURES.items():
-        views = [clouds[c[0]] if len(c) == 1 else simulated(*c) for c in columns if len(c) > 1 or c[0] in clouds]  # type: ignore[arg-type]
+        views = [clouds[c] if isinstance(c, str) else simulated(*c) for c in columns if not isinstance(c, str) or c in clouds]
         figure = Figure(figsize=(4.2 * len(views), 5.6), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots(2, len(views), squeeze=False, height_ratios=(3, 1.6))
@@ -97,9 +98,9 @@ def draw(folder: Path, out: Path) -> list[Path]:
 def _density(ax: Axes, points: Array) -> None:
     """Points as darkness, on a logarithmic scale."""
     low, high = points.min(axis=0) - PIXEL, points.max(axis=0) + 2 * PIXEL
-    count, x, y = np.histogram2d(*points.T, bins=[np.arange(a, b, PIXEL) for a, b in zip(low, high, strict=True)])
+    count, (x, y) = np.histogramdd(points, bins=[np.arange(a, b, PIXEL) for a, b in zip(low, high, strict=True)])
     most = np.log1p(np.quantile(count[count > 0], 0.95)) if count.any() else 1.0
-    span = (x[0], x[-1], y[0], y[-1])
+    span = (float(x[0]), float(x[-1]), float(y[0]), float(y[-1]))
     ax.imshow(np.log1p(count.T), origin="lower", extent=span, cmap="gray_r", vmin=0, vmax=most, interpolation="nearest")
     ax.tick_params(labelsize=7)
 

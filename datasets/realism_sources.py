@@ -157,7 +157,7 @@ def real_clouds(folder: Path) -> Iterator[tuple[str, PointCloud, float, float]]:
         yield "octomap fr078", cloud, floor, floor + 2.7
     for path in sorted((folder / APARTMENT).glob("*.vtk")):
         cloud = read_vtk(path)
-        yield f"apartment {path.stem}", cloud, *(level(cloud.points, top=t) for t in (False, True))
+        yield f"apartment {path.stem}", cloud, level(cloud.points, top=False), level(cloud.points, top=True)
 
 
 def level(points: Array, top: bool) -> float:
