@@ -1,7 +1,7 @@
 // A camera that orbits a target, z up. Matrices are column-major, as WebGL wants them.
 
 function makeCamera(centre, size, turn, storeys) { // `turn`: what stands upright on paper does here, too
-  return { target: [...centre], distance: size * (0.72 + 0.2 * Math.min(storeys - 1, 4)), yaw: -Math.PI / 2 - turn, pitch: 0.95, size };
+  return { target: [...centre], distance: size * (0.72 + 0.24 * Math.min(storeys - 1, 4)), yaw: -Math.PI / 2 - turn, pitch: storeys > 1 ? 0.75 : 0.95, size };
 }
 
 function eyeOf(camera) {

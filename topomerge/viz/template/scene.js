@@ -101,6 +101,8 @@ function upload(gl, { cells, first, count }) { // one vertex array a storey
   });
 }
 
+const LONGEST = 1500; // ms that a picture may take once the view rests
+
 const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
 
 function paint(gl, texture, colours) {
@@ -165,7 +167,7 @@ function startScene(place) {
     state.asked = false;
     if (!state.still && last) { // too slow while moving: draw fewer, larger cubes
       const took = time - last;
-      if (took > 45) state.share = Math.max(state.share * 0.7, 0.04);
+      if (took > 45) state.share = Math.max(state.share * 0.7, 0.02);
       else if (took < 22) state.share = Math.min(state.share * 1.15, 1);
     }
     last = state.still ? 0 : time;
@@ -190,7 +192,7 @@ function startScene(place) {
     gl.uniformMatrix4fv(at("matrix"), false, matrix);
     gl.uniform3fv(at("eye"), eyeOf(camera));
     gl.uniform1f(at("edge"), data.edge);
-    gl.uniform1f(at("size"), Math.min(1 / Math.sqrt(share), 5));
+    gl.uniform1f(at("size"), Math.min(1 / Math.sqrt(share), 4));
     gl.uniform1f(at("tall"), 2.5);
     data.storeys.forEach(({ floor }, storey) => {
       if (!shown[storey] || !cells.count[storey]) return;
@@ -203,15 +205,16 @@ function startScene(place) {
   }
 
   function measure() { // where a computer draws without a graphics card, not all cells in one go: it would stand still
-    const matrix = matrixOf(camera, 1), pixel = new Uint8Array(4);
-    let began = 0;
-    for (const share of [0.001, 0.05]) { // the first also makes the shaders ready
-      began = performance.now();
+    const matrix = matrixOf(camera, canvas.width / canvas.height), pixel = new Uint8Array(4);
+    const took = [0.001, 0.001, 0.1].map((share) => { // the first also makes the shaders ready
+      const began = performance.now();
       drawCells(matrix, share);
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // waits for the drawing
-    }
-    state.rest = Math.min(Math.max((0.05 * 500) / Math.max(performance.now() - began, 1), 0.05), 1);
-    state.share = state.rest;
+      return performance.now() - began;
+    });
+    const all = (took[2] - took[1]) * 10;
+    state.rest = Math.min(Math.max((LONGEST - took[1]) / Math.max(all, 1), 0.1), 1);
+    state.share = Math.min(state.rest, 60 / Math.max(all, 1));
   }
 
   function drawNumbers(matrix, ratio) {
@@ -263,7 +266,7 @@ function startScene(place) {
     const parts = [cut];
     if (data.storeys.length > 1) {
       const most = Math.max(size * 0.6, 4);
-      parts.push(control("range", "Storeys apart", { min: 0, max: most, step: most / 100, value: most * 0.2 }, (value, output) => {
+      parts.push(control("range", "Storeys apart", { min: 0, max: most, step: most / 100, value: most * 0.5 }, (value, output) => {
         const rise = ((value - state.apart) * (data.storeys.length - 1)) / 2; // the middle stays in the middle
         camera.target[2] += rise;
         start.target[2] += rise;
