@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.extraction.assumed import with_assumed_floor
 from topomerge.extraction.ceilings import without_ceilings
 from topomerge.extraction.clustering import INFLATIONS, cluster_views
 from topomerge.extraction.convolution import Kernel, sphere, stick
 from topomerge.extraction.dilation import dilate_upwards
 from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.extraction.floors import floor_components, largest_component
+from topomerge.extraction.free_space import carve_rays, carve_views
 from topomerge.extraction.gaps import bridge_gaps
 from topomerge.extraction.noise import without_flying_cells
 from topomerge.extraction.propagation import propagate_labels
@@ -35,6 +37,8 @@ Progress = Callable[[float, str], None]
 
 
 FINEST, COARSE, COARSEST = 0.02, 0.15, 0.3  # m: above the second, walls beside a door leave too little of it
+HEIGHT_OF_EYES = 1.5  # m, of the views that carve
+MOST_RAYS = 400_000  # kept of a portion of two million points
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,8 @@ class Preset:
     absorb: bool = True  # give smaller pieces to the room they touch
     door: float = 0.5  # narrowings of the floor that are doors with this probability part rooms; 0: rooms come from the views
     narrow: float = 0.2  # and with this one areas of a room
+    assume: bool = True  # a floor for slices and for scans of the upper half of rooms
+    carve: bool = True  # the space that rays crossed
 
 
 PRESETS = {
@@ -79,6 +85,8 @@ PRESETS = {
         tolerance=0.0,
         absorb=False,
         door=0.0,
+        assume=False,
+        carve=False,
     ),
 }
 
@@ -124,6 +132,9 @@ def _extract(
     """The steps themselves."""
     with clock("read and voxelise", 0.0):
         grid = _grid(source, voxel_size, known)
+        if p.assume:
+            grid, assumed = with_assumed_floor(grid, known.get("rays"))
+            known["warnings"] += [assumed] if assumed else []
     with clock("navigable volume", 0.3):
         navigable = navigable_volume(grid, p)
     parameters = {**asdict(p), "voxel_size": grid.edge, "preset": preset if isinstance(preset, str) else "custom"}
@@ -132,15 +143,17 @@ def _extract(
             floor = rooms_of_plans(grid, navigable, p.door, p.narrow, p.stem_height + p.body_height)
     else:
         floor, parameters["inflation"] = rooms_of_views(grid, navigable, p, clock)
-    with clock("topology", 0.9):
+    with clock("topology", 0.85):
         result = topometric_map(grid, floor, p.stem_height + p.body_height)
+    with clock("free space", 0.9):
+        free = known.get("free") or free_space(grid, navigable, known.get("rays"), p)
     if grid.edge > COARSE:
         known["warnings"].append(f"cells of {grid.edge:g} m are coarse: doors may be lost, {COARSE} m or less finds them")
     if not len(result.rooms):
         known["warnings"].append("no room was found: take larger voxels if the points are sparse, smaller ones if they are dense")
     return replace(
         result,
-        free=known.get("free"),
+        free=free,
         source=name if name is not None else known.get("source", ""),
         parameters=parameters,
         seconds=clock.seconds,
@@ -170,6 +183,15 @@ def navigable_volume(grid: VoxelGrid, p: Preset) -> VoxelGrid:
             "--up and --unit, or take larger voxels if the points are sparse"
         )
     return navigable
+
+
+def free_space(grid: VoxelGrid, navigable: VoxelGrid, rays: tuple[Array, Array] | None, p: Preset) -> VoxelGrid | None:
+    """Cells known to be empty: crossed by the sensor's rays, or where its places are unknown, seen through from views."""
+    if not p.carve:
+        return None
+    if rays is not None:
+        return carve_rays(grid, *rays)
+    return carve_views(grid, navigable, HEIGHT_OF_EYES, p.range, p.tolerance)
 
 
 def optimal_views(grid: VoxelGrid, navigable: VoxelGrid, p: Preset) -> Array:
@@ -229,9 +251,23 @@ def _grid(source: Any, edge: float, known: dict[str, Any]) -> VoxelGrid:
             known["source"] = chunk.source
             known["free"] = chunk.free if chunk.free is not None else known.get("free")
             known["warnings"] += [w for w in chunk.warnings if w not in known["warnings"]]
+            if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
+                rays.append(_rays(chunk))
             yield chunk
 
-    return voxelise(chunks(), edge, known["warnings"])
+    rays: list[tuple[Array, Array]] = []
+    grid = voxelise(chunks(), edge, known["warnings"])
+    if rays:
+        known["rays"] = tuple(np.concatenate(part) for part in zip(*rays, strict=True))
+    return grid
+
+
+def _rays(cloud: PointCloud) -> tuple[Array, Array]:
+    """Places of the sensor and of what it saw, m: an even selection of the points whose pose is known."""
+    assert cloud.poses is not None and cloud.pose_of is not None
+    rows = np.arange(0, len(cloud), max(len(cloud) // MOST_RAYS, 1))
+    rows = rows[cloud.pose_of[rows] >= 0]
+    return cloud.poses[cloud.pose_of[rows], :3, 3], cloud.points[rows] + cloud.shift
 
 
 class _Clock:

@@ -86,7 +86,7 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, kn
         at = known[:, :2] - low
         at = at[_within(at, size)]
         inside[tuple(at.T)] = True
-    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), e)
+    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), ~np.isnan(clear), e)
     return Plan(e, low, base, top, profile, wall, inside, ceiling, clear)
 
 
@@ -179,8 +179,8 @@ def _without_clutter(wall: Array, edge: float) -> Array:
     return keep[piece]
 
 
-def _filled(inside: Array, wall: Array, seen: Array, edge: float) -> Array:
-    """What is known, without small holes and without scraps in which no floor was seen."""
+def _filled(inside: Array, wall: Array, seen: Array, covered: Array, edge: float) -> Array:
+    """What is known, without small holes and without parts of which neither a floor was seen nor a ceiling with walls around."""
     reach = max(round(0.2 / edge), 1)
     closed = ndimage.binary_closing(np.pad(inside | wall, reach), np.ones((2 * reach + 1,) * 2))[reach:-reach, reach:-reach]
     hole, count = ndimage.label(~closed)
@@ -193,7 +193,13 @@ def _filled(inside: Array, wall: Array, seen: Array, edge: float) -> Array:
         closed |= small[hole]
     inside = closed & ~wall
     piece, count = ndimage.label(inside)
+    area = np.maximum(np.bincount(piece.ravel(), minlength=count + 1), 1)
     floor = np.bincount(piece[seen & inside], minlength=count + 1)
-    keep = floor * edge**2 >= LEAST_FLOOR
+    roof = np.bincount(piece[covered & inside], minlength=count + 1)
+    outline = inside & ndimage.binary_dilation(~inside, np.ones((3, 3)))
+    walled = outline & ndimage.binary_dilation(wall, np.ones((3, 3)))
+    around = np.bincount(piece[walled], minlength=count + 1) / np.maximum(np.bincount(piece[outline], minlength=count + 1), 1)
+    closed_in = (roof >= 0.5 * area) & (around >= 0.6) & (area * edge**2 >= 2 * LEAST_FLOOR)
+    keep = (floor * edge**2 >= LEAST_FLOOR) | closed_in
     keep[0] = False
     return keep[piece]

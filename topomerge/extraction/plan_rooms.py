@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from topomerge.extraction.components import spread_labels
 from topomerge.extraction.judge import door_probability
 from topomerge.extraction.partition import Pair, merge_regions
 from topomerge.extraction.passages import clearance_of, find_passages, regions_of
@@ -19,6 +20,8 @@ WALL_REACH = 0.5  # m: so far into walls and what stands before them the cells o
 OVER_CEILING = 0.4  # m
 UNDER_FLOOR = 0.25  # m
 LEAST_ROOM = 0.8  # m2
+LEAST_HALF_WIDTH = 0.35  # m: what is nowhere wider is the edge of a facade or of a slab
+DOORWAY = 0.5  # m: so far the navigable volume goes on into what looks like wall: the openings of noisy scans
 OPEN_ALL_AROUND = 0.25  # share of the outline with walls, and of the floor with a ceiling: less, and a floor may be a ceiling
 
 
@@ -75,7 +78,9 @@ def _partition(grid: VoxelGrid, plan: Plan, door: float, narrow: float, above_an
         region = _without_ceilings(grid, plan, region)
     found = merge_regions(region, clearance, find_passages(plan, clearance, region), plan.edge, door_probability, door, narrow, LEAST_ROOM)
     size = np.bincount(found.room[region[region >= 0]], minlength=len(found.room)) * plan.edge**2
-    large = np.flatnonzero(size >= LEAST_ROOM)
+    widest = np.zeros(len(size))
+    np.maximum.at(widest, found.room[region[region >= 0]], clearance[region >= 0])
+    large = np.flatnonzero((size >= LEAST_ROOM) & (widest >= LEAST_HALF_WIDTH))
     number = np.full(len(size) + 1, -1)
     number[large] = np.arange(len(large))
     room_of = np.append(number[found.room], -1)
@@ -151,9 +156,14 @@ def _floor(
         empty = np.zeros(0, np.int32)
         return Floor(grid.with_cells(np.zeros((0, 3), np.int32)), storeys, empty, empty, empty, empty, label)
     cells, standing, storey, room, area = (np.concatenate(c) for c in zip(*parts, strict=True))
-    ok = ((cells >= 0) & (cells < grid.shape)).all(axis=1) & (room >= 0)
+    ok = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
     tables = {"standing": standing[ok], "storey": storey[ok], "room": room[ok], "area": area[ok]}
     whole = grid.with_cells(cells[ok], tables)
     of = {name: values.astype(np.int32) for name, values in whole.properties.items()}
-    floor = grid.with_cells(whole.cells, {"standing": of["standing"].astype(bool)})
+    in_a_room = of["room"] >= 0
+    of["room"] = spread_labels(whole, of["room"], round(DOORWAY / grid.edge)).astype(np.int32)
+    of["area"] = spread_labels(whole, of["area"], round(DOORWAY / grid.edge)).astype(np.int32)
+    kept = (of["room"] >= 0) & (in_a_room | of["standing"].astype(bool))
+    of = {name: values[kept] for name, values in of.items()}
+    floor = grid.with_cells(whole.cells[kept], {"standing": of["standing"].astype(bool)})
     return Floor(floor, storeys, of["storey"], of["room"], of["area"], np.concatenate(owners).astype(np.int32), label, 0.0, probability)

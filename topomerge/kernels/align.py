@@ -126,7 +126,7 @@ def tally(points, kinds, facing, inner, kind, to_wall, to_any, face, open_, orig
         if what == CLUTTER:
             out[6] += 1
             out[7] += close
-        else:
+        elif what == FREE:
             out[8] += 1
             out[9] += close
     return out
