@@ -148,10 +148,10 @@ def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan]) -> 
     names = storey_names(map)
     choices = [element("button", name, type="button", data_storey=i) for i, (name, _) in enumerate(names) if len(names) > 1]
     layers = [("labels", "numbers", True), ("graph", "graph", True), ("doors", "doors", True)]
-    if len(names) > 1:
-        layers.append(("all", "rooms of all storeys", False))
     if len(map.narrows):
         layers.append(("areas", "areas", True))
+    if len(names) > 1:
+        layers.append(("all", "rooms of all storeys", False))
     boxes = []
     for layer, name, on in layers:
         box = element("input", type="checkbox", checked=on, data_layer=layer)

@@ -19,5 +19,6 @@ startTheme(document.getElementById("theme"));
 startHighlights();
 document.querySelectorAll("table.sortable").forEach(startTable);
 document.querySelectorAll(".plan-view").forEach(startPlan);
-// The page is shown before the cells are read.
-requestAnimationFrame(() => setTimeout(() => document.querySelectorAll("[data-scene]").forEach(openScene)));
+// The page is shown before the cells are read; that there is no 3D is said only once it is known.
+document.querySelectorAll("[data-scene]").forEach((place) => place.classList.add("waiting"));
+setTimeout(() => document.querySelectorAll("[data-scene]").forEach(openScene), 50);

@@ -82,26 +82,17 @@ function program(gl) {
   return made;
 }
 
-function upload(gl, { cells, first, count }) { // one vertex array a storey
-  const buffer = gl.createBuffer();
-  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+function upload(gl, cells) {
+  const corners = gl.createBuffer(), faces = [0, 4, 8].flatMap((v) => [v, v + 1, v + 2, v + 2, v + 1, v + 3]);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, corners);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint16Array(faces), gl.STATIC_DRAW);
+  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ARRAY_BUFFER, cells, gl.STATIC_DRAW);
-  const corners = gl.createBuffer();
-  const faces = [0, 4, 8].flatMap((v) => [v, v + 1, v + 2, v + 2, v + 1, v + 3]);
-  return count.map((_, storey) => {
-    const array = gl.createVertexArray();
-    gl.bindVertexArray(array);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, corners);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint16Array(faces), gl.STATIC_DRAW);
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 4, gl.UNSIGNED_SHORT, 8, 8 * first[storey]);
-    gl.vertexAttribDivisor(0, 1);
-    return array;
-  });
+  gl.enableVertexAttribArray(0);
+  gl.vertexAttribDivisor(0, 1);
 }
 
-const LONGEST = 1500; // ms that a picture may take once the view rests
+const LONGEST = 400; // ms that one pass may take once the view rests: what is not drawn by then follows in the next
 
 const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
 
@@ -131,6 +122,7 @@ function openScene(place) {
     place.replaceChildren(missing);
     place.dataset.state = `missing: ${error.message}`;
   }
+  place.classList.remove("waiting");
 }
 
 function startScene(place) {
@@ -140,19 +132,20 @@ function startScene(place) {
   words.className = "words";
   stage.tabIndex = 0;
   stage.append(canvas, words);
-  const gl = canvas.getContext("webgl2", { antialias: true, powerPreference: "high-performance" });
+  const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true, powerPreference: "high-performance" });
   if (!gl || !data.drawn) return false; // the words that stand there say why
   const missing = place.querySelector(".missing");
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); stopped(place, missing); });
   const made = program(gl), at = (name) => gl.getUniformLocation(made, name);
-  const cells = decode(data), arrays = upload(gl, cells), texture = gl.createTexture();
+  const cells = decode(data), texture = gl.createTexture();
+  upload(gl, cells.cells);
   const extent = data.shape.map((n) => n * data.edge);
   const [near, far] = data.look || [[0, 0, 0], extent];
   const size = Math.hypot(far[0] - near[0], far[1] - near[1]);
   const camera = makeCamera(near.map((v, i) => (v + far[i]) / 2), size, data.turn, data.storeys.length);
   const start = { ...camera, target: [...camera.target] };
   const shown = data.storeys.map(() => true);
-  const state = { cut: 2, apart: 0, numbers: true, colour: Object.keys(data.colours)[0], share: 1, rest: 1, still: true, timer: 0, asked: false };
+  const state = { cut: 2, apart: 0, numbers: true, colour: Object.keys(data.colours)[0], share: 1, rest: 1, drawn: 0, still: true, timer: 0, asked: false };
   let last = 0;
 
   function recolour() {
@@ -178,29 +171,34 @@ function startScene(place) {
     }
     if (!canvas.width) return;
     const matrix = matrixOf(camera, canvas.width / canvas.height);
-    drawCells(matrix);
+    if (state.still) {
+      drawCells(matrix, state.drawn, Math.min(state.drawn + state.rest, 1), 1);
+      state.drawn += state.rest;
+      if (state.drawn < 1) again();
+    } else drawCells(matrix, 0, state.share, Math.min(1 / Math.sqrt(state.share), 4));
     drawNumbers(matrix, ratio);
   }
 
-  function drawCells(matrix, share = state.still ? state.rest : Math.min(state.share, state.rest)) {
+  function drawCells(matrix, from, to, cube) { // shares of the cells of each storey; what was drawn before stays
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.clearColor(...rgb(hexOf("--faint")).map((v) => v / 255), 1);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    if (from === 0) gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.useProgram(made);
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.uniformMatrix4fv(at("matrix"), false, matrix);
     gl.uniform3fv(at("eye"), eyeOf(camera));
     gl.uniform1f(at("edge"), data.edge);
-    gl.uniform1f(at("size"), Math.min(1 / Math.sqrt(share), 4));
+    gl.uniform1f(at("size"), cube);
     gl.uniform1f(at("tall"), 2.5);
     data.storeys.forEach(({ floor }, storey) => {
       if (!shown[storey] || !cells.count[storey]) return;
       const ground = floor - data.origin[2];
       gl.uniform1f(at("ground"), ground);
       gl.uniform2f(at("level"), state.apart * storey, state.cut === null ? 1e9 : (ground + state.cut) / data.edge);
-      gl.bindVertexArray(arrays[storey]);
-      gl.drawElementsInstanced(gl.TRIANGLES, 18, gl.UNSIGNED_SHORT, 0, Math.ceil(cells.count[storey] * share));
+      const [first, end] = [from, to].map((share) => Math.ceil(cells.count[storey] * share));
+      gl.vertexAttribIPointer(0, 4, gl.UNSIGNED_SHORT, 8, 8 * (cells.first[storey] + first));
+      gl.drawElementsInstanced(gl.TRIANGLES, 18, gl.UNSIGNED_SHORT, 0, end - first);
     });
   }
 
@@ -208,12 +206,12 @@ function startScene(place) {
     const matrix = matrixOf(camera, canvas.width / canvas.height), pixel = new Uint8Array(4);
     const took = [0.001, 0.001, 0.1].map((share) => { // the first also makes the shaders ready
       const began = performance.now();
-      drawCells(matrix, share);
+      drawCells(matrix, 0, share, 1);
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // waits for the drawing
       return performance.now() - began;
     });
     const all = (took[2] - took[1]) * 10;
-    state.rest = Math.min(Math.max((LONGEST - took[1]) / Math.max(all, 1), 0.1), 1);
+    state.rest = Math.min(Math.max((LONGEST - took[1]) / Math.max(all, 1), 0.05), 1);
     state.share = Math.min(state.rest, 60 / Math.max(all, 1));
   }
 
@@ -241,7 +239,12 @@ function startScene(place) {
     }
   }
 
-  function ask() {
+  function ask() { // from anew
+    state.drawn = 0;
+    again();
+  }
+
+  function again() {
     if (!state.asked) requestAnimationFrame(frame);
     state.asked = true;
   }
