@@ -104,7 +104,7 @@ def test_free_scale(tmp_path: Path) -> None:
         (["--building", "office", "--rooms", "2"], "rooms 3 or more"),
         (["--building", "office", "--storeys", "9"], "storeys must be 1 to 8"),
         (["--building", "office", "--sensors", "tls", "--hard", "twin-wing"], "need two sensors"),
-        (["--building", "office", "--overlap", "0", "--storeys", "1"], "no two connected parts"),
+        (["--building", "house", "--overlap", "0", "--storeys", "1"], "no two connected parts"),
     ],
 )
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], reason: str) -> None:

@@ -6,10 +6,10 @@ import numpy as np
 from topomerge.datasets.difficulty import Difficulty
 from topomerge.datasets.plan import Flight, Opening, Plan, PlanRoom
 
-BARE = Difficulty(
-    lintels=1, ceiling_spread=0, furniture=0, clutter=0, windows=1, glass=0, open=1, half=0, lamps=0, beams=0, columns=0, slopes=0,
-    ducts=0,
-)
+BARE = Difficulty(  # nothing but the shell
+    lintels=1, ceiling_spread=0, furniture=0, clutter=0, windows=1, glass=0, open=1, half=0, lamps=0, beams=0, columns=0,
+    slopes=0, ducts=0,
+)  # fmt: skip
 
 
 def room(name: str, x0: float, y0: float, x1: float, y1: float, kind: str = "office", **more: float) -> PlanRoom:
