@@ -270,6 +270,24 @@ window.addEventListener("load", () => setTimeout(() => {
   document.getElementById("theme").click();
   seen.theme = getComputedStyle(document.body).backgroundColor;
   seen.scene = document.querySelector(".scene").dataset.state;
+  const at = (type, x) => new PointerEvent(type, { bubbles: true, clientX: x, clientY: 300, pointerId: 1 });
+  const way = [["pointerdown", 100], ["pointermove", 160], ["pointerup", 160]];
+  const drag = (area) => way.forEach(([type, x]) => area.dispatchEvent(at(type, x)));
+  const svg = document.querySelector(".sheet figure:not([hidden]) svg");
+  const before = svg.getAttribute("viewBox").split(" ").map(Number);
+  drag(svg);
+  const moved = svg.getAttribute("viewBox").split(" ").map(Number);
+  svg.dispatchEvent(new WheelEvent("wheel", { bubbles: true, deltaY: -300, clientX: 300, clientY: 300, ctrlKey: true }));
+  const zoomed = svg.getAttribute("viewBox").split(" ").map(Number);
+  seen.moves = moved[0] < before[0] && moved[2] === before[2] && zoomed[2] < moved[2];
+  const stage = document.querySelector(".stage");
+  drag(stage);
+  stage.dispatchEvent(new WheelEvent("wheel", { bubbles: true, deltaY: -300, ctrlKey: true }));
+  document.querySelectorAll(".scene input").forEach((input) => {
+    if (input.type === "range") input.value = input.max;
+    else input.click();
+    input.dispatchEvent(new Event("input"));
+  });
   document.title = JSON.stringify(seen);
 }, 500));
 """
@@ -312,7 +330,7 @@ def test_in_a_browser(tmp_path: Path) -> None:
     assert seen["told"].startswith("room 8 · storey 1 · area")
     assert seen["areas"] == sorted(seen["areas"], reverse=True)
     assert seen["theme"] == "rgb(19, 21, 23)"
-    assert seen["scene"] == "shown"
+    assert seen["scene"] == "shown" and seen["moves"]
 
 
 def test_without_webgl_words_stand_there(tmp_path: Path) -> None:
