@@ -268,7 +268,8 @@ class TopometricMap:
         _check(self.rooms.dtype == ROOM_DTYPE, "rooms must have ROOM_DTYPE")
         _check(self.edges.dtype == EDGE_DTYPE, "edges must have EDGE_DTYPE")
         _check(self.storeys.dtype == STOREY_DTYPE, "storeys must have STOREY_DTYPE")
-        _check(self.areas.dtype == AREA_DTYPE and self.narrows.dtype == EDGE_DTYPE, "areas must have AREA_DTYPE, narrows EDGE_DTYPE")
+        _check(self.areas.dtype == AREA_DTYPE, "areas must have AREA_DTYPE")
+        _check(self.narrows.dtype == EDGE_DTYPE, "narrows must have EDGE_DTYPE")
         if self.navigable_area is None:
             object.__setattr__(self, "navigable_area", np.full(len(self.navigable), -1, np.int32))
         assert self.navigable_area is not None

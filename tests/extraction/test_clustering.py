@@ -9,7 +9,7 @@ from scipy import sparse
 from topomerge.extraction.clustering import cluster_views, markov_clusters, modularity
 from topomerge.extraction.convolution import sphere
 from topomerge.extraction.propagation import propagate_labels
-from topomerge.extraction.rooms import navigable_rooms, split_rooms
+from topomerge.extraction.rooms import navigable_floor, split_rooms
 from topomerge.types import VoxelGrid
 
 
@@ -129,5 +129,5 @@ def test_rooms_are_connected_pieces_of_enough_volume():
 def test_navigable_cells_take_the_nearest_room():
     grid = VoxelGrid.from_cells(np.array([(0, 0, 0), (9, 0, 0)], np.int32), shape=(10, 1, 3))
     line = grid.with_cells(np.array([(x, 0, z) for x in range(10) for z in range(2)], np.int32))
-    label = navigable_rooms(grid, np.array([0, 1], np.int32), line)
+    label = navigable_floor(grid, np.array([0, 1], np.int32), line, 1.75, 0.3).room
     assert (label == (line.cells[:, 0] >= 5)).all()

@@ -11,11 +11,14 @@ from scipy import ndimage
 from topomerge.extraction.components import connected_components
 from topomerge.extraction.convolution import sphere
 from topomerge.extraction.rooms import Floor
+from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import EDGE_DTYPE, Array, VoxelGrid
 
 DOOR_WIDTH = 1.6  # m: what is wider is an opening
 SAME_DOOR = 0.8  # m: passages between the same rooms that are this close are one
 HEIGHT = 0.6  # m: what is higher or lower is another level
+LANDING = 0.35  # m: what is nearer to the level of a storey is no stair
+RAMP = 0.25  # climb below which it is a ramp
 SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
 NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
 
@@ -54,7 +57,49 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
         contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))
         parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
         edges += _apart([_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts])
-    return np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
+    table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
+    _add_stairs(table, floor)
+    return table
+
+
+def _add_stairs(edges: Array, floor: Floor) -> None:
+    """Where the stairs of the given edges begin and end, and which of them are ramps.
+
+    A stair is the connected part of the floor that lies on no storey's level and at which the two rooms meet.
+    """
+    stairs = np.flatnonzero(edges["kind"] == "stairs")
+    if not len(stairs):
+        return
+    z = floor.cells.centroids()[:, 2]
+    nearest = np.abs(z[:, None] - floor.storeys["floor"]).min(axis=1)
+    rows = lowest_of_column(floor.cells)
+    rows = rows[nearest[rows] > LANDING]
+    if not len(rows):
+        return
+    steps = floor.cells.subset(np.sort(rows))
+    part = connected_components(steps, sphere(2.5 * steps.edge, steps.edge))
+    places = steps.centroids()
+    for i in stairs:
+        distance = np.linalg.norm(places - edges["centre"][i], axis=1)
+        if distance.min() > SEARCH:
+            continue
+        mine = places[part == part[distance.argmin()]]
+        low, high = mine[:, 2].min(), mine[:, 2].max()
+        edges["lower"][i] = mine[mine[:, 2] <= low + LANDING].mean(axis=0)
+        edges["upper"][i] = mine[mine[:, 2] >= high - LANDING].mean(axis=0)
+        if _steepness(mine) < RAMP:
+            edges["kind"][i] = "ramp"
+
+
+def _steepness(places: Array) -> float:
+    """Climb of a floor, m per m: the median over tiles of 0.6 m."""
+    tile = np.floor(places[:, :2] / 0.6).astype(np.int64)
+    _, of = np.unique(tile, axis=0, return_inverse=True)
+    of = of.ravel()
+    low, high = np.full(of.max() + 1, np.inf), np.full(of.max() + 1, -np.inf)
+    np.minimum.at(low, of, places[:, 2])
+    np.maximum.at(high, of, places[:, 2])
+    return float(np.median(high - low)) / 0.6
 
 
 def _apart(edges: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:

@@ -21,8 +21,8 @@ from topomerge.extraction.floors import floor_components, largest_component
 from topomerge.extraction.free_space import carve_rays, carve_views
 from topomerge.extraction.gaps import bridge_gaps
 from topomerge.extraction.noise import without_flying_cells
-from topomerge.extraction.propagation import propagate_labels
 from topomerge.extraction.plan_rooms import rooms_of_plans
+from topomerge.extraction.propagation import propagate_labels
 from topomerge.extraction.rooms import Floor, navigable_floor, split_rooms
 from topomerge.extraction.similarity import jaccard_similarity
 from topomerge.extraction.topology import topometric_map

@@ -1,7 +1,7 @@
 """Is a narrowing of the floor a door? A small network trained on simulated buildings (benchmarks/train_judge.py).
 
-The findings' rule (a passage that has less than 0.7 of the narrower side's width is a door) leaves open what a lintel, a wall in line
-with the opening or a step of the ceiling say; these are weighed by what simulated scans of training buildings show.
+The findings' rule (a passage that has less than 0.7 of the narrower side's width is a door) leaves open what a lintel, a wall in
+line with the opening or a step of the ceiling say; these are weighed by what simulated scans of training buildings show.
 """
 
 from __future__ import annotations

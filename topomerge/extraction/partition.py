@@ -89,7 +89,9 @@ class _Links:
 
     def _score(self, pairs: list[Pair]) -> None:
         if pairs:
-            x = [features(self.passages[p], (self.peak[p[0]], self.peak[p[1]]), (self.area[p[0]], self.area[p[1]])) for p in pairs]
+            x = [
+                features(self.passages[p], (self.peak[p[0]], self.peak[p[1]]), (self.area[p[0]], self.area[p[1]])) for p in pairs
+            ]
             self.scores.update(zip(pairs, self.judge(np.array(x)).tolist(), strict=True))
 
     def weakest(self) -> Pair:

@@ -1,7 +1,7 @@
 """Where two regions of a storey meet, and what speaks for a door there (beyond the thesis: findings.md, "What worked").
 
-The regions are the basins of a watershed of the clearance: they part at every narrowing. Whether a narrowing is a door is judged by
-its width, what is on both sides of it, what is above it and how the walls beside it stand.
+The regions are the basins of a watershed of the clearance: they part at every narrowing. Whether a narrowing is a door is judged
+by its width, what is on both sides of it, what is above it and how the walls beside it stand.
 """
 
 from __future__ import annotations
@@ -75,10 +75,15 @@ def find_passages(plan: Plan, clearance: Array, region: Array) -> dict[tuple[int
     thick = ndimage.binary_dilation(plan.wall, np.ones((3, 3)))  # walls are not quite straight
     nearest = ndimage.distance_transform_edt(plan.inside, return_distances=False, return_indices=True)
     low = plan.clear < plan.ceiling - LINTEL  # nan: no
-    return {(int(a), int(b)): _passage(plan, clearance, region, nearest, thick, low, int(a), int(b), int(at)) for a, b, at in meet[first]}
+    return {
+        (int(a), int(b)): _passage(plan, clearance, region, nearest, thick, low, int(a), int(b), int(at))
+        for a, b, at in meet[first]
+    }
 
 
-def _passage(plan: Plan, clearance: Array, region: Array, nearest: Array, thick: Array, low: Array, a: int, b: int, at: int) -> Passage:
+def _passage(
+    plan: Plan, clearance: Array, region: Array, nearest: Array, thick: Array, low: Array, a: int, b: int, at: int
+) -> Passage:
     x, y = divmod(at, plan.wall.shape[1])
     e, here = plan.edge, float(clearance[x, y])
     wall = nearest[:, x, y] - (x, y)
@@ -86,7 +91,9 @@ def _passage(plan: Plan, clearance: Array, region: Array, nearest: Array, thick:
     limit = 3.0 / e
     ahead, behind = crossing.run(plan.inside, x, y, dx, dy, limit), crossing.run(plan.inside, x, y, -dx, -dy, limit)
     mx, my, half = x + dx * (ahead - behind) / 2, y + dy * (ahead - behind) / 2, (ahead + behind) / 2
-    jambs = sorted(crossing.run(thick, mx + s * (half + 1) * dx, my + s * (half + 1) * dy, s * dx, s * dy, 1.0 / e) * e for s in (1, -1))
+    jambs = sorted(
+        crossing.run(thick, mx + s * (half + 1) * dx, my + s * (half + 1) * dy, s * dx, s * dy, 1.0 / e) * e for s in (1, -1)
+    )
     steps = int(0.6 / e)
     across = crossing.widths(plan.inside, mx, my, dx, dy, steps, limit) * e
     narrow = max(float(across[steps]), e)

@@ -1,12 +1,13 @@
 """A storey seen from above: its floor, its walls, its ceiling and where it is open, a raster of columns (beyond the thesis).
 
-Rooms end at walls, whatever stands in them: furniture hides the floor and obstructs the body of the stick kernel, but a wall alone
-fills a column up to the ceiling (findings.md, "Rooms").
+Rooms end at walls, whatever stands in them: furniture hides the floor and obstructs the body of the stick kernel, but a wall
+alone fills a column up to the ceiling (findings.md, "Rooms").
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import edt
 import numpy as np
@@ -50,14 +51,13 @@ class Plan:
         return np.asarray(cells)[:, :2].astype(np.int64) - self.low
 
 
-def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, known: Array | None = None) -> Plan:
+def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) -> Plan:
     """The plan of storey `k`.
 
     Args:
         grid: occupied cells.
         navigable: the navigable volume.
         storey: (m,) storey of each of its cells.
-        known: (j, 3) cells that are known to be free, if any are.
     """
     e = grid.edge
     floor = lowest_of_column(navigable)
@@ -82,10 +82,6 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, kn
     wall = _without_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
     on_floor = (profile & _bits(-0.3, 0.3, e)) != 0
     inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (~np.isnan(clear) & (far * e <= 2 * FLOOR_REACH))
-    if known is not None and len(known):
-        at = known[:, :2] - low
-        at = at[_within(at, size)]
-        inside[tuple(at.T)] = True
     inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), ~np.isnan(clear), e)
     return Plan(e, low, base, top, profile, wall, inside, ceiling, clear)
 
@@ -117,7 +113,7 @@ def _bits(low: float, high: float, edge: float) -> np.uint64:
 
 def _bands(profile: Array, edge: float) -> Array:
     """Is the column filled like a wall, at the heights at which the sensor looked?"""
-    filled = np.stack([(profile & _bits(a, b, edge)) != 0 for a, b in zip(BANDS[:-1], BANDS[1:], strict=True)])
+    filled = np.stack([(profile & _bits(a, b, edge)) != 0 for a, b in pairwise(BANDS)])
     count = filled.sum(axis=(1, 2))
     filled = filled[count >= OBSERVED * count.max()]
     need = np.ceil(WALL_BANDS * len(filled) - 1e-6)

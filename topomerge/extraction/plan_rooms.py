@@ -11,7 +11,7 @@ from topomerge.extraction.partition import Pair, merge_regions
 from topomerge.extraction.passages import clearance_of, find_passages, regions_of
 from topomerge.extraction.plan import Plan, storey_plan
 from topomerge.extraction.rooms import Floor
-from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
+from topomerge.extraction.storeys import find_storeys, floor_to_ceiling, lowest_of_column
 from topomerge.kernels.columns import hollow_below
 from topomerge.types import Array, VoxelGrid
 
@@ -25,9 +25,7 @@ DOORWAY = 0.5  # m: so far the navigable volume goes on into what looks like wal
 OPEN_ALL_AROUND = 0.25  # share of the outline with walls, and of the floor with a ceiling: less, and a floor may be a ceiling
 
 
-def rooms_of_plans(
-    grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: float, body_height: float, known: Array | None = None
-) -> Floor:
+def rooms_of_plans(grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: float, body_height: float) -> Floor:
     """Cut every storey into rooms.
 
     Args:
@@ -36,7 +34,6 @@ def rooms_of_plans(
         door: narrowings with at least this probability of a door part rooms.
         narrow: those with at least this one part areas of a room.
         body_height: m, whatever is lower than this above the floor is no ceiling.
-        known: (j, 3) cells known to be free.
     """
     storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, body_height))
     factor = max(round(PLAN_CELL / grid.edge), 1)
@@ -55,7 +52,7 @@ def rooms_of_plans(
     for k in range(int(storey.max(initial=-1)) + 1):
         if not (level == k).any():
             continue
-        plan = storey_plan(coarse, walk, level, k, None if known is None else known // factor)
+        plan = storey_plan(coarse, walk, level, k)
         room, area, owner, doors = _partition(coarse, plan, door, narrow, k > 0)
         _label_cells(label, grid, plan, np.where(room >= 0, room + rooms, -1), factor)
         parts.append(_cells_of(plan, navigable, storey == k, room, area, factor, k, rooms, areas))
@@ -70,13 +67,17 @@ def _coarse(grid: VoxelGrid, factor: int) -> VoxelGrid:
     return VoxelGrid.from_cells(grid.cells // factor, grid.origin, grid.edge * factor, shape)  # type: ignore[arg-type]
 
 
-def _partition(grid: VoxelGrid, plan: Plan, door: float, narrow: float, above_another: bool) -> tuple[Array, Array, Array, dict[Pair, float]]:
+def _partition(
+    grid: VoxelGrid, plan: Plan, door: float, narrow: float, above_another: bool
+) -> tuple[Array, Array, Array, dict[Pair, float]]:
     """Room and area of each column (numbered from 0), room of each area, and how likely doors part two rooms."""
     clearance = clearance_of(plan)
     region = regions_of(clearance)
     if above_another:
         region = _without_ceilings(grid, plan, region)
-    found = merge_regions(region, clearance, find_passages(plan, clearance, region), plan.edge, door_probability, door, narrow, LEAST_ROOM)
+    found = merge_regions(
+        region, clearance, find_passages(plan, clearance, region), plan.edge, door_probability, door, narrow, LEAST_ROOM
+    )
     size = np.bincount(found.room[region[region >= 0]], minlength=len(found.room)) * plan.edge**2
     widest = np.zeros(len(size))
     np.maximum.at(widest, found.room[region[region >= 0]], clearance[region >= 0])
@@ -122,7 +123,9 @@ def _label_cells(label: Array, grid: VoxelGrid, plan: Plan, room: Array, factor:
     at = at[rows]
     base, ceiling = plan.base[tuple(at.T)], plan.ceiling[tuple(at.T)]
     z = (grid.cells[rows, 2] // factor - base) * plan.edge
-    top = np.minimum(np.where(np.isnan(ceiling), np.inf, ceiling + OVER_CEILING), (plan.top[tuple(at.T)] - base + 0.5) * plan.edge)
+    top = np.minimum(
+        np.where(np.isnan(ceiling), np.inf, ceiling + OVER_CEILING), (plan.top[tuple(at.T)] - base + 0.5) * plan.edge
+    )
     mine = (z >= -UNDER_FLOOR) & (z <= top) & (room[tuple(at.T)] >= 0)
     label[rows[mine]] = room[tuple(at[mine].T)]
 
@@ -150,7 +153,12 @@ def _cells_of(
 
 
 def _floor(
-    grid: VoxelGrid, storeys: Array, parts: list[tuple[Array, ...]], owners: list[Array], label: Array, probability: dict[Pair, float]
+    grid: VoxelGrid,
+    storeys: Array,
+    parts: list[tuple[Array, ...]],
+    owners: list[Array],
+    label: Array,
+    probability: dict[Pair, float],
 ) -> Floor:
     if not parts:
         empty = np.zeros(0, np.int32)
@@ -166,4 +174,7 @@ def _floor(
     kept = (of["room"] >= 0) & (in_a_room | of["standing"].astype(bool))
     of = {name: values[kept] for name, values in of.items()}
     floor = grid.with_cells(whole.cells[kept], {"standing": of["standing"].astype(bool)})
-    return Floor(floor, storeys, of["storey"], of["room"], of["area"], np.concatenate(owners).astype(np.int32), label, 0.0, probability)
+    storeys["area"] = np.bincount(of["storey"][lowest_of_column(floor)], minlength=len(storeys)) * floor.edge**2
+    return Floor(
+        floor, storeys, of["storey"], of["room"], of["area"], np.concatenate(owners).astype(np.int32), label, 0.0, probability
+    )
