@@ -155,7 +155,8 @@ def arrays_of(pair: Pair, told: dict[str, object]) -> dict[str, Array]:
         if empty is not None:
             out[f"{side}.free"] = empty.cells.astype(np.int16)
     out["truth"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
-    told = {**told, "sensors": pair.sensors, "kind": pair.kind, "building": pair.building, "overlap": pair.overlap, "common": common}
+    known = {k: getattr(pair, k) for k in ("sensors", "kind", "building", "overlap")}
+    told = {**told, **known, "common": common}
     out["about"] = np.frombuffer(json.dumps(told, sort_keys=True, default=str).encode(), np.uint8)
     return out
 

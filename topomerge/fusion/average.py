@@ -58,7 +58,7 @@ def difference(p: Sim3, q: Sim3, anchor: Array) -> tuple[float, float, float]:
 def consensus(
     poses: Sequence[Sim3], weights: Array | Sequence[float], anchor: Array | None = None, rounds: int = 5
 ) -> list[tuple[Sim3, float, list[int]]]:
-    """Clusters of weighted poses, heaviest first: (mean, weight, members). Replaces the thesis' DBSCAN, which needs no fewer limits.
+    """Clusters of weighted poses, heaviest first: (mean, weight, members). In place of the thesis' DBSCAN.
 
     The pose with most weight around it is a cluster's seed; members are those within `APART` of the mean, until none changes.
     """

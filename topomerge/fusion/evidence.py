@@ -132,7 +132,7 @@ def slices(grid: VoxelGrid) -> list[float]:
     """
     z = cell_middles(grid)[:, 2]
     if float(np.ptp(z)) + grid.edge <= SLICE:
-        return [float(np.median(z))]
+        return [] if _filled(grid.cells, grid.edge) else [float(np.median(z))]
     thick = max(round(SLICE / 2 / grid.edge), 1)
     many = np.convolve(np.bincount(grid.cells[:, 2], minlength=grid.shape[2]), np.ones(thick), "same")
     layers: list[int] = []
@@ -144,13 +144,18 @@ def slices(grid: VoxelGrid) -> list[float]:
     inside = [np.abs(grid.cells[:, 2] - k) <= thick / 2 for k in layers]
     if not layers or sum(int(i.sum()) for i in inside) < 0.7 * len(grid):
         return []
-    flat = grid.cells[np.logical_or.reduce(inside)][:, :2].astype(np.int64)
-    columns = len(np.unique(flat[:, 0] << 32 | flat[:, 1]))
-    side = max(round(0.5 / grid.edge), 1)
-    blocks = len(np.unique((flat[:, 0] // side) << 32 | (flat[:, 1] // side)))
-    if columns > 0.6 * blocks * side**2:
+    if _filled(grid.cells[np.logical_or.reduce(inside)], grid.edge):
         return []
     return sorted(float(np.median(z[i])) for i in inside)
+
+
+def _filled(cells: Array, edge: float) -> bool:
+    """Do cells fill areas, seen from above, or only draw lines?"""
+    flat = cells[:, :2].astype(np.int64)
+    columns = len(np.unique(flat[:, 0] << 32 | flat[:, 1]))
+    side = max(round(0.5 / edge), 1)
+    blocks = len(np.unique((flat[:, 0] // side) << 32 | (flat[:, 1] // side)))
+    return columns > 0.6 * blocks * side**2
 
 
 def levels(grid: VoxelGrid) -> list[tuple[float, float, float]]:
@@ -207,10 +212,11 @@ def _closed(grid: VoxelGrid, bottom: Array, top: Array) -> list[tuple[float, flo
 def _local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Array:
     """The floor under each column: drift and a tilted map raise and lower it by a few centimetres."""
     near = np.abs(z - heights[ix, iy]) < 0.3
-    where = (ix[near], iy[near])
-    many, total = np.zeros(heights.shape, np.float32), np.zeros(heights.shape, np.float32)
-    np.add.at(many, where, 1.0)
-    np.add.at(total, where, (z[near] - heights[where]).astype(np.float32))
+    lowest = np.full(heights.shape, np.inf)
+    np.minimum.at(lowest, (ix[near], iy[near]), z[near])
+    seen = np.isfinite(lowest)
+    many = seen.astype(np.float32)
+    total = np.where(seen, lowest - heights, 0.0).astype(np.float32)
     cells = FLAT / CELL
     many, total = (ndimage.gaussian_filter(i, cells, truncate=2.0) for i in (many, total))
     return heights + np.where(many > 0.02, total / np.maximum(many, 1e-6), 0.0)
@@ -226,7 +232,14 @@ def _ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: float, shape:
 
 
 def _plan(
-    occupied: Array, crossed: Array, origin: Array, cell: float, floor: float, ceiling: float, heights: tuple[Array, Array], sliced: bool
+    occupied: Array,
+    crossed: Array,
+    origin: Array,
+    cell: float,
+    floor: float,
+    ceiling: float,
+    heights: tuple[Array, Array],
+    sliced: bool,
 ) -> Plan:
     bands = _observed(occupied)
     body, walls = _mask(*BODY), _mask(*WALL) & bands
@@ -240,7 +253,8 @@ def _plan(
     if sliced:
         wall = _straight(wall, cell)
     free = ~standing & (rays | (shut & (not sliced)))
-    return Plan(origin, cell, wall, free, standing & ~wall, floor, ceiling, occupied, int(bands), *(h.astype(np.float32) for h in heights), sliced)
+    high, low = (h.astype(np.float32) for h in heights)
+    return Plan(origin, cell, wall, free, standing & ~wall, floor, ceiling, occupied, int(bands), high, low, sliced)
 
 
 def _straight(mask: Array, cell: float) -> Array:

@@ -57,7 +57,9 @@ def surface(grid: VoxelGrid) -> Surface:
     return Surface(blocks, np.ascontiguousarray(middle), direction, flat)
 
 
-def refine_pose(a: Surface, b: Surface, start: Sim3, scaled: bool = False, stages: Sequence[tuple[int, float]] = STAGES) -> Refined:
+def refine_pose(
+    a: Surface, b: Surface, start: Sim3, scaled: bool = False, stages: Sequence[tuple[int, float]] = STAGES
+) -> Refined:
     """T_ab that brings b's surfaces onto a's, from a start that is right to a few decimetres.
 
     Slices have vertical planes only: what the planes do not fix (the height) stays as it was.

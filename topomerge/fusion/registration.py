@@ -39,7 +39,7 @@ class Registration:
     Args:
         transform: T_ab of the best hypothesis, believed or not; None where there was none.
         probability: that it is right, calibrated on simulated pairs; 0 without a hypothesis.
-        accepted: is the probability above the threshold that kept every training pair from a wrong merge?
+        accepted: is the probability above the threshold of the calibration?
         features: what it was judged by (`verify.Judge`), with ``margin`` and ``rmse`` (m).
         alternatives: the hypotheses, best first; the first one is the best before its fine registration.
         reason: in words.
@@ -82,8 +82,8 @@ def register(
     if scale not in ("fixed", "free"):
         raise InputError(f"scale must be fixed or free, not {scale!r}")
     if _order(b) < _order(a):  # so that nothing depends on which comes first
-        back = register(b, a, scale=scale, hypotheses=[h.inverse() for h in hypotheses], free=(free[1], free[0]), yaws=[-y for y in yaws])
-        return _inverse(back)
+        turned = [h.inverse() for h in hypotheses], [-y for y in yaws]
+        return _inverse(register(b, a, scale=scale, hypotheses=turned[0], free=(free[1], free[0]), yaws=turned[1]))
     began = time.perf_counter()
     first, second = ([View(p) for p in plans(m, f)] for m, f in zip((a, b), free, strict=True))
     seconds = {"plans": time.perf_counter() - began}
@@ -103,7 +103,7 @@ def register(
     if not any(v.plan.sliced for v in (*first, *second)):
         pose, rmse = _fine(_grid(a), _grid(b), best.pose, scale == "free")
     seconds["refine"] = time.perf_counter() - began
-    chance = probability(features, margin)
+    chance = probability(ranked)
     accepted = chance >= model()["threshold"]
     said = "believed" if accepted else "not believed"
     reason = (

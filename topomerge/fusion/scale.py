@@ -23,7 +23,9 @@ PER_COMBINATION = 4
 SAMPLE = 4000  # wall columns that are projected
 
 
-def search_scaled(a: Sequence[View], b: Sequence[View], hypotheses: Sequence[Sim3] = (), yaws: Sequence[float] = ()) -> list[Candidate]:
+def search_scaled(
+    a: Sequence[View], b: Sequence[View], hypotheses: Sequence[Sim3] = (), yaws: Sequence[float] = ()
+) -> list[Candidate]:
     """Candidate poses T_ab with their scale, refined, best first. Arguments as of `search.search`."""
     found = [Candidate(h, 0.0, True) for h in hypotheses]
     pairs = [(v, w) for v in a for w in b if len(v.walls) >= 20 and len(w.walls) >= 20]

@@ -210,7 +210,7 @@ class Correlator:
         best = best[np.lexsort((best, -flat[best]))]
         shift = np.column_stack(np.unravel_index(best, image.shape)).astype(float)
         shift = np.where(shift > self.span, shift - self.size, shift)
-        found = []
+        found: list[tuple[float, float, float]] = []
         while len(best) and len(found) < many:
             x, y = (start + shift[0] * self.cell).tolist()
             found.append((float(flat[best[0]]), x, y))

@@ -82,9 +82,9 @@ def tally(points, kinds, facing, inner, kind, to_wall, to_any, face, open_, orig
 
     `facing` and `face` are unit vectors from walls towards empty space (0 where unknown); `to_wall` and `to_any` the distances to
     the nearest wall, and to anything standing, m. Returns counts of columns:
-    0 walls on known ground, 1 of these near a wall that faces alike, 2 near one that faces the other way, 3 walls that stand `far`
-    from anything on free ground; 4 free on known ground, 5 free on free; of the columns that are `inner` here and fall on such there
-    (`open_`): 6 clutter, 7 of these near clutter, 8 free, 9 of these near clutter; 10 walls in all.
+    0 walls on known ground, 1 of these near a wall that faces alike, 2 near one that faces the other way, 3 walls on free ground
+    that stand `far` from anything; 4 free on known ground, 5 free on free; of the columns that are `inner` here and fall on such
+    there (`open_`): 6 clutter, 7 of these near clutter, 8 free, 9 of these near clutter; 10 walls in all.
     """
     out = np.zeros(11)
     size = np.exp(pose[3])

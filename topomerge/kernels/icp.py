@@ -60,7 +60,9 @@ def gather(table, bricks, origin, edge, points, normal, moving, moving_normal, p
         nx = c * moving_normal[i, 0] - s * moving_normal[i, 1]
         ny = s * moving_normal[i, 0] + c * moving_normal[i, 1]
         nz = moving_normal[i, 2]
-        x, y, z = int(np.floor((px - origin[0]) / edge)), int(np.floor((py - origin[1]) / edge)), int(np.floor((pz - origin[2]) / edge))
+        x = int(np.floor((px - origin[0]) / edge))
+        y = int(np.floor((py - origin[1]) / edge))
+        z = int(np.floor((pz - origin[2]) / edge))
         best, near = -1, 1e9
         for a in range(-reach, reach + 1):
             for b in range(-reach, reach + 1):

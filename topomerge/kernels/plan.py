@@ -22,7 +22,7 @@ def column_bits(ix, iy, z, base, low, band):  # type: ignore[no-untyped-def]  # 
 
 @njit(cache=True, nogil=True)
 def on_lines(mask, cosines, sines, long, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(H, W) bool: the columns of a mask that lie in, or end, a straight run of `long` columns of which `least` are in the mask."""
+    """(H, W) bool: the columns of a mask in, or at an end of, a straight run of `long` columns of which `least` are in it."""
     out = np.zeros(mask.shape, np.bool_)
     for x in range(mask.shape[0]):
         for y in range(mask.shape[1]):
