@@ -25,17 +25,22 @@ def keep(path: Path, columns: Array, truth: Truth) -> None:
         np.savez_compressed(file, columns=columns.astype(np.int16), visited=visited)
 
 
-def agreement(a: Path, b: Path) -> float:
-    """Consistency of two maps on the floor of the rooms that both visited and saw; 0 where one of them failed."""
+def agreement(a: Path, b: Path) -> tuple[float, float]:
+    """Consistency of two maps on the floor of the rooms that both visited and saw, of the rooms assigned to each other and of
+    all; 0 where one of them failed."""
     if not a.exists() or not b.exists():
-        return 0.0
+        return 0.0, 0.0
     with np.load(a, allow_pickle=False) as first, np.load(b, allow_pickle=False) as second:
         both = first["visited"] & second["visited"]
-        return consistency(first["columns"][both], second["columns"][both], round(LEAST / CELL**2))
+        labels, least = (first["columns"][both], second["columns"][both]), round(LEAST / CELL**2)
+        return consistency(*labels, least, every=False), consistency(*labels, least)
 
 
 def with_agreement(rows: list[Row], out: Path) -> list[Row]:
-    """The rows, with `agreement` of those that have a partner: the reference of the same scan, or the first session."""
+    """The rows, with `agreement` and `agreement_all` of those that have a partner.
+
+    It is the reference of the same scan, or the first session.
+    """
     partner: dict[tuple[Any, ...], Row] = {}
     for row in rows:
         if row["set"] == REFERENCE:
@@ -49,5 +54,5 @@ def with_agreement(rows: list[Row], out: Path) -> list[Row]:
         alike = None
         if other is not None and other is not row and not row.get("missing"):
             alike = agreement(out / "said" / f"{other['key']}.npz", out / "said" / f"{row['key']}.npz")
-        done.append(row if alike is None else {**row, "agreement": round(alike, 4)})
+        done.append(row if alike is None else {**row, "agreement": round(alike[0], 4), "agreement_all": round(alike[1], 4)})
     return done

@@ -55,9 +55,10 @@ def report(rows: list[Row], command: str) -> str:
 
 
 AGREEMENT = (
-    "Agreement of two maps of one place: mean IoU of the rooms assigned to each other one to one, over the rooms of the map that "
-    "has more, on the floor that both saw. Two sessions have other sensors, other walks with 60 % of the rooms in common, and "
-    "things moved between them; the others are compared with the map of the same scan at 4 cm spacing in cells of 10 cm."
+    "Agreement of two maps of one place: mean and worst over the pairs of maps of the mean IoU of the rooms assigned to each "
+    "other one to one, on the floor that both saw; of all: rooms that got no partner count 0. Two sessions have other sensors, "
+    "other walks with 60 % of the rooms in common, and things moved between them; the others are compared with the map of the "
+    "same scan at 4 cm spacing in cells of 10 cm."
 )
 
 
@@ -89,13 +90,18 @@ def _beside(rows: list[Row], presets: list[str], key: str, title: str) -> str:
 
 
 def _agreement(rows: list[Row], presets: list[str]) -> str:
-    lines = _head(["set", "maps", *(f"{p}: mean | {p}: worst" for p in presets)], 2 + 2 * len(presets))
+    lines = _head(["set", "maps", *(f"{p}: mean | {p}: worst | {p}: of all" for p in presets)], 2 + 3 * len(presets))
     for group in dict.fromkeys(r["set"] for r in rows if "agreement" in r):
         these = [r for r in rows if r["set"] == group and "agreement" in r]
         cells = [group, str(len({r["case"] for r in these}))]
         for p in presets:
             values = [r["agreement"] for r in these if r["preset"] == p]
-            cells += [_mean([r for r in these if r["preset"] == p], "agreement", True), f"{min(values):.2f}" if values else "–"]
+            mine = [r for r in these if r["preset"] == p]
+            cells += [
+                _mean(mine, "agreement", True),
+                f"{min(values):.2f}" if values else "–",
+                _mean(mine, "agreement_all", False),
+            ]
         lines.append(_line(cells))
     return "\n".join(lines)
 

@@ -120,6 +120,7 @@ def test_consistency_is_symmetric(a, b) -> None:
 def test_consistency_by_hand() -> None:
     a, b = places((0, 0, 30), (1, 1, 18), (1, 2, 12))
     assert consistency(a, b) == pytest.approx((1 + 18 / 30) / 3)
+    assert consistency(a, b, every=False) == pytest.approx((1 + 18 / 30) / 2)
     assert consistency(a, b, least=15) == pytest.approx((1 + 18 / 30) / 2)
     assert consistency(a, np.full(60, -1)) == 0
     assert np.isnan(consistency(np.full(3, -1), np.full(3, -1)))

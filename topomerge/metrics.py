@@ -187,11 +187,12 @@ def storeys_right(true: Array, found: Array, within: float = LEVEL) -> bool:
     return len(true) == len(found) and bool((np.abs(np.sort(true) - np.sort(found)) <= within).all())
 
 
-def consistency(a: Array, b: Array, least: int = 0) -> float:
+def consistency(a: Array, b: Array, least: int = 0, every: bool = True) -> float:
     """How alike two maps cut one place into rooms: 1 where they agree; the same either way round.
 
-    The mean IoU of the rooms assigned to each other one to one, the sum divided by the number of rooms of the map that has
-    more; so a room that is split in one of them costs. nan where neither has a room.
+    The sum of the IoU of the rooms assigned to each other one to one, divided by the number of rooms of the map that has more, so
+    that a room that is split in one of them costs; or, without `every`, of the map that has fewer: the mean of those assigned.
+    nan where neither has a room.
 
     Args:
         a, b: (n,) labels of the same places, those that both have seen.
@@ -201,11 +202,10 @@ def consistency(a: Array, b: Array, least: int = 0) -> float:
     iou, _ = overlaps(a, b, len(counts[0]), len(counts[1]))
     sizes = [c >= max(least, 1) for c in counts]
     iou = iou[sizes[0]][:, sizes[1]]
-    most = max(iou.shape)
     if not iou.size:
-        return 0.0 if most else float("nan")
+        return 0.0 if max(iou.shape) else float("nan")
     i, j = linear_sum_assignment(iou, maximize=True)
-    return float(iou[i, j].sum() / most)
+    return float(iou[i, j].sum() / (max(iou.shape) if every else min(iou.shape)))
 
 
 def bootstrap(values: Array, groups: Array, rounds: int = 2000, seed: int = 0) -> tuple[float, float, float]:
