@@ -20,7 +20,7 @@ from sklearn.model_selection import GroupKFold
 
 from topomerge.fusion.evidence import plans
 from topomerge.fusion.search import View, search, wrapped
-from topomerge.fusion.verify import VECTOR, Judge, lead, vector
+from topomerge.fusion.verify import VECTOR, Judge, lead, rank, vector
 from topomerge.types import Array, Sim3
 
 ROWS = Path("cache/merge/features.jsonl")
@@ -57,9 +57,7 @@ def gather(folder: str = "cache/merge/train") -> None:
         pair = load(path)
         a, b = ([View(p) for p in plans(g, f)] for g, f in ((pair.a, pair.free[0]), (pair.b, pair.free[1])))
         judge = Judge(a, b)
-        poses = [judge.lifted(c.pose) for c in search(a, b)]
-        judged = [(judge(p), error(p, pair)) for p in poses]
-        judged.sort(key=lambda j: -j[0]["walls"])
+        judged = [(f, error(c.pose, pair)) for c, f, _ in rank(search(a, b), judge)]
         about = {k: pair.about[k] for k in ("sensors", "kind", "building", "source")}
         row = {"name": pair.name, "common": pair.common, **about, "hyps": [{**f, "err": e} for f, e in judged[:KEPT]]}
         with ROWS.open("a") as out:

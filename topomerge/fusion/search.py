@@ -270,22 +270,24 @@ def _refined(v: View, w: View, group: Sequence[Candidate], scaled: bool) -> list
     return out
 
 
-def distinct(candidates: Iterable[Candidate], middle: Array) -> list[Candidate]:
+def distinct(
+    candidates: Iterable[Candidate], middle: Array, same: tuple[float, float, float] = SAME
+) -> list[Candidate]:
     """The first of each group of poses that are one: they agree about b's middle, the yaw and the scale."""
     kept: list[Candidate] = []
     at: list[Array] = []
     for candidate in candidates:
         here = np.append(candidate.pose.apply(middle[None])[0], [candidate.pose.yaw, np.log(candidate.pose.scale)])
-        if not any(_same(here, other) for other in at):
+        if not any(_same(here, other, same) for other in at):
             kept.append(candidate)
             at.append(here)
     return kept
 
 
-def _same(p: Array, q: Array) -> bool:
+def _same(p: Array, q: Array, same: tuple[float, float, float]) -> bool:
     return bool(
-        np.abs(p[:2] - q[:2]).max() < SAME[0]
+        np.abs(p[:2] - q[:2]).max() < same[0]
         and abs(p[2] - q[2]) < 2 * SAME_LEVEL
-        and abs(wrapped(p[3] - q[3])) < SAME[1]
-        and abs(p[4] - q[4]) < SAME[2]
+        and abs(wrapped(p[3] - q[3])) < same[1]
+        and abs(p[4] - q[4]) < same[2]
     )

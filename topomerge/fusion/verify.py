@@ -13,16 +13,18 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.fusion.evidence import BODY
-from topomerge.fusion.search import MARGIN, Candidate, View, pairs_at
+from topomerge.fusion.search import MARGIN, Candidate, View, distinct, pairs_at
 from topomerge.kernels import align
 from topomerge.types import Array, Sim3
 
 NEAR = 0.15  # m: walls that near are one
 SAMPLE = 40_000  # columns of a storey that are judged; of larger ones so many
-INNER = 0.4  # m from walls, whose noise is no clutter
+INNER = 0.3  # m from walls, whose noise is no clutter
 BODY_BITS = (1 << BODY[1]) - (1 << BODY[0])
 SLICE_BITS = 0b111 << 2  # 0 to 0.75 m above the floor: where the lasers of robots look
+BLOCK = 12  # columns
 MARGIN_CAP = 6.0
+BASIN = (1.2, np.radians(3.0), 0.05)  # m, rad, log scale: a worse pose nearer than that is no rival
 RIVAL = 0.3  # of the walls that the best hypothesis brings together
 Features = Mapping[str, float]
 
@@ -60,9 +62,9 @@ class Judge:
         for v, w in pairs_at(self.a, self.b, pose.translation[2], pose.scale):
             if not (np.isfinite(v.plan.ceiling) and np.isfinite(w.plan.ceiling)):
                 continue
-            gap = self._gap(v, w, pose)
+            gap, at = self._gap(v, w, pose)
             if len(gap):
-                found.append(np.minimum(np.abs(gap - np.median(gap)), 0.4))
+                found.append(np.minimum(np.abs(_smooth(gap, at) - np.median(gap)), 0.4))
                 area += len(gap) * w.plan.cell**2 * self._steps[id(w)]
         return (float(np.concatenate(found).mean()), area) if found else (0.0, 0.0)
 
@@ -72,15 +74,16 @@ class Judge:
         gaps = []
         for v, w in pairs_at(self.a, self.b, pose.translation[2], pose.scale):
             if np.isfinite([v.plan.ceiling, w.plan.ceiling]).all() and not np.isfinite([v.plan.floor, w.plan.floor]).all():
-                gaps.append(self._gap(v, w, pose) - pose.translation[2])
+                gaps.append(self._gap(v, w, pose)[0] - pose.translation[2])
         every = np.concatenate(gaps) if gaps else np.zeros(0)
         if len(every) < 50:
             return pose
         x, y, z = pose.translation
         return replace(pose, translation=(x, y, z + float(np.clip(np.median(every), -1.2, 1.2))))
 
-    def _gap(self, v: View, w: View, pose: Sim3) -> Array:
-        """(n,) m by which the ceilings of a lie above those of b, before any shift upwards, where both saw free ground."""
+    def _gap(self, v: View, w: View, pose: Sim3) -> tuple[Array, Array]:
+        """(n,) m by which the ceilings of a lie above those of b before any shift, where both saw free ground; and the columns
+        (n, 2) of a."""
         rows = self._under(w)
         at = np.column_stack([w.plan.origin + (rows + 0.5) * w.plan.cell, np.zeros(len(rows))])
         there = np.floor((pose.apply(at)[:, :2] - v.plan.origin) / v.plan.cell).astype(np.int64)
@@ -89,8 +92,8 @@ class Judge:
         gap = v.plan.high[i, j] - pose.scale * w.plan.high[k]
         if np.isfinite([v.plan.floor, w.plan.floor]).all():  # drift and tilt raise both
             gap -= v.plan.low[i, j] - pose.scale * w.plan.low[k]
-        found: Array = gap[np.isfinite(gap) & v.plan.free[i, j]]
-        return found
+        kept = np.isfinite(gap) & v.plan.free[i, j]
+        return gap[kept], there[inside][kept]
 
     def _under(self, view: View) -> Array:
         """(n, 2) some of the free columns under a ceiling."""
@@ -99,6 +102,17 @@ class Judge:
             self._steps[id(view)] = max(len(rows) // 3000, 1)
             self._rows[id(view)] = rows[:: self._steps[id(view)]]
         return self._rows[id(view)]
+
+
+def _smooth(values: Array, columns: Array) -> Array:
+    """The median of the values in each block of `BLOCK` columns a side: rooms differ in height, lamps and noise do not count."""
+    block = columns // BLOCK
+    _, owner = np.unique(block[:, 0] << 32 | block[:, 1], return_inverse=True)
+    order = np.lexsort((values, owner))
+    start = np.searchsorted(owner[order], np.arange(owner.max() + 1))
+    middle = (start + np.append(start[1:], len(values))) // 2
+    smooth: Array = values[order][middle][owner]
+    return smooth
 
 
 class Side:
@@ -111,6 +125,8 @@ class Side:
         self.view = view
         kind = view.kind.copy()
         common = SLICE_BITS if other.plan.sliced else view.plan.bands & other.plan.bands & BODY_BITS
+        flat = view.plan.sliced or other.plan.sliced  # slices tell nothing of heights
+        self.bits = np.ones_like(view.plan.bits) if flat else view.plan.bits & np.uint32(common)
         if common and not view.plan.sliced:
             kind[(kind == align.CLUTTER) & ((view.plan.bits & np.uint32(common)) == 0)] = align.FREE
         many = ndimage.uniform_filter((kind == align.CLUTTER).astype(np.float32), 3) * 9
@@ -125,14 +141,14 @@ class Side:
             rows = rows[np.sort(np.random.default_rng(0).permutation(len(rows))[:SAMPLE])]
         at = (rows[:, 0], rows[:, 1])
         self.points = view.plan.origin + (rows + 0.5) * view.plan.cell
-        self.kinds, self.faces, self.inner = kind[at], view.face[at], self.open[at]
+        self.kinds, self.faces, self.inner, self.filled = kind[at], view.face[at], self.open[at], self.bits[at]
 
     def tally(self, on: Side, pose: Sim3) -> Array:
         """(11,) of `align.tally`, m2."""
         at = np.array([*pose.translation[:2], pose.yaw, np.log(pose.scale)])
         v = on.view
-        seen = (on.kind, v.to_wall, v.to_any, v.face, on.open, v.plan.origin, v.plan.cell)
-        found: Array = align.tally(self.points, self.kinds, self.faces, self.inner, *seen, at, NEAR, MARGIN)
+        seen = (on.kind, v.to_wall, v.to_any, v.face, on.open, on.bits, v.plan.origin, v.plan.cell)
+        found: Array = align.tally(self.points, self.kinds, self.faces, self.inner, self.filled, *seen, at, NEAR, MARGIN)
         return found * self.weight
 
 
@@ -236,4 +252,6 @@ def rank(candidates: Sequence[Candidate], judge: Judge) -> list[tuple[Candidate,
     """
     lifted = [replace(c, pose=judge.lifted(c.pose)) for c in candidates]
     judged = [(c, f, plausibility(f)) for c, f in ((c, judge(c.pose)) for c in lifted)]
-    return sorted(judged, key=lambda j: -j[2])
+    judged.sort(key=lambda j: -j[2])
+    kept = {id(c) for c in distinct((c for c, _, _ in judged), np.append(judge.b[0].middle, 0.0), BASIN)}
+    return [j for j in judged if id(j[0]) in kept]

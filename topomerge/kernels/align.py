@@ -73,18 +73,30 @@ def refine(points, field, origin, cell, poses, sigmas, rounds, scaled):  # type:
     return out, score
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _alike(p, q):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Bits in both of those in either."""
+    both, either = 0, 0
+    for k in range(32):
+        u, v = (p >> np.uint32(k)) & np.uint32(1), (q >> np.uint32(k)) & np.uint32(1)
+        both += u & v
+        either += u | v
+    return both / max(either, 1)
+
+
 WALL, FREE, CLUTTER, HAZE = 1, 2, 3, 4
 
 
 @njit(cache=True, nogil=True)
-def tally(points, kinds, facing, inner, kind, to_wall, to_any, face, open_, origin, cell, pose, near, far):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face, open_, bits, origin, cell, pose, near, far):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """What the columns of one plan meet in the other under a pose (x, y, yaw, log scale) that maps them into it.
 
     `facing` and `face` are unit vectors from walls towards empty space (0 where unknown); `to_wall` and `to_any` the distances to
     the nearest wall, and to anything standing, m. Returns counts of columns:
     0 walls on known ground, 1 of these near a wall that faces alike, 2 near one that faces the other way, 3 walls on free ground
     that stand `far` from anything; 4 free on known ground, 5 free on free; of the columns that are `inner` here and fall on such
-    there (`open_`): 6 clutter, 7 of these near clutter, 8 free, 9 of these near clutter; 10 walls in all.
+    there (`open_`): 6 clutter, 7 of these near clutter, weighed by how alike the bands are that they fill (`filled`, `bits`),
+    8 free, 9 of these near clutter; 10 walls in all.
     """
     out = np.zeros(11)
     size = np.exp(pose[3])
@@ -119,10 +131,11 @@ def tally(points, kinds, facing, inner, kind, to_wall, to_any, face, open_, orig
             out[5] += there == FREE
         if not inner[i] or not open_[x, y]:
             continue
-        close = False
+        close = 0.0
         for a in range(-1, 2):
             for b in range(-1, 2):
-                close |= kind[x + a, y + b] == CLUTTER
+                if kind[x + a, y + b] == CLUTTER:
+                    close = max(close, 1.0 if what == FREE else _alike(filled[i], bits[x + a, y + b]))
         if what == CLUTTER:
             out[6] += 1
             out[7] += close
