@@ -213,6 +213,11 @@ class VoxelGrid:
         """Other cells (any order) of the same volume."""
         return VoxelGrid.from_cells(cells, self.origin, self.edge, self.shape, properties)
 
+    def coarser(self, factor: int) -> VoxelGrid:
+        """The cells, `factor` times as long, in which one or more of these lie; without properties."""
+        x, y, z = (-(-s // factor) for s in self.shape)
+        return VoxelGrid.from_cells(self.cells // factor, self.origin, self.edge * factor, (x, y, z))
+
     def with_properties(self, **properties: Array) -> VoxelGrid:
         """The same cells with more properties."""
         grid = replace(self, properties={**self.properties, **properties})

@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from topomerge.extraction.storeys import floor_to_ceiling, lowest_of_column
 from topomerge.kernels.carve import carve
 from topomerge.types import Array, VoxelGrid
 
 SLICE = 0.6  # m: what is flatter is a slice
 EXTRUDED = 2.4  # m: height of the walls that a slice becomes
 TILE = 5.0  # m
-LOW = 0.35  # m: what lies so near to the lowest cell of its tile is at the bottom
-FLOORED = 0.35  # share of the columns that end at the bottom: where a floor was seen, most do
+COVERED = 0.1  # share of a floor with something above it
+HANGING = 0.5  # share of the columns that begin high over the lowest ones
+LEAST_AREA = 2.0  # m2
 HEADROOM = 2.3  # m between an assumed floor and the ceiling
 OVERHEAD = 1.0  # m above the bottom: what is higher and no wall is a ceiling
 ENCLOSED = 0.75  # share of the directions in which a place inside sees a wall
@@ -20,56 +22,23 @@ DIRECTIONS = 24
 FARTHEST = 15.0  # m
 
 
-def with_assumed_floor(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> tuple[VoxelGrid, str]:
-    """The grid with a floor where rooms are, if the scan shows none; and a warning, empty if it does.
+def is_slice(grid: VoxelGrid) -> bool:
+    """Is the scan flat, but for single points?"""
+    levels = np.sort(grid.cells[:, 2])
+    if not len(levels):
+        return False
+    low, high = levels[int(0.01 * len(levels))], levels[int(0.99 * (len(levels) - 1))]
+    return bool((high - low) * grid.edge <= SLICE)
+
+
+def extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
+    """Walls over the columns of a slice, and a floor where the sensor looked, or where walls are around.
 
     Args:
         grid: occupied cells.
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, where they are known.
     """
-    levels = np.sort(grid.cells[:, 2])
-    if not len(levels):
-        return grid, ""
-    low, high = levels[int(0.01 * len(levels))], levels[int(0.99 * (len(levels) - 1))]
-    if (high - low) * grid.edge <= SLICE:
-        return _extruded(grid, rays, int(low)), "the scan is a slice: walls of 2.4 m and a floor were assumed"
-    bottom, top, height = _bottom(grid)
-    at_bottom = (bottom - height) * grid.edge <= LOW
-    columns = bottom < np.iinfo(np.int64).max
-    if at_bottom[columns].mean() >= FLOORED:
-        return grid, ""
-    inside = columns & ~at_bottom & ((top - height) * grid.edge >= OVERHEAD)
-    inside = ndimage.binary_closing(np.pad(inside, 5), np.ones((7, 7)))[5:-5, 5:-5]
-    ceiling = ndimage.percentile_filter(np.where(columns, top, 0), 75, max(round(1.0 / grid.edge) | 1, 3))
-    floor = np.minimum(height, ceiling - round(HEADROOM / grid.edge))
-    level = int(np.median(floor[inside])) if inside.any() else 0
-    return _with_cells(grid, np.argwhere(inside), level), "no floor was seen: one was assumed below the lowest points"
-
-
-def _bottom(grid: VoxelGrid) -> tuple[Array, Array, Array]:
-    """(nx, ny) lowest and highest occupied level of each column, and the lowest around it."""
-    nx, ny = grid.shape[:2]
-    bottom, top = np.full((nx, ny), np.iinfo(np.int64).max), np.full((nx, ny), -1)
-    at = tuple(grid.cells[:, :2].T)
-    np.minimum.at(bottom, at, grid.cells[:, 2].astype(np.int64))
-    np.maximum.at(top, at, grid.cells[:, 2].astype(np.int64))
-    tile = max(round(TILE / grid.edge), 1)
-    tx, ty = -(-nx // tile), -(-ny // tile)
-    lowest = np.full((tx, ty), np.inf)
-    x, y = np.nonzero(top >= 0)
-    of = (x // tile) * ty + y // tile
-    order = np.lexsort((bottom[x, y], of))
-    first = np.searchsorted(of[order], np.arange(tx * ty))
-    last = np.searchsorted(of[order], np.arange(tx * ty), side="right")
-    some = last > first
-    lowest.flat[some] = bottom[x, y][order][first[some] + ((last - first)[some] * 0.05).astype(int)]
-    lowest = ndimage.minimum_filter(lowest, 3, mode="nearest")
-    lowest[~np.isfinite(lowest)] = 0
-    return bottom, top, np.repeat(np.repeat(lowest, tile, 0), tile, 1)[:nx, :ny].astype(np.int64)
-
-
-def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None, low: int) -> VoxelGrid:
-    """Walls over the columns of a slice, and a floor where the sensor looked or where walls are around."""
+    low = int(np.sort(grid.cells[:, 2])[int(0.01 * len(grid))])
     columns = np.unique(grid.cells[:, :2], axis=0)
     wall = np.zeros(grid.shape[:2], bool)
     wall[tuple(columns.T)] = True
@@ -81,6 +50,51 @@ def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None, low: int) -> Vo
     shape = (grid.shape[0], grid.shape[1], max(grid.shape[2], low + high + 1))
     floor = np.column_stack([np.argwhere(inside), np.full(int(inside.sum()), low)])
     return VoxelGrid.from_cells(np.concatenate([walls, floor]), grid.origin, grid.edge, shape)
+
+
+def has_floor(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> bool:
+    """Was a floor seen? Without one, what one could stand on is the upper side of the ceiling: it has nothing above, and most
+    columns begin high over the lowest ones around."""
+    lowest = lowest_of_column(navigable)
+    covered = (floor_to_ceiling(grid, navigable, body_height)[lowest] > 0).mean()
+    hanging, _, top = _under_ceiling(grid)
+    return bool(covered > COVERED or hanging.sum() < HANGING * (top >= 0).sum())
+
+
+def any_ceiling(grid: VoxelGrid) -> bool:
+    """Does enough lie so high above the lowest points that it may be a ceiling?"""
+    return bool(_under_ceiling(grid)[0].sum() * grid.edge**2 >= LEAST_AREA)
+
+
+def with_assumed_floor(grid: VoxelGrid) -> VoxelGrid:
+    """The grid with a floor under whatever seems to be a ceiling, at the lowest points around, or so far below the ceiling that
+    one can stand."""
+    inside, height, top = _under_ceiling(grid)
+    inside = ndimage.binary_closing(np.pad(inside, 5), np.ones((7, 7)))[5:-5, 5:-5]
+    level = int(min(np.median(height[inside]), np.median(top[inside & (top >= 0)]) - round(HEADROOM / grid.edge)))
+    return _with_cells(grid, np.argwhere(inside), level)
+
+
+def _under_ceiling(grid: VoxelGrid) -> tuple[Array, Array, Array]:
+    """(nx, ny) columns that begin high above the lowest ones around; that lowest level; the highest occupied one of each."""
+    nx, ny = grid.shape[:2]
+    bottom, top = np.full((nx, ny), np.iinfo(np.int64).max), np.full((nx, ny), -1)
+    at = tuple(grid.cells[:, :2].T)
+    np.minimum.at(bottom, at, grid.cells[:, 2].astype(np.int64))
+    np.maximum.at(top, at, grid.cells[:, 2].astype(np.int64))
+    tile = max(round(TILE / grid.edge), 1)
+    tx, ty = -(-nx // tile), -(-ny // tile)
+    x, y = np.nonzero(top >= 0)
+    of = (x // tile) * ty + y // tile
+    order = np.lexsort((bottom[x, y], of))
+    first, last = (np.searchsorted(of[order], np.arange(tx * ty), side=side) for side in ("left", "right"))
+    some = last > first
+    lowest = np.full(tx * ty, np.inf)
+    lowest[some] = bottom[x, y][order][first[some] + ((last - first)[some] * 0.05).astype(int)]  # but for single points
+    lowest = ndimage.minimum_filter(lowest.reshape(tx, ty), 3, mode="nearest")
+    lowest[~np.isfinite(lowest)] = 0
+    height = np.repeat(np.repeat(lowest, tile, 0), tile, 1)[:nx, :ny].astype(np.int64)
+    return (top >= 0) & ((bottom - height) * grid.edge >= OVERHEAD), height, top
 
 
 def _crossed(grid: VoxelGrid, starts: Array, ends: Array) -> Array:

@@ -40,7 +40,7 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
     component = connected_components(standing, moore(), group=np.where(bare, 0, -1))
     count = int(component.max()) + 1
     boundary = np.flatnonzero(bare & (horizontal_distance_field(standing) == 0))
-    walled = any_at(grid, cells[boundary], _beside_and_above(grid.edge))
+    walled = any_at(grid, cells[boundary], beside_and_above(grid.edge))
     on_boundary = np.bincount(component[boundary], minlength=count)
     with_wall = np.bincount(component[boundary], walled, minlength=count)
     hollow_share = np.bincount(component[bare], hollow[bare], minlength=count) / np.bincount(component[bare], minlength=count)
@@ -54,7 +54,7 @@ def _on_a_wall(grid: VoxelGrid, cells: Array) -> Array:
     return levels_below(*grid._bricks, cells, 1, depth) >= SOLID * depth
 
 
-def _beside_and_above(edge: float) -> Kernel:
+def beside_and_above(edge: float) -> Kernel:
     """Cells within 0.35 m horizontally and 0.5 to 1.5 m above."""
     reach = int(np.ceil(0.35 / edge))
     steps = np.arange(-reach, reach + 1)

@@ -3,15 +3,35 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from topomerge.extraction.convolution import Kernel, any_at
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import Array, VoxelGrid
 
-GLIMPSED = 0.5  # rooms of which less of the outline was seen were only looked into
+GLIMPSED = 0.6  # rooms of which less of the outline was seen were only looked into
 STEP = 0.3  # m: floor beside a cell may be this much higher or lower
 WALL = (0.3, 1.5)  # m above the floor: where a wall has to be seen
+BESIDE = 0.15  # m: between a floor and its wall in a plan
 REACH = 0.25  # m beyond the body's half width
+
+
+def outline_seen(room: Array, inside: Array, wall: Array, edge: float) -> Array:
+    """(R,) share of each room's outline beside which a wall stands, from the plan of a storey.
+
+    Args:
+        room: (nx, ny) room of each column, -1 none.
+        inside: (nx, ny) bool, open columns; those of another room are no end: the floor goes on.
+        wall: (nx, ny) bool.
+        edge: of a column, m.
+    """
+    count = int(room.max(initial=-1)) + 1
+    reach = max(round(BESIDE / edge), 1)
+    near = ndimage.binary_dilation(wall, np.ones((2 * reach + 1, 2 * reach + 1)))
+    outline = (room >= 0) & ndimage.binary_dilation(~inside)
+    total = np.bincount(room[outline], minlength=count)
+    seen = np.bincount(room[outline & near], minlength=count)
+    return np.where(total > 0, seen / np.maximum(total, 1), 1.0)
 
 
 def completeness(grid: VoxelGrid, navigable: VoxelGrid, label: Array, count: int, body: float) -> Array:

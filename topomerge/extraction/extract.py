@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.extraction.assumed import with_assumed_floor
+from topomerge.extraction.assumed import any_ceiling, extruded, has_floor, is_slice, with_assumed_floor
 from topomerge.extraction.ceilings import without_ceilings
 from topomerge.extraction.clustering import INFLATIONS, cluster_views
 from topomerge.extraction.convolution import Kernel, sphere, stick
@@ -20,7 +20,7 @@ from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.extraction.floors import floor_components, largest_component
 from topomerge.extraction.free_space import carve_rays, carve_views
 from topomerge.extraction.gaps import bridge_gaps
-from topomerge.extraction.noise import without_flying_cells
+from topomerge.extraction.noise import without_flying_cells, without_gaps
 from topomerge.extraction.plan_rooms import rooms_of_plans
 from topomerge.extraction.propagation import propagate_labels
 from topomerge.extraction.rooms import Floor, navigable_floor, split_rooms
@@ -46,6 +46,7 @@ class Preset:
     """Parameters of the extraction; lengths in metres. The defaults mend the thesis' known faults where that is cheap."""
 
     noise: float = 0.4  # cells with a smaller share of the usual number of neighbours are in nobody's way; 0: all are
+    sparse: float = 3.5  # cells are doubled until they have that many neighbours of 26 (median): fewer are no surface; 0: never
     stem_height: float = 0.25  # a step may stand beside the foot
     body_width: float = 0.30
     body_height: float = 1.50  # with the stem 1.75: a grown-up
@@ -75,6 +76,7 @@ PRESETS = {
     "default": Preset(),
     "thesis": Preset(
         noise=0.0,
+        sparse=0.0,
         body_height=0.75,
         bridge=0.0,
         ceilings=True,
@@ -132,11 +134,12 @@ def _extract(
     """The steps themselves."""
     with clock("read and voxelise", 0.0):
         grid = _grid(source, voxel_size, known)
+        if p.sparse and not isinstance(source, VoxelGrid):
+            grid = without_gaps(grid, p.sparse, known["warnings"])
         if p.assume:
-            grid, assumed = with_assumed_floor(grid, known.get("rays"))
-            known["warnings"] += [assumed] if assumed else []
+            grid = _upright(grid, known)
     with clock("navigable volume", 0.3):
-        navigable = navigable_volume(grid, p)
+        grid, navigable = _standing(grid, p, known)
     parameters = {**asdict(p), "voxel_size": grid.edge, "preset": preset if isinstance(preset, str) else "custom"}
     if p.door:
         with clock("rooms", 0.4):
@@ -159,6 +162,28 @@ def _extract(
         seconds=clock.seconds,
         warnings=tuple(known["warnings"]),
     )
+
+
+def _upright(grid: VoxelGrid, known: dict[str, Any]) -> VoxelGrid:
+    """A slice gets walls and a floor."""
+    if not is_slice(grid):
+        return grid
+    known["warnings"].append("the scan is a slice: walls of 2.4 m and a floor were assumed")
+    return extruded(grid, known.get("rays"))
+
+
+def _standing(grid: VoxelGrid, p: Preset, known: dict[str, Any]) -> tuple[VoxelGrid, VoxelGrid]:
+    """The navigable volume; if no floor was seen, of the grid with an assumed one."""
+    try:
+        navigable = navigable_volume(grid, p)
+        if not p.assume or has_floor(grid, navigable, p.stem_height + p.body_height):
+            return grid, navigable
+    except InputError:
+        if not p.assume or not any_ceiling(grid):
+            raise
+    known["warnings"].append("no floor was seen: one was assumed below the lowest points")
+    grid = with_assumed_floor(grid)
+    return grid, navigable_volume(grid, p)
 
 
 def navigable_volume(grid: VoxelGrid, p: Preset) -> VoxelGrid:
@@ -191,7 +216,7 @@ def free_space(grid: VoxelGrid, navigable: VoxelGrid, rays: tuple[Array, Array] 
         return None
     if rays is not None:
         return carve_rays(grid, *rays)
-    return carve_views(grid, navigable, HEIGHT_OF_EYES, p.range, p.tolerance)
+    return carve_views(grid, navigable, HEIGHT_OF_EYES, p.range)
 
 
 def optimal_views(grid: VoxelGrid, navigable: VoxelGrid, p: Preset) -> Array:

@@ -29,7 +29,7 @@ LEAST_FLOOR = 0.5  # m2 of seen floor in a part
 HOLE = 4.0  # m2: gaps this small in what is known are filled
 TOUCHES = 0.25  # m: pieces this close to a longer wall belong to it
 MARGIN = 0.6  # m
-SLAB = 0.2  # m between a ceiling and the floor above it
+SLAB = 0.1  # m at least, between a ceiling and the floor above it
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import ndimage
 
+from topomerge.extraction.completeness import outline_seen
 from topomerge.extraction.components import spread_labels
 from topomerge.extraction.judge import door_probability
 from topomerge.extraction.partition import Pair, merge_regions
@@ -22,6 +25,9 @@ UNDER_FLOOR = 0.25  # m
 LEAST_ROOM = 0.8  # m2
 LEAST_HALF_WIDTH = 0.35  # m: what is nowhere wider is the edge of a facade or of a slab
 DOORWAY = 0.5  # m: so far the navigable volume goes on into what looks like wall: the openings of noisy scans
+SHEET = 0.2  # m: thinner than a floor that carries somebody
+SLAB = 0.8  # m: the thickest floor
+HEADROOM, HIGHEST = 1.2, 8.0  # m of empty space under a ceiling: at least, at most
 OPEN_ALL_AROUND = 0.25  # share of the outline with walls, and of the floor with a ceiling: less, and a floor may be a ceiling
 
 
@@ -39,14 +45,15 @@ def rooms_of_plans(grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: f
     factor = max(round(PLAN_CELL / grid.edge), 1)
     coarse, walk, level = grid, navigable, storey
     if factor > 1:
-        coarse = _coarse(grid, factor)
-        walk = _coarse(navigable, factor)
+        coarse = grid.coarser(factor)
+        walk = navigable.coarser(factor)
         row = walk.rows(navigable.cells // factor)
         level = np.full(len(walk), np.iinfo(np.int32).max, np.int32)
         np.minimum.at(level, row, storey)
     label = np.full(len(grid), -1, np.int32)
     parts: list[tuple[Array, ...]] = []
     owners: list[Array] = []
+    seen: list[Array] = []
     probability: dict[Pair, float] = {}
     rooms = areas = 0
     for k in range(int(storey.max(initial=-1)) + 1):
@@ -58,13 +65,10 @@ def rooms_of_plans(grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: f
         parts.append(_cells_of(plan, navigable, storey == k, room, area, factor, k, rooms, areas))
         probability |= {(a + rooms, b + rooms): p for (a, b), p in doors.items()}
         owners.append(owner + rooms)
+        seen.append(outline_seen(room, plan.inside, plan.wall, plan.edge))
         rooms, areas = rooms + int(room.max(initial=-1)) + 1, areas + len(owner)
-    return _floor(grid, storeys, parts, owners, label, probability)
-
-
-def _coarse(grid: VoxelGrid, factor: int) -> VoxelGrid:
-    shape = tuple(-(-s // factor) for s in grid.shape)
-    return VoxelGrid.from_cells(grid.cells // factor, grid.origin, grid.edge * factor, shape)  # type: ignore[arg-type]
+    floor = _floor(grid, storeys, parts, owners, label, probability)
+    return replace(floor, completeness=np.concatenate(seen)) if seen else floor
 
 
 def _partition(
@@ -102,16 +106,21 @@ def _without_ceilings(grid: VoxelGrid, plan: Plan, region: Array) -> Array:
     outline = known & ndimage.binary_dilation(~plan.inside, np.ones((3, 3)))
     length = np.maximum(np.bincount(region[outline], minlength=count), 1)
     beside = np.bincount(region[outline], walled[outline], minlength=count) / length
-    suspect = (covered < OPEN_ALL_AROUND) & (beside < OPEN_ALL_AROUND)
+    suspect = covered < OPEN_ALL_AROUND
     if not suspect.any():
         return region
     at = np.argwhere(known & suspect[np.where(known, region, 0)])
     cells = np.column_stack([at + plan.low, plan.base[tuple(at.T)]])
-    e = plan.edge
-    hollow = hollow_below(*grid._bricks, cells, 1, int(np.ceil(0.8 / e)), int(np.ceil(1.2 / e)), int(np.ceil(8 / e)))
     of = region[tuple(at.T)]
-    ceiling = suspect & (np.bincount(of, hollow, minlength=count) > 0.5 * total)
+    thin, thick = (np.bincount(of, _hollow(grid, cells, depth), minlength=count) > 0.5 * total for depth in (SHEET, SLAB))
+    ceiling = suspect & (thin | (thick & (beside < OPEN_ALL_AROUND)))
     return np.where(known & ceiling[np.where(known, region, 0)], -1, region)
+
+
+def _hollow(grid: VoxelGrid, cells: Array, thickness: float) -> Array:
+    """Is a storey below each cell, under at most so much (m) of slab?"""
+    levels = [round(height / grid.edge) for height in (thickness, HEADROOM, HIGHEST)]
+    return np.asarray(hollow_below(*grid._bricks, cells, 1, *levels))
 
 
 def _label_cells(label: Array, grid: VoxelGrid, plan: Plan, room: Array, factor: int) -> None:
@@ -175,6 +184,8 @@ def _floor(
     of = {name: values[kept] for name, values in of.items()}
     floor = grid.with_cells(whole.cells[kept], {"standing": of["standing"].astype(bool)})
     storeys["area"] = np.bincount(of["storey"][lowest_of_column(floor)], minlength=len(storeys)) * floor.edge**2
+    used = storeys["area"] > 0  # what turned out to be the upper side of a ceiling is no storey
+    storeys, of["storey"] = storeys[used], (np.cumsum(used) - 1)[of["storey"]].astype(np.int32)
     return Floor(
         floor, storeys, of["storey"], of["room"], of["area"], np.concatenate(owners).astype(np.int32), label, 0.0, probability
     )

@@ -25,6 +25,7 @@ class Floor:
         label: (n,) int32 room of each occupied cell of the grid, -1 none.
         body: m, how much wider than its cells a passage is: where they tell where a body's middle may be, the body's width.
         probability: that a door parts two rooms, as far as it is known.
+        completeness: (R,) share of each room's outline at which a wall was seen, where the plans tell it.
     """
 
     cells: VoxelGrid
@@ -36,6 +37,7 @@ class Floor:
     label: Array
     body: float = 0.0
     probability: dict[tuple[int, int], float] = field(default_factory=dict)
+    completeness: Array | None = None
 
 
 def split_rooms(grid: VoxelGrid, labels: Array, least_volume: float, absorb: bool = False) -> Array:

@@ -27,7 +27,7 @@ def topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> Topomet
     number = np.append(np.where(used, np.cumsum(used) - 1, -1), -1).astype(np.int32)
     room, label = number[floor.label], number[floor.room]
     above = floor_to_ceiling(grid, floor.cells, body_height)
-    rooms = _measure(grid, room, floor, label, above)
+    rooms = _measure(grid, room, floor, label, above, np.flatnonzero(used))
     edges = find_edges(floor, label, rooms["storey"], above)
     for edge in edges:
         a, b = np.flatnonzero(used)[edge["rooms"]].tolist()
@@ -53,12 +53,14 @@ def _areas(floor: Floor, label: Array, area: Array) -> tuple[Array, Array]:
     return areas, area
 
 
-def _measure(grid: VoxelGrid, room: Array, floor: Floor, label: Array, above: Array) -> Array:
-    """(R,) ROOM_DTYPE."""
+def _measure(grid: VoxelGrid, room: Array, floor: Floor, label: Array, above: Array, numbers: Array) -> Array:
+    """(R,) ROOM_DTYPE; `numbers` (R,) are those of the floor's rooms."""
     count = int(label.max(initial=-1)) + 1
     cells = floor.cells
     rooms = np.zeros(count, ROOM_DTYPE)
-    rooms["completeness"] = completeness(grid, cells, label, count, floor.body)
+    known = floor.completeness
+    known = None if known is None else known[numbers]
+    rooms["completeness"] = completeness(grid, cells, label, count, floor.body) if known is None else known
     rooms["glimpsed"] = rooms["completeness"] < GLIMPSED
     lowest = lowest_of_column(cells)
     order = lowest[np.argsort(label[lowest], kind="stable")]

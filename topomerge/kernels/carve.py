@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from topomerge.kernels.lookup import row
+
 
 @njit(cache=True, parallel=True)
 def carve(starts, ends, margin, crossed):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
@@ -37,3 +39,32 @@ def carve(starts, ends, margin, crossed):  # type: ignore[no-untyped-def]  # pra
                 t, ty, y = ty, ty + uy, y + sy
             else:
                 t, tz, z = tz, tz + uz, z + sz
+
+
+@njit(cache=True, parallel=True)
+def sweep(table, bricks, starts, directions, reach, coarser, crossed):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Sets `crossed` in every cell, `coarser` times as long as those of the grid, that lies between a start and the first
+    occupied cell in each direction; nothing for a ray that meets none within `reach` cells.
+
+    `starts` (v, 3) in cells, `directions` (d, 3) unit vectors.
+    """
+    nx, ny, nz = crossed.shape
+    for i in prange(len(starts)):
+        for d in range(len(directions)):
+            dx, dy, dz = directions[d, 0], directions[d, 1], directions[d, 2]
+            met = -1.0
+            t = 1.0
+            while t < reach:
+                u, v, w = starts[i, 0] + t * dx, starts[i, 1] + t * dy, starts[i, 2] + t * dz
+                if row(table, bricks, int(np.floor(u)), int(np.floor(v)), int(np.floor(w))) >= 0:
+                    met = t
+                    break
+                t += 0.7
+            t = 0.0
+            while t < met - coarser / 2:
+                x = int(np.floor((starts[i, 0] + t * dx) / coarser))
+                y = int(np.floor((starts[i, 1] + t * dy) / coarser))
+                z = int(np.floor((starts[i, 2] + t * dz) / coarser))
+                if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+                    crossed[x, y, z] = True
+                t += coarser / 2
