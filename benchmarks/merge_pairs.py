@@ -22,6 +22,7 @@ from topomerge.datasets.pairs import Pair
 from topomerge.datasets.recipe import Item, Library, Recipe, draw_items, library, plans_of
 
 from topomerge.extraction.voxels import voxelise
+from topomerge.fusion.evidence import with_means
 from topomerge.io import archive
 from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
 
@@ -95,14 +96,7 @@ def _harder(i: int, item: Item) -> Item:
 
 def grid_of(cloud: PointCloud) -> VoxelGrid:
     """Occupied cells with the middle of their points."""
-    grid = voxelise(cloud, EDGE)
-    points = cloud.points.astype(np.float64) + cloud.shift
-    rows = grid.rows(grid.locate(points))
-    kept = rows >= 0
-    rows, points = rows[kept], points[kept]
-    many = np.maximum(np.bincount(rows, minlength=len(grid)), 1)
-    mean = np.column_stack([np.bincount(rows, points[:, k], len(grid)) / many for k in range(3)])
-    return VoxelGrid(grid.cells, grid.origin, grid.edge, grid.shape, {"mean": mean.astype(np.float32)})
+    return with_means(voxelise(cloud, EDGE), cloud.points.astype(np.float64) + cloud.shift)
 
 
 def free_of(cloud: PointCloud, grid: VoxelGrid) -> VoxelGrid | None:

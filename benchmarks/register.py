@@ -1,9 +1,10 @@
 """Registration of whole maps beside KISS-Matcher and Open3D: what is merged right and wrong, and how fast.
 
 ``python benchmarks/register.py [split] [limit] [methods]``: cached simulated pairs (``merge_pairs.py``; split ``train`` for
-development, ``test`` for final runs only), or ``real`` for the real pairs of TOPOMERGE_DATA. Methods: ours, kiss02, kiss03, fpfh,
-fgr (comma-separated; default all). Resumable: a line of JSON a pair and method in ``cache/merge/results_<split>.jsonl``; the
-first `limit` pairs are run (0: none, only the table). Peers get the means of the points of 0.1 m cells and a voxel size.
+development, ``test`` for final runs only), or ``real`` for the real pairs of TOPOMERGE_DATA. Methods: ours, ours_cells, kiss02,
+kiss03, fpfh, fgr (comma-separated; default all). Resumable: a line of JSON a pair and method in
+``cache/merge/results_<split>.jsonl``; the first `limit` pairs are run (0: none, only the table). Peers get the means of the
+points of 0.1 m cells and a voxel size.
 
 Right: within 0.5 m and 5 degrees (fine: 0.1 m, 1 degree) in the middle of what both maps saw; of slices, horizontally. Seconds
 are of the processor, so that other jobs on the machine do not count.
@@ -33,10 +34,20 @@ Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, how much
 
 
 def ours(pair: GridPair) -> Answer:
-    """`register`, with cells only: what an extracted map has."""
+    """`register` with cells and the middles of their points."""
+    return registered(pair, pair.a, pair.b)
+
+
+def ours_cells(pair: GridPair) -> Answer:
+    """`register` with cells only: what a map has whose points are gone."""
     bare = [VoxelGrid(g.cells, g.origin, g.edge, g.shape) for g in (pair.a, pair.b)]
+    return registered(pair, bare[0], bare[1])
+
+
+def registered(pair: GridPair, a: VoxelGrid, b: VoxelGrid) -> Answer:
+    """`register`; the scale is free where the truth says that it must be."""
     scale = "free" if pair.truth is not None and abs(pair.truth.scale - 1) > 0.03 else "fixed"
-    found = register(bare[0], bare[1], free=pair.free, scale=scale)
+    found = register(a, b, free=pair.free, scale=scale)
     return found.transform, found.accepted, found.probability
 
 
@@ -94,7 +105,7 @@ def fgr(pair: GridPair, voxel: float = 0.3) -> Answer:
 
 
 METHODS: dict[str, Callable[[GridPair], Answer]] = {
-    "ours": ours, "kiss02": kiss(0.2), "kiss03": kiss(0.3), "fpfh": fpfh, "fgr": fgr,
+    "ours": ours, "ours_cells": ours_cells, "kiss02": kiss(0.2), "kiss03": kiss(0.3), "fpfh": fpfh, "fgr": fgr,
 }  # fmt: skip
 
 
@@ -160,7 +171,7 @@ def table(rows: list[dict[str, Any]], key: Callable[[dict[str, Any]], str]) -> N
                 believed = np.array([r["believed"] and r["answered"] for r in mine])
                 seconds = np.median([r["seconds"] for r in mine])
                 print(
-                    f"{group:24s} {method:7s} pairs {len(mine):3d}  right {good.sum():3d}  fine {fine.sum():3d}  believed right "
+                    f"{group:24s} {method:10s} pairs {len(mine):3d}  right {good.sum():3d}  fine {fine.sum():3d}  believed right "
                     f"{(good & believed).sum():3d}  believed wrong {(believed & ~good).sum():3d}  cpu s {seconds:.2f}"
                 )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scenes import HEIGHT, Scene
 
+from topomerge.fusion.evidence import with_means
 from topomerge.types import Sim3, VoxelGrid
 
 MOVE = Sim3(2.1, (7.0, -3.0, 0.4))
@@ -43,12 +44,7 @@ def grid_of(points: np.ndarray, frame: Sim3 | None = None, edge: float = 0.1, me
     base = np.floor(points.min(axis=0) / edge).astype(np.int64)
     cells = np.floor(points / edge).astype(np.int64) - base
     grid = VoxelGrid.from_cells(cells, base * edge, edge)
-    if not mean:
-        return grid
-    rows = grid.rows(cells)
-    many = np.bincount(rows, minlength=len(grid))
-    middle = np.column_stack([np.bincount(rows, points[:, k], len(grid)) / many for k in range(3)])
-    return grid.with_properties(mean=middle)
+    return with_means(grid, points) if mean else grid
 
 
 def off(found: Sim3, true: Sim3, at=(10.0, 7.0, 1.0)) -> tuple[float, float]:

@@ -53,7 +53,8 @@ class Judge:
             gaps += [abs(h - (pose.scale * k + pose.translation[2])) for h, k in seen]
         unlike, area = self._ceilings(pose)
         sliced = any(v.plan.sliced for v in (*self.a, *self.b))
-        return {**_features(out, max(gaps)), "sliced": float(sliced), "ceilings": unlike, "ceiling_area": area}
+        known = {"sliced": float(sliced), "ceilings": unlike, "ceiling_area": area}
+        return {**_features(out, max(gaps)), **known}
 
     def _ceilings(self, pose: Sim3) -> tuple[float, float]:
         """How unlike the ceilings are where both maps saw free ground: mean deviation from their median difference, m, and the
@@ -207,7 +208,7 @@ def vector(f: Features) -> Array:
 
 @cache
 def model() -> dict[str, Any]:
-    """Coefficients of the two logistic models, fitted by benchmarks/calibrate_merge.py on simulated training pairs."""
+    """Coefficients of both models and the threshold, fitted on simulated training pairs (benchmarks/calibrate_merge.py)."""
     text = resources.files("topomerge.fusion").joinpath("calibration.json").read_text(encoding="utf-8")
     found: dict[str, Any] = json.loads(text)
     return found
