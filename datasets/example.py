@@ -134,7 +134,7 @@ def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]
         InputError: no candidate has such a pair, or a map has hardly a room.
     """
     pair = _first_pair(item, plans)
-    maps = [extract(cloud, voxel_size=item.voxel_size) for cloud in (pair.a, pair.b)]
+    maps = [extract(cloud, voxel_size=item.voxel_size, carve=False) for cloud in (pair.a, pair.b)]
     if min(len(m.rooms) for m in maps) < FEWEST:
         raise InputError(f"fewer than {FEWEST} rooms were extracted from a map of {' or '.join(item.sensors)}")
     truths = [room_truth(m, cloud) for m, cloud in zip(maps, (pair.a, pair.b), strict=True)]

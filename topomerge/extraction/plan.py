@@ -19,6 +19,7 @@ from topomerge.types import Array, VoxelGrid
 
 BANDS = np.linspace(0.5, 2.0, 7)  # m above the floor: a wall is seen in most of these
 WALL_BANDS = 4 / 6
+THIN = 0.4  # share of the usual wall's levels: what has fewer is no wall
 OBSERVED = 0.2  # of the fullest band's columns: below, the sensor did not look at that height
 UPRIGHT = 1.9  # m: nothing lower is a ceiling
 OVER_FURNITURE = 2.05  # m: cupboards end below
@@ -119,7 +120,11 @@ def _bands(profile: Array, edge: float) -> Array:
     need = np.ceil(WALL_BANDS * len(filled) - 1e-6)
     own = filled.sum(axis=0)
     around = np.stack([ndimage.maximum_filter(f, 3) for f in filled]).sum(axis=0)
-    return np.asarray((own >= need) | ((own >= 0.5 * need) & (around > need)))
+    like = (own >= need) | ((own >= 0.5 * need) & (around > need))
+    # flying points hang in every height of a doorway, but few of them
+    levels = np.bitwise_count(profile & _bits(BANDS[0], BANDS[-1], edge))
+    usual = np.median(levels[own >= need]) if (own >= need).any() else 0
+    return np.asarray(like & (levels >= THIN * usual))
 
 
 def _first_above(profile: Array, edge: float, height: float) -> Array:

@@ -26,7 +26,6 @@ LEAST_ROOM = 0.8  # m2
 LEAST_HALF_WIDTH = 0.35  # m: what is nowhere wider is the edge of a facade or of a slab
 DOORWAY = 0.5  # m: so far the navigable volume goes on into what looks like wall: the openings of noisy scans
 SHEET = 0.2  # m: thinner than a floor that carries somebody
-SLAB = 0.8  # m: the thickest floor
 HEADROOM, HIGHEST = 1.2, 8.0  # m of empty space under a ceiling: at least, at most
 OPEN_ALL_AROUND = 0.25  # share of the outline with walls, and of the floor with a ceiling: less, and a floor may be a ceiling
 
@@ -97,7 +96,8 @@ def _partition(
 
 
 def _without_ceilings(grid: VoxelGrid, plan: Plan, region: Array) -> Array:
-    """The regions less those without walls around and a ceiling above, under which a storey is: the upper side of its ceiling."""
+    """The regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls around
+    or so thin that nobody is carried, with a storey right below."""
     count = int(region.max(initial=-1)) + 1
     known = region >= 0
     total = np.maximum(np.bincount(region[known], minlength=count), 1)
@@ -111,16 +111,10 @@ def _without_ceilings(grid: VoxelGrid, plan: Plan, region: Array) -> Array:
         return region
     at = np.argwhere(known & suspect[np.where(known, region, 0)])
     cells = np.column_stack([at + plan.low, plan.base[tuple(at.T)]])
-    of = region[tuple(at.T)]
-    thin, thick = (np.bincount(of, _hollow(grid, cells, depth), minlength=count) > 0.5 * total for depth in (SHEET, SLAB))
-    ceiling = suspect & (thin | (thick & (beside < OPEN_ALL_AROUND)))
+    hollow = hollow_below(*grid._bricks, cells, 1, *(round(height / grid.edge) for height in (SHEET, HEADROOM, HIGHEST)))
+    thin = np.bincount(region[tuple(at.T)], hollow, minlength=count) > 0.5 * total
+    ceiling = suspect & (thin | (beside < OPEN_ALL_AROUND))
     return np.where(known & ceiling[np.where(known, region, 0)], -1, region)
-
-
-def _hollow(grid: VoxelGrid, cells: Array, thickness: float) -> Array:
-    """Is a storey below each cell, under at most so much (m) of slab?"""
-    levels = [round(height / grid.edge) for height in (thickness, HEADROOM, HIGHEST)]
-    return np.asarray(hollow_below(*grid._bricks, cells, 1, *levels))
 
 
 def _label_cells(label: Array, grid: VoxelGrid, plan: Plan, room: Array, factor: int) -> None:
