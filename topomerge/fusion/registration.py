@@ -14,7 +14,7 @@ from topomerge.errors import InputError
 from topomerge.fusion.evidence import cell_middles, plans
 from topomerge.fusion.refine import refine_pose, surface
 from topomerge.fusion.scale import search_scaled
-from topomerge.fusion.search import View, search
+from topomerge.fusion.search import Candidate, View, search
 from topomerge.fusion.verify import MARGIN_CAP, Judge, model, probability, rank
 from topomerge.types import Sim3, TopometricMap, VoxelGrid
 
@@ -84,34 +84,47 @@ def register(
     if _order(b) < _order(a):  # so that nothing depends on which comes first
         turned = [h.inverse() for h in hypotheses], [-y for y in yaws]
         return _inverse(register(b, a, scale=scale, hypotheses=turned[0], free=(free[1], free[0]), yaws=turned[1]))
-    began = time.perf_counter()
+    clock = _Clock()
     first, second = ([View(p) for p in plans(m, f)] for m, f in zip((a, b), free, strict=True))
-    seconds = {"plans": time.perf_counter() - began}
-    began = time.perf_counter()
+    clock("plans")
     candidates = (search_scaled if scale == "free" else search)(first, second, hypotheses, yaws)
-    seconds["search"] = time.perf_counter() - began
+    clock("search")
     if not candidates:
-        return Registration(None, 0.0, False, reason="the maps show no walls that could be compared", seconds=seconds)
-    began = time.perf_counter()
-    judge = Judge(first, second)
-    ranked = rank(candidates, judge)
-    seconds["verify"] = time.perf_counter() - began
-    margin = ranked[0][2] - ranked[1][2] if len(ranked) > 1 else MARGIN_CAP
-    best, features, _ = ranked[0]
-    began = time.perf_counter()
-    pose, rmse = best.pose, float("nan")
-    if not any(v.plan.sliced for v in (*first, *second)):
-        pose, rmse = _fine(_grid(a), _grid(b), best.pose, scale == "free")
-    seconds["refine"] = time.perf_counter() - began
+        return Registration(None, 0.0, False, reason="the maps show no walls that could be compared", seconds=clock.seconds)
+    ranked = rank(candidates, Judge(first, second))
+    clock("verify")
+    pose, rmse = ranked[0][0].pose, float("nan")
+    if not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
+        pose, rmse = _fine(_grid(a), _grid(b), pose, scale == "free")
+    clock("refine")
+    return _verdict(ranked, pose, rmse, clock.seconds)
+
+
+class _Clock:
+    """Seconds since the step before."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.before = time.perf_counter()
+
+    def __call__(self, step: str) -> None:
+        now = time.perf_counter()
+        self.seconds[step], self.before = now - self.before, now
+
+
+def _verdict(
+    ranked: Sequence[tuple[Candidate, dict[str, float], float]], pose: Sim3, rmse: float, seconds: dict[str, float]
+) -> Registration:
+    """The best of ranked hypotheses, refined to `pose`, with its probability and the reason in words."""
+    features = {**ranked[0][1], "margin": ranked[0][2] - ranked[1][2] if len(ranked) > 1 else MARGIN_CAP, "rmse": rmse}
     chance = probability(ranked)
     accepted = chance >= model()["threshold"]
-    said = "believed" if accepted else "not believed"
     reason = (
-        f"{said}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of free floor seen by both, "
-        f"{100 * features['conflict_share']:.1f} % of the walls stand on free floor of the other map"
+        f"{'believed' if accepted else 'not believed'}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of free "
+        f"floor seen by both, {100 * features['conflict_share']:.1f} % of the walls stand on free floor of the other map"
     )
     others = tuple(Alternative(c.pose, s, f) for c, f, s in ranked[:ALTERNATIVES])
-    return Registration(pose, chance, bool(accepted), {**features, "margin": margin, "rmse": rmse}, others, reason, seconds)
+    return Registration(pose, chance, accepted, features, others, reason, seconds)
 
 
 def _grid(m: Map) -> VoxelGrid:

@@ -38,7 +38,8 @@ def search_scaled(
                 share = score / max(np.sqrt(len(v.walls) * len(w.walls)) * scale, 1.0)  # larger maps meet more walls
                 found.append(Candidate(Sim3(yaw, (x, y, offset), scale), share))
     found.sort(key=lambda c: (not c.given, -c.score))
-    return refined(a, b, found[: KEPT + len(hypotheses)], True)
+    best = refined(a, b, found[: KEPT + len(hypotheses)], True)
+    return [c for c in best if c.given or SCALES[0] <= c.pose.scale <= SCALES[1]]  # refinement may run away
 
 
 def scale_candidates(v: View, w: View, yaws: Sequence[float]) -> list[tuple[float, float, float]]:

@@ -49,7 +49,10 @@ class Judge:
             p, q = self._sides[id(v), id(w)]
             out[0] += q.tally(p, pose)
             out[1] += p.tally(q, back) * pose.scale**2
-            seen = [h for h in ((v.plan.floor, w.plan.floor), (v.plan.ceiling, w.plan.ceiling)) if np.isfinite(h).all()]
+            heights = [(v.plan.floor, w.plan.floor), (v.plan.ceiling, w.plan.ceiling)]
+            if pose.scale != 1.0:  # a drawing of unknown scale was raised by a height of nobody's measuring
+                heights.pop()
+            seen = [h for h in heights if np.isfinite(h).all()]
             gaps += [abs(h - (pose.scale * k + pose.translation[2])) for h, k in seen]
         unlike, area = self._ceilings(pose)
         sliced = any(v.plan.sliced for v in (*self.a, *self.b))
