@@ -119,9 +119,10 @@ def _verdict(
     features = {**ranked[0][1], "margin": ranked[0][2] - ranked[1][2] if len(ranked) > 1 else MARGIN_CAP, "rmse": rmse}
     chance = probability(ranked)
     accepted = chance >= model()["threshold"]
+    share = 100 * features["conflict_share"]
     reason = (
-        f"{'believed' if accepted else 'not believed'}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of free "
-        f"floor seen by both, {100 * features['conflict_share']:.1f} % of the walls stand on free floor of the other map"
+        f"{'believed' if accepted else 'not believed'}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of "
+        f"free floor seen by both, {share:.1f} % of the walls stand on free floor of the other map"
     )
     others = tuple(Alternative(c.pose, s, f) for c, f, s in ranked[:ALTERNATIVES])
     return Registration(pose, chance, accepted, features, others, reason, seconds)
