@@ -234,7 +234,8 @@ class TopometricMap:
     Args:
         grid: occupied cells.
         room: (n,) int32, room of each occupied cell, -1 none.
-        navigable: the navigable volume, a grid of the same volume; its cells need not be occupied.
+        navigable: the navigable volume, a grid of the same volume; its cells need not be occupied. In maps of the default preset it
+            is the whole floor of the rooms, also under furniture, and its property `standing` says where a body fits.
         navigable_room: (m,) int32, room of each navigable cell, -1 none.
         rooms: (R,) ROOM_DTYPE.
         edges: (E,) EDGE_DTYPE; two rooms that meet in two doors have two edges.
@@ -242,7 +243,7 @@ class TopometricMap:
         areas: (A,) AREA_DTYPE, the parts of rooms that a narrowing or a wide opening suggests; a room without such has one.
         navigable_area: (m,) int32, area of each navigable cell, -1 none.
         narrows: (N,) EDGE_DTYPE whose `rooms` are two areas of one room.
-        free: cells known to be empty (rays crossed them), or None.
+        free: cells known to be empty (rays crossed them), of the same origin but perhaps another edge length; or None.
         provenance: (n,) uint32 bit set of the maps that saw each cell, or None for a map of one source.
         source: the file it was made from.
         parameters: what it was extracted with.
