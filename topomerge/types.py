@@ -234,8 +234,8 @@ class TopometricMap:
     Args:
         grid: occupied cells.
         room: (n,) int32, room of each occupied cell, -1 none.
-        navigable: the navigable volume, a grid of the same volume; its cells need not be occupied. In maps of the default preset it
-            is the whole floor of the rooms, also under furniture, and its property `standing` says where a body fits.
+        navigable: the navigable volume, a grid of the same volume; its cells need not be occupied. In maps of the default preset
+            it is the whole floor of the rooms, also under furniture, and its property `standing` says where a body fits.
         navigable_room: (m,) int32, room of each navigable cell, -1 none.
         rooms: (R,) ROOM_DTYPE.
         edges: (E,) EDGE_DTYPE; two rooms that meet in two doors have two edges.
