@@ -1,8 +1,8 @@
 """Pairs of extracted maps with their truth, for `benchmarks/matching.py`: two .tmap and a .json a pair, made once and reused.
 
 Run from the root: ``python benchmarks/matching_pairs.py FOLDER [pairs] [split]``. Pairs are drawn as those of `train_small`, with
-overlaps of 25, 50 and 75 % and no hard negatives; TOPOMERGE_DATA adds real plans to the procedural buildings. What is there is kept:
-take a new folder after the extraction changed.
+overlaps of 25, 50 and 75 % and no hard negatives; TOPOMERGE_DATA adds real plans to the procedural buildings. What is there is
+kept: take a new folder after the extraction changed.
 """
 
 from __future__ import annotations

@@ -93,11 +93,11 @@ def test_feather_is_the_formula(map: TopometricMap):
     walk = walk_matrix(map)
     assert np.allclose(walk.sum(axis=1), 1)
     waves = np.exp(0.3j * values[:, 0])
-    expected = np.stack([(walk @ waves).real, (walk @ waves).imag, (walk @ walk @ waves).real, (walk @ walk @ waves).imag], axis=1)
-    assert np.allclose(rows, expected[:, [0, 2, 1, 3]])
+    once, twice = walk @ waves, walk @ walk @ waves
+    assert np.allclose(rows, np.stack([once.real, twice.real, once.imag, twice.imag], axis=1))
 
 
 def test_bad_names():
-    for wrong in ({"name": "x"}, {"name": "engineered", "k": -1}, {"name": "shapedna", "value": 3}, {"name": "feather", "steps": 0}):
+    for name, options in (("x", {}), ("engineered", {"k": -1}), ("shapedna", {"value": 3}), ("feather", {"steps": 0})):
         with pytest.raises(InputError):
-            embedder(**wrong)
+            embedder(name, **options)

@@ -30,8 +30,8 @@ def graph_laplacian(cells: Array) -> Laplacian:
 def surface_laplacian(points: Array) -> Laplacian:
     """Laplace-Beltrami operator of a sampled surface (n, 3), in 1/m2: Voronoi cells in the tangent planes of the points.
 
-    On a flat sample the weights are the cotangents of its Delaunay triangulation, as in the finite elements of ShapeDNA (Reuter et
-    al. 2006); where two points see their common side differently, the mean is taken. Borders are free (Neumann).
+    On a flat sample the weights are the cotangents of its Delaunay triangulation, as in the finite elements of ShapeDNA (Reuter
+    et al. 2006); where two points see their common side differently, the mean is taken. Borders are free (Neumann).
     """
     count = min(NEIGHBOURS, len(points) - 1)
     distance, near = cKDTree(points).query(points, count + 1)

@@ -1,7 +1,7 @@
 """Sets of matches that one transform explains, several kept alive (beyond the thesis; findings: "matching alone is not the end").
 
-Pairs of rooms that may be one vote with their doors in the space of poses; the poses with most votes are laid over the plan of the
-other map, moved so that walls meet, and ranked by walls that agree less walls that stand in what the other map saw empty.
+Pairs of rooms that may be one vote with their doors in the space of poses; the poses with most votes are laid over the plan of
+the other map, moved so that walls meet, and ranked by walls that agree less walls that stand in what the other map saw empty.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ SIGMAS = (0.25, 0.15)  # m, of agreement: of the first look and of the last
 REFINED = 60  # poses that are moved until walls meet
 COLUMNS = 20_000  # of floor, laid over each other to find the rooms in common
 TRIMS = (0.8, 0.6, 0.45, 0.35, 0.3, 0.3)  # m, walls farther apart do not count, round by round
+MANY = 20_000  # poses: neighbours are not looked for among more
 FEWEST = 10  # walls that meet; fewer move nothing
 STOREY = 0.7  # m by which floors of one storey may differ
 CONFLICT = 2.0  # weight of a metre that disagrees against one that agrees
@@ -76,8 +77,11 @@ def candidate_poses(
 
 def votes(poses: Poses) -> Array:
     """(H,) logarithm of 1 + the weight of all poses that lay the map within 1 m and 10 degrees of each."""
-    place = np.concatenate([poses.shift, np.stack([np.cos(poses.yaw), np.sin(poses.yaw), 3 * np.log(poses.scale)], axis=1) * 6], axis=1)
-    near = cKDTree(place).query_ball_point(place, 1.0, return_sorted=False) if len(place) < 20_000 else [[i] for i in range(len(place))]
+    turn = 6 * np.stack([np.cos(poses.yaw), np.sin(poses.yaw), 3 * np.log(poses.scale)], axis=1)  # 10 degrees are 1 m
+    place = np.concatenate([poses.shift, turn], axis=1)
+    if len(place) > MANY:
+        return np.log1p(poses.weight)
+    near = cKDTree(place).query_ball_point(place, 1.0, return_sorted=False)
     return np.log1p(np.array([poses.weight[n].sum() for n in near]))
 
 
@@ -183,18 +187,18 @@ def odds_features(evidence: Array) -> Array:
 
 
 def matches_under(transform: Sim3, plans: tuple[TopDown, TopDown], storeys: Array) -> tuple[Array, Array]:
-    """(M, 2) rooms that share floor under a transform and (M,) how well they fit (see `by_overlap`)."""
+    """(M, 2) rooms whose footprints meet under a transform and (M,) how well they fit (see `by_overlap`)."""
     a, b = plans
-    storey, x, y = np.nonzero(b.floor)
+    storey, x, y = np.nonzero(b.footprint >= 0)
     every = max(len(x) // COLUMNS, 1)
     storey, x, y = storey[::every], x[::every], y[::every]
-    room = b.label[storey, x, y]
+    room = b.footprint[storey, x, y]
     places = b.origin + (np.stack([x, y], axis=1) + 0.5) * b.edge
     at = transform.apply(np.concatenate([places, np.zeros((len(places), 1))], axis=1))[:, :2]
     cell = np.floor((at - a.origin) / a.edge).astype(int)
     on = storeys[storey]
-    inside = (cell >= 0).all(axis=1) & (cell < a.label.shape[1:]).all(axis=1) & (on >= 0)
-    other = a.label[on[inside], cell[inside, 0], cell[inside, 1]]
+    inside = (cell >= 0).all(axis=1) & (cell < a.footprint.shape[1:]).all(axis=1) & (on >= 0)
+    other = a.footprint[on[inside], cell[inside, 0], cell[inside, 1]]
     hit = other >= 0
     common = np.zeros((len(a.areas), len(b.areas)))
     np.add.at(common, (other[hit], room[inside][hit]), every * (transform.scale * b.edge) ** 2)

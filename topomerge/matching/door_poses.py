@@ -1,7 +1,7 @@
 """Poses that put a door of one map on a door of the other.
 
-The middle of a room that was seen in part is off by a metre; its doors are not, and a door tells a direction, too. So each pair of
-rooms that may be one, and each pair of their doors, makes a pose.
+The middle of a room that was seen in part is off by a metre; its doors are not, and a door tells a direction, too. So each pair
+of rooms that may be one, and each pair of their doors, makes a pose.
 """
 
 from __future__ import annotations
@@ -73,8 +73,7 @@ def door_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown
 
 
 def middle_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> Poses:
-    """Four poses for each pair of rooms, middle on middle along the walls: for rooms without doors in common. The scale is that
-    which makes the rooms of both maps equally high on the median, if `weight` says so by being negative (never otherwise)."""
+    """Four poses for each pair of rooms, middle on middle along the walls: for rooms without doors in common."""
     quarter = (plans[0].direction[0] - plans[1].direction[0]) + np.arange(4) * np.pi / 2
     i, j = np.repeat(pairs[:, 0], 4), np.repeat(pairs[:, 1], 4)
     yaw = np.tile(quarter, len(pairs))
@@ -142,8 +141,8 @@ def _two_doors(a: Doors, b: Doors, pairs: Array, weight: Array) -> tuple[Array, 
                 turns = np.array([a.into[p] - b.into[q], a.into[p2] - b.into[q2]]) - yaw
                 if (abs((turns + np.pi) % (2 * np.pi) - np.pi) < 2 * SNAP).all():
                     found.append((p, q, yaw, abs(u) / abs(v), w))
-    p, q, turn, ratio, each = (np.array(x) for x in zip(*found, strict=True)) if found else (np.zeros(0),) * 5
-    return p.astype(int), q.astype(int), turn, ratio, each
+    table = np.array(found, float).reshape(-1, 5)
+    return table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2], table[:, 3], table[:, 4]
 
 
 def _ordered(rows: Array) -> list[tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""Hypothesis growing: from one matched pair of rooms to their neighbours, as long as costs and geometry allow (seeds 3.3; thesis)."""
+"""Hypothesis growing: from one matched pair of rooms to their neighbours, while costs and geometry allow (seeds 3.3; thesis)."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ Pairs = tuple[tuple[int, int], ...]
 def grow(a: TopometricMap, b: TopometricMap, cost: Array, c_max: float | None = None, de_max: float = 2.5) -> list[Pairs]:
     """Hypotheses, the one with most matches first (of equal ones the cheapest); each is a set of pairs, ascending.
 
-    Every pair of the assignment of least cost is a seed. A seed's neighbours are assigned to the neighbours of its partner; a pair
-    is taken if its cost is at most `c_max` and the alignment of all matched centroids does not get worse by more than `de_max`;
+    Every pair of the assignment of least cost is a seed. A seed's neighbours are assigned to those of its partner; a pair is
+    taken if its cost is at most `c_max` and the alignment of all matched centroids does not get worse by more than `de_max`;
     its own neighbours come next.
 
     Args:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from topomerge.io.listing import plain
@@ -45,9 +46,7 @@ def matching_to_text(found: Matching, a: TopometricMap, b: TopometricMap) -> str
     if found.alternatives:
         lines += ["", "hypothesis  probability  matches  yaw deg        x        y        z  scale"]
     for k, h in enumerate(found.alternatives[:5]):
-        x, y, z = h.transform.translation
-        yaw = h.transform.yaw * 57.29577951308232
-        lines.append(
-            f"{k:>10}  {h.probability:>11.2f}  {len(h.rooms):>7}  {yaw:>7.1f}  {x:>7.2f}  {y:>7.2f}  {z:>7.2f}  {h.transform.scale:>5.3f}"
-        )
+        numbers = "  ".join(f"{v:>7.2f}" for v in h.transform.translation)
+        yaw = math.degrees(h.transform.yaw)
+        lines.append(f"{k:>10}  {h.probability:>11.2f}  {len(h.rooms):>7}  {yaw:>7.1f}  {numbers}  {h.transform.scale:>5.3f}")
     return "\n".join(lines)

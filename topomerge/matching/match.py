@@ -56,7 +56,7 @@ def match(
         raise InputError(f"matching method {method!r}: {', '.join(METHODS)} are possible")
     check(a, b)
     describe = make_embedder("shapedna", **THESIS) if method == "thesis" else make_embedder(embedder, k, **options)
-    cost = descriptor_costs(*(checked(describe, m) for m in (a, b)))
+    cost = descriptor_costs(checked(describe, a), checked(describe, b))
     similarity = similarities(cost)
     told = {"rooms_a": float(len(a.rooms)), "rooms_b": float(len(b.rooms)), "median_cost": float(np.median(cost))}
     told["usual_best_cost"] = usual_best(cost)

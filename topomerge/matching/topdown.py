@@ -22,7 +22,8 @@ class TopDown:
     origin: (2,) m, corner of the raster; edge: m of a cell.
     floors: (S,) m, height of each storey's floor.
     walls: (S, nx, ny) bool.
-    label: (S, nx, ny) int32 room whose floor it is, -1 none.
+    label: (S, nx, ny) int32 room whose navigable floor it is, -1 none.
+    footprint: (S, nx, ny) int32 room that anything in the column belongs to, -1 none.
     """
 
     origin: Array
@@ -30,6 +31,7 @@ class TopDown:
     floors: Array
     walls: Array
     label: Array
+    footprint: Array
 
     @cached_property
     def distance(self) -> Array:
@@ -65,8 +67,8 @@ class TopDown:
 
     @cached_property
     def areas(self) -> Array:
-        """(R,) m2 of floor of each room that has a label."""
-        return np.bincount(self.label[self.floor]) * self.edge**2
+        """(R,) m2 of each room's footprint; rooms after the last one that has any are left out."""
+        return np.bincount(self.footprint[self.footprint >= 0]) * self.edge**2
 
     @cached_property
     def direction(self) -> tuple[float, float]:
@@ -117,4 +119,8 @@ def top_down(map: TopometricMap) -> TopDown:
     x, y = (nav.cells[rows, :2] + shift).T
     fits = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[2])
     label[map.rooms["storey"][room[fits]], x[fits], y[fits]] = room[fits]
-    return TopDown(grid.origin[:2], grid.edge, floors, walls, label)
+    footprint = np.full(shape, -1, np.int32)
+    rows = np.flatnonzero(map.room >= 0)
+    room = map.room[rows]
+    footprint[map.rooms["storey"][room], grid.cells[rows, 0], grid.cells[rows, 1]] = room
+    return TopDown(grid.origin[:2], grid.edge, floors, walls, label, np.where(label >= 0, label, footprint))
