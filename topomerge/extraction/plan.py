@@ -88,7 +88,7 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
 
 
 def _within(at: Array, size: Array) -> Array:
-    return ((at >= 0) & (at < size)).all(axis=1)
+    return np.asarray(((at >= 0) & (at < size)).all(axis=1))
 
 
 def _heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[Array, Array, Array]:
