@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from topomerge.extraction.extract import PRESETS as PRESETS
     from topomerge.extraction.extract import extract as extract
     from topomerge.extraction.voxels import voxelise as voxelise
+    from topomerge.fusion.merge import merge as merge
+    from topomerge.fusion.result import MergeResult as MergeResult
     from topomerge.io.listing import map_to_json as map_to_json
     from topomerge.io.listing import save_json as save_json
     from topomerge.io.maps import load_map as load_map
@@ -30,12 +32,14 @@ if TYPE_CHECKING:
     from topomerge.types import VoxelGrid as VoxelGrid
     from topomerge.viz.figures import plan_figure as plan_figure
     from topomerge.viz.figures import save_figure as save_figure
+    from topomerge.viz.merge_report import save_merge as save_merge
     from topomerge.viz.report import save_report as save_report
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "InputError": "topomerge.errors",
+    "MergeResult": "topomerge.fusion.result",
     "PRESETS": "topomerge.extraction.extract",
     "PointCloud": "topomerge.types",
     "Sim3": "topomerge.types",
@@ -44,12 +48,14 @@ _HOMES = {
     "extract": "topomerge.extraction.extract",
     "load_map": "topomerge.io.maps",
     "map_to_json": "topomerge.io.listing",
+    "merge": "topomerge.fusion.merge",
     "plan_figure": "topomerge.viz.figures",
     "read_chunks": "topomerge.io.points",
     "read_points": "topomerge.io.points",
     "save_figure": "topomerge.viz.figures",
     "save_json": "topomerge.io.listing",
     "save_map": "topomerge.io.maps",
+    "save_merge": "topomerge.viz.merge_report",
     "save_report": "topomerge.viz.report",
     "save_rooms_ply": "topomerge.io.rooms_ply",
     "voxelise": "topomerge.extraction.voxels",

@@ -21,6 +21,7 @@ EXIT_STATUSES = """\
 exit status:
   0    done
   1    bad input or a wrong command line: one line on stderr says which file and why; no output is written
+  2    no trustworthy merge: the reason is printed and stands in merge.json
   130  interrupted
   141  what read the output went away (`| head`)
 Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""

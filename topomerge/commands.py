@@ -55,6 +55,16 @@ def _above_zero(text: str) -> float:
     return value
 
 
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"must be a number from 0 to 1, not {text!r}")
+    return value
+
+
 def _count(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"must be a whole number, not {text!r}")
@@ -177,6 +187,64 @@ def match_command(args: argparse.Namespace) -> int:
     return 0
 
 
+def merge_command(args: argparse.Namespace) -> int:
+    """`topomerge merge`: maps in, one map out, or an honest refusal."""
+    folder = Path(args.output)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; give the name of a folder")
+    _check_inputs(args.inputs)
+    made = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        check_outputs([folder / name for name in ("merge.json", "report.html", "merged.ply", "map.tmap")], args.inputs)
+        status = _merge(args, folder)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be written ({error.strerror or error})") from error
+    finally:
+        if made and folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+    return status
+
+
+def _check_inputs(paths: list[str]) -> None:
+    if len(paths) != 2:
+        later = "more than two need an atlas, which comes later: merge two, then merged/map.tmap with the next"
+        advice = later if len(paths) > 2 else "give another one"
+        raise InputError(f"{paths[-1]}: merge takes two maps, {len(paths)} given; {advice}")
+    for path in paths:
+        if not Path(path).exists():
+            raise InputError(f"{path}: no such file")
+    if Path(paths[0]).resolve() == Path(paths[1]).resolve():
+        raise InputError(f"{paths[1]}: is given twice; give two different maps")
+
+
+def _merge(args: argparse.Namespace, folder: Path) -> int:
+    from dataclasses import replace
+    from time import perf_counter
+
+    maps, read, extracted = [], 0.0, 0.0
+    for path in args.inputs:
+        began = perf_counter()
+        found = _map_from(path, args)
+        took = perf_counter() - began
+        steps = 0.0  # of a .tmap, all is reading
+        if Path(path).suffix.lower() != ".tmap":
+            steps = min(sum(s for step, s in found.seconds.items() if not step.startswith("read")), took)
+        read, extracted = read + took - steps, extracted + steps
+        maps.append(replace(found, source=path))
+    choices = _given(args, "force", "threshold")
+    result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, **choices)
+    result = replace(result, seconds={**result.seconds, "read": read, "extract": extracted})
+    warn(result.warnings)
+    result.save(folder)
+    if not args.quiet:
+        rooms = f", {len(result.map.rooms)} rooms, {len(result.matches)} matches" if result.map else ""
+        print(f"{result.reason}{rooms} -> {folder}")
+    elif not result.merged:
+        print(f"topomerge: {result.reason}", file=sys.stderr)
+    return 0 if result.merged else 2
+
+
 def _map_from(path: str, args: argparse.Namespace) -> Any:
     """The map in a .tmap, or the one that is extracted from anything else."""
     from topomerge.io.maps import load_map
@@ -270,6 +338,36 @@ COMMANDS = (
         ),
         paths=("a", "b"),
         description="Print which rooms of two maps are the same, with probabilities, and the transforms that would make them so.",
+    ),
+    Command(
+        "merge",
+        merge_command,
+        "bring two maps together, or say why not",
+        "topomerge merge a.ply b.laz -o merged/",
+        (
+            option("inputs", nargs="+", metavar="MAP", help="two clouds or .tmap, in any mix; clouds are extracted first"),
+            option(
+                "-o",
+                "--output",
+                required=True,
+                metavar="DIR",
+                default=None,
+                help="folder for merge.json, merged.ply, map.tmap, report.html",
+            ),
+            option(
+                "--scale",
+                dest="scale_of_b",
+                choices=("fixed", "free"),
+                default="fixed",
+                help="free: that of the second is unknown",
+            ),
+            option("--force", action="store_true", help="write the best merge even if it is not believed (status 2 stays)"),
+            option("--threshold", type=_share, metavar="P", help="probability from which a merge is believed (default 0.9)"),
+            *(o for o in MAPS if o[0][0] != "--k"),
+            option("-q", "--quiet", action="store_true", default=False, help="print nothing but warnings and a refusal"),
+        ),
+        paths=("output",),
+        description="Bring two maps together: status 0 and a joined map, or status 2 and the reason why it is not believed.",
     ),
     Command(
         "simulate",

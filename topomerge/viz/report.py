@@ -19,7 +19,7 @@ import numpy as np
 
 from topomerge import __version__
 from topomerge.io.atomic import replacing
-from topomerge.types import TopometricMap
+from topomerge.types import Array, TopometricMap
 from topomerge.viz.markup import Markup, element, join, json_data
 from topomerge.viz.plan import StoreyPlan
 from topomerge.viz.scene import scene_data
@@ -27,7 +27,7 @@ from topomerge.viz.sheet import Sheet, lay_out
 from topomerge.viz.svg import plan_svgs
 from topomerge.viz.tables import doors_table, facts, rooms_table, seconds_table, storeys_table
 
-SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "page.js")
+SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "merge.js", "page.js")
 
 
 def save_report(map: TopometricMap, path: str | Path) -> None:
@@ -143,8 +143,12 @@ def storey_names(map: TopometricMap) -> list[tuple[str, str]]:
     return names or [("Plan", "no storeys were found")]
 
 
-def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan]) -> Markup:
-    """All storeys' plans, as `lay_out` made them; the page's script shows one at a time, zooms and switches layers."""
+def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], colours: Array | None = None) -> Markup:
+    """All storeys' plans, as `lay_out` made them; the page's script shows one at a time, zooms and switches layers.
+
+    Args:
+        colours: (R, 3) uint8 of the rooms; neighbours differ if None.
+    """
     names = storey_names(map)
     choices = [element("button", name, type="button", data_storey=i) for i, (name, _) in enumerate(names) if len(names) > 1]
     layers = [("labels", "numbers", True), ("graph", "graph", True), ("doors", "doors", True)]
@@ -156,18 +160,22 @@ def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan]) -> 
     for layer, name, on in layers:
         box = element("input", type="checkbox", checked=on, data_layer=layer)
         boxes.append(element("label", box, f" {name}"))
-    zoom = [
-        element("button", sign, type="button", data_zoom=step, title=words, aria_label=words)
-        for sign, step, words in (("+", "in", "Zoom in"), ("−", "out", "Zoom out"), ("⤢", "all", "Show all"))
-    ]
-    groups = [("choices", choices), ("layers", boxes), ("zoom", zoom)]
+    groups = [("choices", choices), ("layers", boxes), ("zoom", zoom_buttons())]
     bar = element("div", *(element("div", *parts, class_=name) for name, parts in groups if parts), class_="controls")
     figures = [
         element("figure", element("figcaption", element("b", name), f" {words}"), drawing, data_storey=i)
-        for i, ((name, words), drawing) in enumerate(zip(names, plan_svgs(map, sheet, plans), strict=True))
+        for i, ((name, words), drawing) in enumerate(zip(names, plan_svgs(map, sheet, plans, colours), strict=True))
     ]
     told = element("p", "Point at a room. Drag to move; click, then scroll to zoom.", class_="told", aria_live="polite")
     return element("div", bar, element("div", *figures, class_="sheet", tabindex=0), told, legend(map), class_="plan-view")
+
+
+def zoom_buttons() -> list[Markup]:
+    """The buttons by which a plan is zoomed."""
+    return [
+        element("button", sign, type="button", data_zoom=step, title=words, aria_label=words)
+        for sign, step, words in (("+", "in", "Zoom in"), ("−", "out", "Zoom out"), ("⤢", "all", "Show all"))
+    ]
 
 
 def legend(map: TopometricMap) -> Markup:

@@ -61,30 +61,32 @@ def rotation(angle: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
-def lay_out(map: TopometricMap, key: str = "") -> tuple[Sheet, list[StoreyPlan]]:
+def lay_out(map: TopometricMap, key: str = "", turn: float | None = None) -> tuple[Sheet, list[StoreyPlan]]:
     """The paper for a map and the plan of each storey, lowest first.
 
     Args:
         map: any map.
         key: stands before the numbers of its rooms, to tell the rooms of several maps on a page apart.
+        turn: rad, by which the building is turned against the clock; None: so that its walls run along the paper.
     """
     frame = frame_of(map)
     plans = storey_plans(map, frame)
-    return sheet_for(plans, frame, key), plans
+    return sheet_for(plans, frame, key, turn), plans
 
 
-def sheet_for(plans: list[StoreyPlan], frame: Frame, key: str = "") -> Sheet:
+def sheet_for(plans: list[StoreyPlan], frame: Frame, key: str = "", turn: float | None = None) -> Sheet:
     """The paper for the plans of all storeys."""
     mask = np.any([plan.room >= 0 for plan in plans], axis=0)
     if not mask.any():
         mask = np.any([plan.floor for plan in plans], axis=0)
     pixels = np.argwhere(mask)
     points = frame.centre(pixels) if len(pixels) else frame.low[None]
-    turn = -direction(np.any([plan.wall for plan in plans], axis=0))
-    turn = 0.0 if abs(turn) < UPRIGHT else turn
-    wide, high = np.ptp(points @ rotation(turn).T, axis=0)
-    if turn and high > TALL * wide:
-        turn -= np.copysign(np.pi / 2, turn)
+    if turn is None:
+        turn = -direction(np.any([plan.wall for plan in plans], axis=0))
+        turn = 0.0 if abs(turn) < UPRIGHT else turn
+        wide, high = np.ptp(points @ rotation(turn).T, axis=0)
+        if turn and high > TALL * wide:
+            turn -= np.copysign(np.pi / 2, turn)
     turned = points @ rotation(turn).T
     low, top = turned.min(axis=0) - frame.size, turned.max(axis=0) + frame.size
     width, height = np.round(100 * (top - low)).astype(int).tolist()

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.io.palette import room_colours
-from topomerge.types import TopometricMap
+from topomerge.types import Array, TopometricMap
 from topomerge.viz.markup import Markup, element
 from topomerge.viz.outline import room_outlines, seen_outline, wall_outline
 from topomerge.viz.plan import Place, StoreyPlan, places
@@ -25,17 +25,18 @@ MARGIN = 0.04  # of the longer side, around the building
 LEVEL = 0.5  # m: stairs whose ends are nearer to each other, seen from above, are drawn as a sign
 
 
-def plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan]) -> list[Markup]:
+def plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], colours: Array | None = None) -> list[Markup]:
     """The plan of each storey, lowest first.
 
     Args:
         map: any map.
         sheet: the paper, and `plans`, the plan of each storey: both from `lay_out`.
+        colours: (R, 3) uint8 of the rooms; neighbours differ if None.
 
     Returns:
         `<svg class="plan" data-storey=…>` elements. Rooms, their labels and their nodes in the graph carry `data-room`.
     """
-    colours = room_colours(map)
+    colours = room_colours(map) if colours is None else colours
     named = [places(plan, sheet.frame) for plan in plans]
     everywhere = {room: place for of_storey in named for room, place in of_storey.items()}
     drawings = []
@@ -50,7 +51,7 @@ def plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan]) -> 
             _layer("doors", _doors(map, sheet, storey)),
             _layer("labels", [_label(map, sheet, i, place) for i, place in sorted(named[storey].items())]),
         ]
-        drawings.append(_drawing(map, sheet, storey, layers))
+        drawings.append(drawing(map, sheet, storey, layers))
     return drawings
 
 
@@ -58,7 +59,8 @@ def _layer(name: str, parts: list[Markup]) -> Markup:
     return element("g", *parts, class_=name)
 
 
-def _drawing(map: TopometricMap, sheet: Sheet, storey: int, layers: list[Markup]) -> Markup:
+def drawing(map: TopometricMap, sheet: Sheet, storey: int, layers: list[Markup]) -> Markup:
+    """One `<svg class="plan">` of what its layers hold, with scale bar and axes, that the page's script can zoom."""
     width, height = sheet.size
     margin = round(MARGIN * max(width, height)) + 30
     unit = max((width + 2 * margin) / SCREEN[0], (height + 2 * margin) / SCREEN[1])

@@ -19,6 +19,8 @@ startTheme(document.getElementById("theme"));
 startHighlights();
 document.querySelectorAll("table.sortable").forEach(startTable);
 document.querySelectorAll(".plan-view").forEach(startPlan);
+document.querySelectorAll("input[data-blend]").forEach(startBlend);
+startMates(document.getElementById("mates"));
 // The page is shown before the cells are read; that there is no 3D is said only once it is known.
 document.querySelectorAll("[data-scene]").forEach((place) => place.classList.add("waiting"));
 setTimeout(() => document.querySelectorAll("[data-scene]").forEach(openScene), 50);

@@ -1,0 +1,169 @@
+"""Maps -> one map, or an honest refusal: rooms matched, poses judged on the whole maps, cells fused (seeds 3.3; method.md, 3)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from topomerge.embedding.embedders import embedder as make_embedder
+from topomerge.embedding.room_cells import Descriptor
+from topomerge.errors import InputError
+from topomerge.fusion.fuse import join, rooms_in_common
+from topomerge.fusion.registration import Registration, _order, register
+from topomerge.fusion.result import STEPS, MergeResult, RoomMatch
+from topomerge.fusion.verify import model
+from topomerge.fusion.words import why
+from topomerge.matching.match import match
+from topomerge.types import Array, Sim3, TopometricMap
+
+SPARE = 0.3  # a match fits fully with this much less of the floor shared: rooms are seen in part
+TOO_WIDE, WIDER = 300.0, 30.0  # m, and times the other map: a map that spans this is in another unit
+HIGHER = 2.2  # times the height of the other's storeys: the same, or a hall
+
+
+def merge(
+    maps: Sequence[TopometricMap],
+    *,
+    scale: str = "fixed",
+    force: bool = False,
+    threshold: float | None = None,
+    embedder: str | Descriptor | None = None,
+) -> MergeResult:
+    """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
+
+    Args:
+        maps: two topometric maps.
+        scale: "fixed", or "free" where the scale of the second map is unknown.
+        force: give the best transform and its joined map, too, where it is not believed; the status stays "abstained".
+        threshold: probability from which a merge is believed; that of the calibration if None.
+        embedder: "engineered" (default), "shapedna", "feather" or a callable map -> (R, D), for the matching of rooms.
+
+    Raises:
+        InputError: not two maps, one map twice, a map without cells, maps in different units, another word for the scale.
+    """
+    a, b = _checked(maps, scale)
+    limit = float(model()["threshold"]) if threshold is None else float(threshold)
+    if not 0 <= limit <= 1:
+        raise InputError(f"threshold must be a probability between 0 and 1, not {threshold}")
+    clock = _Clock()
+    found = register(a, b, scale=scale, hypotheses=_hypotheses(a, b, embedder, scale, clock))
+    believed = found.transform is not None and found.probability >= limit
+    result = MergeResult(
+        "merged" if believed else "abstained",
+        found.probability,
+        why(found, limit, force),
+        maps=(a, b),
+        registration=found,
+        warnings=tuple(_warnings(a, b, scale)),
+    )
+    pose = found.transform
+    if pose is None or not (believed or force):
+        return replace(result, seconds=clock.all())
+    joined = join(a, b, pose)
+    matches = tuple(_matches(a, b, found))
+    return replace(result, transforms={1: pose}, matches=matches, map=joined, seconds=clock.all())
+
+
+class _Clock:
+    """Seconds of embedding and matching; fusing is the rest."""
+
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(STEPS, 0.0)
+        self.began = time.perf_counter()
+
+    @contextmanager
+    def __call__(self, step: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.seconds[step] += time.perf_counter() - began
+
+    def all(self) -> dict[str, float]:
+        """Of each step; embedding is part of no other."""
+        s = self.seconds
+        s["match"] = max(s["match"] - s["embed"], 0.0)
+        s["fuse"] = max(time.perf_counter() - self.began - s["match"] - s["embed"], 0.0)
+        return s
+
+
+def _checked(maps: Sequence[TopometricMap], scale: str) -> tuple[TopometricMap, TopometricMap]:
+    if len(maps) != 2:
+        words = "more than two need an atlas, which comes later: merge two, then the joined map with the next"
+        raise InputError(f"{len(maps)} maps were given, merge takes two; {words if len(maps) > 2 else 'give another one'}")
+    if scale not in ("fixed", "free"):
+        raise InputError(f"scale must be fixed or free, not {scale!r}")
+    a, b = maps
+    for which, m in (("the first map", a), ("the second map", b)):
+        if not len(m.grid):
+            raise InputError(f"{m.source or which}: has no occupied cells, nothing can be merged")
+    same = len(a.grid) == len(b.grid) and np.array_equal(a.grid.cells, b.grid.cells)
+    if a is b or (same and np.allclose(a.grid.origin, b.grid.origin) and a.grid.edge == b.grid.edge):
+        name = b.source or "the second map"
+        raise InputError(f"{name}: is the same map as {a.source or 'the first'}; give two different maps")
+    if scale == "fixed":
+        _check_units(a, b)
+    return a, b
+
+
+def _check_units(a: TopometricMap, b: TopometricMap) -> None:
+    """A map that is far larger than any neighbour of the other is in centimetres or millimetres."""
+    wide = [float(np.hypot(*np.ptp(m.grid.cells[:, :2], axis=0))) * m.grid.edge for m in (a, b)]
+    big, small = (a, b) if wide[0] >= wide[1] else (b, a)
+    ratio = max(wide) / max(min(wide), small.grid.edge)
+    if max(wide) > TOO_WIDE and ratio > WIDER:
+        unit = "mm" if ratio > 300 else "cm"
+        name, other = big.source or "one map", small.source or "the other"
+        raise InputError(
+            f"{name}: spans {max(wide):,.0f} m, {other} {min(wide):,.0f} m: the units seem to differ; extract it with --unit {unit}, "
+            "or merge with --scale free"
+        )
+
+
+def _warnings(a: TopometricMap, b: TopometricMap, scale: str) -> Iterator[str]:
+    for which, m in (("the first map", a), ("the second map", b)):
+        if len(m.rooms) == 0:
+            yield f"{m.source or which}: has no rooms: only walls and empty space can be compared"
+        elif len(m.rooms) == 1:
+            yield f"{m.source or which}: has one room: little can be compared"
+    high = [_storey_height(m) for m in (a, b)]
+    if scale == "fixed" and min(high) > 0 and max(high) > HIGHER * min(high):
+        tall, low = (a, b) if high[0] >= high[1] else (b, a)
+        names = tall.source or "one map", low.source or "the other"
+        yield (
+            f"{names[0]}: storeys are {max(high):.1f} m high, in {names[1]} {min(high):.1f} m: the units may differ (--unit ft, or "
+            "--scale free)"
+        )
+
+
+def _storey_height(m: TopometricMap) -> float:
+    """m, median floor to ceiling; 0 where none was seen."""
+    height = m.storeys["ceiling"] - m.storeys["floor"]
+    height = height[np.isfinite(height)]
+    return float(np.median(height)) if len(height) else 0.0
+
+
+def _hypotheses(a: TopometricMap, b: TopometricMap, embedder: str | Descriptor | None, scale: str, clock: _Clock) -> list[Sim3]:
+    """Poses T_ab of matched rooms."""
+    if not len(a.rooms) or not len(b.rooms):
+        return []
+    if _order(b) < _order(a):  # as registration: nothing may depend on which comes first
+        return [h.inverse() for h in _hypotheses(b, a, embedder, scale, clock)]
+    describe = make_embedder(embedder or "engineered", 0)
+
+    def timed(m: TopometricMap) -> Array:
+        with clock("embed"):
+            return describe(m)
+
+    with clock("match"):
+        return [h.transform for h in match(a, b, timed, scale_free=scale == "free").alternatives]
+
+
+def _matches(a: TopometricMap, b: TopometricMap, found: Registration) -> Iterator[RoomMatch]:
+    """Rooms that lie in each other; a match is as probable as the merge, and less where they share little of their floor."""
+    assert found.transform is not None
+    rooms, fit = rooms_in_common(a, b, found.transform)
+    for (i, j), share in zip(rooms.tolist(), fit.tolist(), strict=True):
+        yield RoomMatch((0, 1), (i, j), found.probability * min(1.0, share + SPARE))

@@ -1,0 +1,110 @@
+"""What a merge gives: whether two maps belong together, where, which rooms are the same, and the joined map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from topomerge.fusion.registration import Registration
+from topomerge.io.listing import plain
+from topomerge.types import Sim3, TopometricMap
+
+FORMAT = 1
+STEPS = ("read", "extract", "embed", "match", "fuse")
+
+
+@dataclass(frozen=True)
+class RoomMatch:
+    """A room of one map that is a room of another.
+
+    Args:
+        maps: which maps, by their place in the list that was merged.
+        rooms: one room of each.
+        probability: that they are one: of the merge, times how well the rooms' floors fit. Not calibrated by itself.
+    """
+
+    maps: tuple[int, int]
+    rooms: tuple[int, int]
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class MergeResult:
+    """What `merge` found.
+
+    Args:
+        status: "merged" or "abstained".
+        probability: that the best transform is right, calibrated on simulated pairs.
+        reason: in words.
+        transforms: k -> T_0k, which maps points of map k into the frame of map 0; empty where nothing is believed.
+        matches: rooms that are one under the transforms.
+        seconds: of ``embed``, ``match`` and ``fuse`` (registration, fusing, extracting rooms again); ``read`` and ``extract``
+            are 0 where the maps were made before.
+        map: the joined map with the provenance of its cells (bit k: map k saw it), or None.
+        maps: what was merged.
+        registration: the evidence.
+        warnings: what the user should know.
+    """
+
+    status: str
+    probability: float
+    reason: str
+    transforms: Mapping[int, Sim3] = field(default_factory=dict)
+    matches: tuple[RoomMatch, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    map: TopometricMap | None = None
+    maps: tuple[TopometricMap, ...] = ()
+    registration: Registration | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.status not in ("merged", "abstained"):
+            raise ValueError(f"status must be merged or abstained, not {self.status!r}")
+
+    @property
+    def merged(self) -> bool:
+        """Is the merge to be trusted?"""
+        return self.status == "merged"
+
+    def save(self, folder: str | Path) -> None:
+        """Write merge.json and report.html, and where there is a joined map merged.ply and map.tmap; all of them or none.
+
+        Files of an earlier merge are replaced, or removed where this one has none; others in the folder are left alone.
+
+        Raises:
+            InputError: the folder can't be made or written.
+        """
+        from topomerge import save_merge  # by the package's face: the report stands above fusion
+
+        save_merge(self, folder)
+
+
+def merge_to_json(result: MergeResult) -> dict[str, Any]:
+    """`merge.json` as plain values: see docs/outputs.md. Numbers are not rounded: national grids need all digits."""
+    registration = result.registration
+    rmse = registration.features.get("rmse", float("nan")) if registration else float("nan")
+    transforms = {str(k): _transform(pose, rmse) for k, pose in result.transforms.items()}
+    listing = {
+        "format": FORMAT,
+        "status": result.status,
+        "probability": min(max(float(result.probability), 0.0), 1.0),
+        "reason": result.reason,
+        "maps": [{"source": m.source, "rooms": len(m.rooms), "storeys": len(m.storeys)} for m in result.maps],
+        "transforms": transforms,
+        "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],
+        "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in STEPS},
+    }
+    out: dict[str, Any] = plain(listing)
+    return out
+
+
+def _transform(pose: Sim3, rmse: float) -> dict[str, Any]:
+    return {
+        "into": 0,
+        "matrix": pose.matrix.tolist(),
+        "scale": pose.scale,
+        "yaw_deg": pose.yaw * 57.29577951308232,
+        "rmse_m": rmse if rmse == rmse else None,  # nan: slices have no planes to measure it by
+    }

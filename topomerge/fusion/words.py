@@ -1,0 +1,71 @@
+"""Why a merge is believed, or not, in words and in numbers that a reader can weigh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from topomerge.fusion.registration import Alternative, Registration
+
+CLOSE = 1.5  # log odds: a hypothesis less far behind is as good
+Row = tuple[str, str, str]  # what, how much, what it says
+
+
+def why(found: Registration, threshold: float, force: bool = False) -> str:
+    """One sentence: the verdict, what speaks for it and what against."""
+    if found.transform is None:
+        return f"not merged: {found.reason}"
+    believed = found.probability >= threshold
+    f = found.features
+    sign = "reaches" if believed else "is below"
+    words = [f"{'merged' if believed else 'not merged'}: probability {found.probability:.2f} {sign} {threshold:.2f}"]
+    words.append(f"{f['walls']:.0f} m2 of walls agree, {f['free']:.0f} m2 of free floor seen by both")
+    words.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
+    if not believed and f["margin"] < CLOSE and len(found.alternatives) > 1:
+        words.append("another place explains the maps as well")
+    if force and not believed:
+        words.append("joined all the same, as was asked for (--force)")
+    return "; ".join(words)
+
+
+def evidence_rows(found: Registration) -> list[Row]:
+    """What the best hypothesis was judged by: (what, how much, what it says)."""
+    if found.transform is None:
+        return []
+    f = found.features
+    whole = f"{_percent(f['conflict_share'])} of the walls that meet anything, {_percent(f['worst_conflict'])} of one map's"
+    met = f"{_percent(f['met'])} of it meets furniture of the other map; by chance {_percent(f['chance'])}"
+    rows = [
+        ("walls on walls", f"{f['walls']:.1f} m²", f"{_percent(f['ratio'])} of the walls that both could have seen; speaks for"),
+        ("free floor in common", f"{f['free']:.0f} m²", "seen empty by both; speaks for"),
+        ("walls on free floor", f"{f['conflict']:.1f} m²", f"{whole}; speaks against"),
+        ("walls back to back", _percent(f["opposed"]), "of the walls that meet face apart, as those of neighbouring rooms do"),
+        ("furniture", f"{f['clutter']:.1f} m²", met),
+        ("floors", f"{f['level']:.2f} m", "largest step between floors or ceilings that should be one"),
+    ]
+    if f.get("ceiling_area", 0) > 0:
+        words = f"how unlike they are over {f['ceiling_area']:.0f} m²; storeys of one plan often differ here"
+        rows.append(("ceilings", f"{f['ceilings']:.2f} m", words))
+    if np.isfinite(f.get("rmse", np.nan)):
+        rows.append(("surfaces", f"{100 * f['rmse']:.1f} cm", "root mean square distance of surfaces that are one"))
+    if len(found.alternatives) > 1:
+        times = np.exp(min(f["margin"], 15.0))
+        words = f"{times:,.0f} times as probable" if times >= 1.5 else "about as probable"
+        rows.append(("next best place", words, "how far the best hypothesis is ahead of the next one, each seen by itself"))
+    return rows
+
+
+def hypothesis_row(rank: int, other: Alternative, best: Alternative, middle: Mapping[str, float] | np.ndarray) -> list[str]:
+    """A hypothesis as text: rank, turn, distance from the best one, odds against it, walls, conflict."""
+    at = np.asarray(middle, float)[None]
+    away = float(np.linalg.norm(other.transform.apply(at) - best.transform.apply(at)))
+    turn = (np.degrees(other.transform.yaw) + 180) % 360 - 180
+    odds = np.exp(np.clip(other.plausibility - best.plausibility, -15, 15))
+    f = other.features
+    share = f"{100 * f['conflict_share']:.1f} %"
+    return [str(rank), f"{turn:.1f}", f"{away:.1f}", f"{odds:.2g}", f"{f['walls']:.1f}", f"{f['free']:.0f}", share]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
