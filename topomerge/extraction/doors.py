@@ -14,6 +14,7 @@ from topomerge.extraction.rooms import Floor
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import EDGE_DTYPE, Array, VoxelGrid
 
+LEAST_WIDTH = 0.4  # m: narrower gaps in which no body fits are holes in a wall
 DOOR_WIDTH = 1.6  # m: what is wider is an opening
 SAME_DOOR = 0.8  # m: passages between the same rooms that are this close are one
 HEIGHT = 0.6  # m: what is higher or lower is another level
@@ -56,7 +57,8 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
         meeting = navigable.subset(rows)
         contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))
         parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
-        edges += _apart([_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts])
+        found = [_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts]
+        edges += _apart([edge for edge in found if edge[2] >= LEAST_WIDTH or edge[6]])
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
     _add_stairs(table, floor)
     return table
@@ -135,7 +137,9 @@ def _edge(
         kind = "door" if width <= DOOR_WIDTH else "opening"
     across = float(np.arctan2(along[0], -along[1]) % np.pi)  # the wall's normal
     place = tuple(centre.tolist())
-    return (tuple(int(p) for p in pair), place, width, height, across, kind, True, 1.0, place, place)
+    standing = navigable.properties.get("standing")
+    passable = standing is None or bool(standing[rows].any())
+    return (tuple(int(p) for p in pair), place, width, height, across, kind, passable, 1.0, place, place)
 
 
 def _under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:

@@ -43,8 +43,11 @@ MOST_RAYS = 400_000  # kept of a portion of two million points
 
 @dataclass(frozen=True)
 class Preset:
-    """Parameters of the extraction; lengths in metres. With `door` above 0 rooms come from the plans of the storeys (docs/adr/0004),
-    otherwise from the views, as in the thesis: then everything from `view_spacing` to `absorb` counts."""
+    """Parameters of the extraction; lengths in metres.
+
+    With `door` above 0 rooms come from the plans of the storeys (docs/adr/0004), otherwise from the views, as in the thesis: then
+    everything from `view_spacing` to `absorb` counts.
+    """
 
     noise: float = 0.4  # cells with a smaller share of the usual number of neighbours are in nobody's way; 0: all are
     sparse: float = 3.5  # cells are doubled until they have that many neighbours of 26 (median): fewer are no surface; 0: never
