@@ -19,6 +19,7 @@ TRUTH_DTYPE = np.dtype(
 )
 LEAST_IOU = 0.1  # below, an extracted room is no true room
 BESIDE = 0.15  # m: points of a wall lie outside of the room's outline
+OUTSIDE = 0.5  # share of the points outside of the map's cells: a slice that was made into walls and a floor
 
 
 def room_truth(map: TopometricMap, cloud: PointCloud) -> Array:
@@ -47,16 +48,33 @@ def room_truth(map: TopometricMap, cloud: PointCloud) -> Array:
 
 
 def cell_labels(map: TopometricMap, cloud: PointCloud) -> Array:
-    """(n,) int32 true room of each occupied cell: that of most of its labelled points; -1: none."""
+    """(n,) int32 true room of each occupied cell: that of most of its labelled points; -1: none.
+
+    The points of a slice lie below the walls that the extraction made of it: they label the whole column. Its assumed floor has
+    no points and gets its labels from the rooms' outlines.
+    """
     if cloud.labels is None:
         return _by_outline(map, cloud)
     known = np.flatnonzero(cloud.labels >= 0)
-    row = map.grid.rows(map.grid.locate(cloud.points[known].astype(np.float64) + cloud.shift))
-    label = cloud.labels[known][row >= 0].astype(np.int64)
-    out = np.full(len(map.grid), -1, np.int32)
-    pair, votes = np.unique(row[row >= 0] * max(len(cloud.rooms), 1) + label, return_counts=True)
+    label = cloud.labels[known].astype(np.int64)
+    places = map.grid.locate(cloud.points[known].astype(np.float64) + cloud.shift)
+    row = map.grid.rows(places)
+    if (row < 0).sum() <= OUTSIDE * len(known):
+        return _most(row, label, len(map.grid), len(cloud.rooms))
+    columns, column = np.unique(map.grid.cells[:, :2], axis=0, return_inverse=True)
+    number = np.full(map.grid.shape[:2], -1)
+    number[tuple(columns.T)] = np.arange(len(columns))
+    inside = ((places[:, :2] >= 0) & (places[:, :2] < map.grid.shape[:2])).all(axis=1)
+    walls = _most(number[tuple(places[inside, :2].T)], label[inside], len(columns), len(cloud.rooms))[column.ravel()]
+    return np.where(walls >= 0, walls, _by_outline(map, cloud))
+
+
+def _most(row: Array, label: Array, count: int, rooms: int) -> Array:
+    """(count,) int32 label that is commonest in each row; -1: none. Rows below 0 are left out."""
+    out = np.full(count, -1, np.int32)
+    pair, votes = np.unique(row[row >= 0] * max(rooms, 1) + label[row >= 0], return_counts=True)
     order = np.argsort(votes, kind="stable")  # the last one written has most votes
-    cell, room = np.divmod(pair[order], max(len(cloud.rooms), 1))
+    cell, room = np.divmod(pair[order], max(rooms, 1))
     out[cell] = room
     return out
 
