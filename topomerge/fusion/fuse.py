@@ -1,7 +1,7 @@
-"""Two maps and where one lies in the other -> one map (thesis, section 3.4: fusion; here on the cells, and rooms are found anew).
+"""Two maps and where one lies in the other -> one map: their cells are fused, and rooms and doors found anew (seeds 3.3; method 3).
 
-Cells of b are resampled: a cell of the joined grid is occupied where its middle lies in a cell of b. So a turned wall stays as
-thick as it was and gets no holes, which moving the middles of b's cells would make.
+Cells of b are resampled: a cell of the joined grid is occupied where its middle lies in a cell of b, and where the middle of a
+cell of b lies in it. So no cell of b is lost, and a turned floor or wall gets no holes.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _by_room(owner: Array, values: Array, count: int) -> tuple[Array, Array]:
 
 
 def resampled(grid: VoxelGrid, pose: Sim3, origin: Array, edge: float) -> tuple[Array, Array]:
-    """Cells (n, 3) int64 of a lattice whose middles lie in the moved cells of a grid, and the row (n,) of that cell.
+    """Cells (n, 3) int64 of a lattice that the moved cells of a grid fill, and the row (n,) of one that does.
 
     Args:
         pose: of the grid in the frame of the lattice.
@@ -148,10 +148,12 @@ def _resampled(grid: VoxelGrid, pose: Sim3, origin: Array, edge: float) -> Itera
     back = pose.inverse()
     for start in range(0, len(grid), AT_ONCE):
         at = pose.apply(grid.centroids(grid.cells[start : start + AT_ONCE]))
-        cells = (np.floor((at - origin) / edge).astype(np.int64)[:, None] + around).reshape(-1, 3)
+        own = np.floor((at - origin) / edge).astype(np.int64)
+        cells = (own[:, None] + around).reshape(-1, 3)
         cells = cells[np.unique(_codes(cells), return_index=True)[1]]
         rows = grid.rows(grid.locate(back.apply(origin + (cells + 0.5) * edge)))
         yield cells[rows >= 0], rows[rows >= 0]
+        yield own, np.arange(start, start + len(own))
 
 
 def _codes(cells: Array) -> Array:

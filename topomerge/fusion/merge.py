@@ -115,11 +115,8 @@ def _check_units(a: TopometricMap, b: TopometricMap) -> None:
     ratio = max(wide) / max(min(wide), small.grid.edge)
     if max(wide) > TOO_WIDE and ratio > WIDER:
         unit = "mm" if ratio > 300 else "cm"
-        name, other = big.source or "one map", small.source or "the other"
-        raise InputError(
-            f"{name}: spans {max(wide):,.0f} m, {other} {min(wide):,.0f} m: the units seem to differ; extract it with --unit {unit}, "
-            "or merge with --scale free"
-        )
+        spans = f"{big.source or 'one map'}: spans {max(wide):,.0f} m, {small.source or 'the other'} {min(wide):,.0f} m"
+        raise InputError(f"{spans}: the units seem to differ; extract it with --unit {unit}")
 
 
 def _warnings(a: TopometricMap, b: TopometricMap, scale: str) -> Iterator[str]:
@@ -132,10 +129,7 @@ def _warnings(a: TopometricMap, b: TopometricMap, scale: str) -> Iterator[str]:
     if scale == "fixed" and min(high) > 0 and max(high) > HIGHER * min(high):
         tall, low = (a, b) if high[0] >= high[1] else (b, a)
         names = tall.source or "one map", low.source or "the other"
-        yield (
-            f"{names[0]}: storeys are {max(high):.1f} m high, in {names[1]} {min(high):.1f} m: the units may differ (--unit ft, or "
-            "--scale free)"
-        )
+        yield f"{names[0]}: storeys are {max(high):.1f} m high, in {names[1]} {min(high):.1f} m: the units may differ"
 
 
 def _storey_height(m: TopometricMap) -> float:

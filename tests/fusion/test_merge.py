@@ -1,0 +1,262 @@
+"""Two maps of one building become one; maps that do not belong together do not; what is written can be read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plans_of import MOVE, off, office, part
+from scenes import Scene, two_rooms
+from scipy import ndimage
+
+import topomerge as tm
+from topomerge.errors import InputError
+from topomerge.fusion.fuse import fuse, join, resampled, room_of_rooms, rooms_in_common
+from topomerge.fusion.result import STEPS, MergeResult, merge_to_json
+from topomerge.types import Sim3, TopometricMap, VoxelGrid
+
+
+def map_of(points: np.ndarray, name: str, frame: Sim3 | None = None) -> TopometricMap:
+    return tm.extract((frame or Sim3()).apply(points).astype(np.float32), name=name)
+
+
+@pytest.fixture(scope="module")
+def points():
+    return office().points()
+
+
+@pytest.fixture(scope="module")
+def halves(points):
+    """The west and the east of the office, in two frames; T_ab = MOVE^-1."""
+    return map_of(part(points, high=(16, 99)), "a.ply"), map_of(part(points, low=(5, -99)), "b.ply", MOVE)
+
+
+@pytest.fixture(scope="module")
+def merged(halves):
+    return tm.merge(halves)
+
+
+@pytest.fixture(scope="module")
+def stranger():
+    other = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,))
+    return map_of(other.points(), "c.ply", MOVE)
+
+
+@pytest.fixture(scope="module")
+def refused(halves, stranger):
+    return tm.merge([halves[0], stranger])
+
+
+def test_two_halves_are_merged(merged, halves):
+    assert merged.merged and merged.probability > 0.9 and "merged" in merged.reason
+    middle = tuple(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0])
+    metres, degrees = off(merged.transforms[1], MOVE.inverse(), middle)
+    assert metres < 0.06 and degrees < 0.2
+    assert set(merged.seconds) == set(STEPS) and merged.seconds["fuse"] > 0 and merged.seconds["embed"] > 0
+    assert merged.maps == halves
+
+
+def test_the_joined_map_has_the_rooms_of_the_whole(merged, points):
+    whole = map_of(points, "whole")
+    assert len(merged.map.rooms) == len(whole.rooms)
+    assert merged.map.rooms["area"].sum() == pytest.approx(whole.rooms["area"].sum(), rel=0.05)
+    assert abs(len(merged.map.edges) - len(whole.edges)) <= 1
+    assert merged.map.source == "a.ply + b.ply" and merged.map.free is not None
+
+
+def test_the_other_way_round_is_the_inverse(merged, halves):
+    back = tm.merge(halves[::-1])
+    assert np.allclose((merged.transforms[1] @ back.transforms[1]).matrix, np.eye(4), atol=1e-6)
+    assert back.probability == pytest.approx(merged.probability)
+    assert {m.rooms for m in merged.matches} == {m.rooms[::-1] for m in back.matches}
+
+
+def test_rooms_match_where_both_saw_them(merged, halves):
+    a, b = halves
+    assert merged.matches
+    for match in merged.matches:
+        i, j = match.rooms
+        there = MOVE.inverse().apply(b.rooms["centroid"][j][None])[0]
+        both_whole = a.rooms["lo"][i][0] > 5 and a.rooms["hi"][i][0] < 16
+        if both_whole:
+            assert np.linalg.norm(a.rooms["centroid"][i] - there) < 0.5
+        assert 0 < match.probability <= merged.probability and match.maps == (0, 1)
+    within = room_of_rooms(a, merged.map, Sim3()), room_of_rooms(b, merged.map, merged.transforms[1])
+    assert all(within[0][m.rooms[0]] == within[1][m.rooms[1]] for m in merged.matches)
+
+
+def test_unrelated_maps_are_refused(refused):
+    assert refused.status == "abstained" and not refused.merged
+    assert not refused.transforms and refused.map is None and not refused.matches
+    assert "not merged" in refused.reason and refused.probability < 0.9
+
+
+def test_force_joins_them_and_still_says_no(halves, stranger):
+    forced = tm.merge([halves[0], stranger], force=True)
+    assert forced.status == "abstained" and 1 in forced.transforms and forced.map is not None and "force" in forced.reason
+
+
+def test_a_threshold_is_kept_to(halves, merged):
+    assert tm.merge(halves, threshold=1.0).status == "abstained"
+    for wrong in (-0.1, 1.1, float("nan")):
+        with pytest.raises(InputError, match="between 0 and 1"):
+            tm.merge(halves, threshold=wrong)
+
+
+def test_provenance_counts_every_cell_once():
+    """Two boxes of cells that share a part, the second one moved by whole cells."""
+    a, b = (map_of(two_rooms().points(), n) for n in "ab")
+    move = Sim3(0.0, (3.0, 0.0, 0.0))
+    found = fuse(a, b, move)
+    shifted = b.grid.locate(b.grid.centroids())  # the cells themselves
+    to = {tuple(c) for c in (shifted + np.round((b.grid.origin + (3, 0, 0)) / 0.1)).astype(int).tolist()}
+    own = {tuple(c) for c in (a.grid.cells + np.round(a.grid.origin / 0.1)).astype(int).tolist()}
+    assert np.bincount(found.provenance, minlength=4).tolist() == [0, len(own - to), len(to - own), len(own & to)]
+    assert found.provenance.dtype == np.uint32
+
+
+def test_bits_of_joined_maps_follow(halves, merged):
+    again = fuse(merged.map, halves[1], merged.transforms[1])
+    assert np.bitwise_or.reduce(again.provenance) == 0b111
+    full = replace(merged.map, provenance=np.full(len(merged.map.grid), 1 << 31, np.uint32))
+    with pytest.raises(InputError, match="at most 32"):
+        fuse(full, halves[1], merged.transforms[1])
+
+
+def test_what_one_map_saw_empty_and_the_other_did_not_is_occupied(halves, merged):
+    found = fuse(*halves, merged.transforms[1])
+    assert found.free is not None and found.contested > 0
+    assert np.array_equal(found.free.origin, found.grid.origin) and found.free.edge == 2 * found.grid.edge
+    assert not found.grid.coarser(2).contains(found.free.cells).any()
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 4])
+def test_a_turned_wall_stays_whole(turn):
+    x, z = np.meshgrid(np.arange(60), np.arange(25), indexing="ij")
+    wall = VoxelGrid.from_cells(np.stack([x, 0 * x + 5, z], axis=-1).reshape(-1, 3), edge=0.1)
+    cells, rows = resampled(wall, Sim3(turn, (1.23, 4.56, 0.05)), np.zeros(3), 0.1)
+    assert 0.7 * len(wall) < len(cells) < 1.35 * len(wall) and len(np.unique(cells, axis=0)) == len(cells)
+    moved = Sim3(turn, (1.23, 4.56, 0.05)).apply(wall.centroids())
+    assert {tuple(c) for c in np.floor(moved / 0.1).astype(int).tolist()} <= {tuple(c) for c in cells.tolist()}  # none is lost
+    away = np.linalg.norm((cells + 0.5) * 0.1 - moved[rows], axis=1)
+    assert away.max() < 0.1 * np.sqrt(3) / 2 + 1e-9
+    image = np.zeros(cells.max(axis=0)[:2] + 1, bool)
+    image[tuple(cells[:, :2].T)] = True
+    assert ndimage.label(image, np.ones((3, 3)))[1] == 1  # a walk along the wall meets no gap
+
+
+@pytest.mark.parametrize("turn", [0.2, 0.6, np.pi / 4])
+def test_a_turned_floor_has_no_holes(turn):
+    x, y = np.meshgrid(np.arange(50), np.arange(40), indexing="ij")
+    floor = VoxelGrid.from_cells(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3), edge=0.1)
+    cells, _ = resampled(floor, Sim3(turn, (0.03, 0.07, 0.0)), np.array([-9.0, -9.0, 0.0]), 0.1)
+    image = np.zeros(cells.max(axis=0)[:2] + 2, bool)
+    image[tuple(cells[:, :2].T)] = True
+    assert np.array_equal(ndimage.binary_fill_holes(image), image) and (cells[:, 2] == cells[0, 2]).all()
+
+
+def test_coarse_cells_are_filled():
+    grid = VoxelGrid.from_cells(np.array([[0, 0, 0], [1, 0, 0]]), edge=0.2)
+    cells, rows = resampled(grid, Sim3(), np.zeros(3), 0.1)
+    assert len(cells) == 16 and np.bincount(rows).tolist() == [8, 8]
+
+
+def test_a_map_laid_on_itself_is_itself(halves):
+    a = halves[0]
+    found = join(a, replace(a, source="again"), Sim3())
+    assert len(found.grid) == len(a.grid) and (found.provenance == 3).all()
+    rooms, fit = rooms_in_common(a, a, Sim3())
+    assert rooms[:, 0].tolist() == rooms[:, 1].tolist() == list(range(len(a.rooms))) and (fit > 0.99).all()
+
+
+def test_json_has_the_schema(merged, refused):
+    listing = merge_to_json(merged)
+    assert list(listing) == ["format", "status", "probability", "reason", "maps", "transforms", "matches", "seconds"]
+    assert listing["format"] == 1 and listing["status"] == "merged" and 0 <= listing["probability"] <= 1
+    assert listing["maps"][0] == {"source": "a.ply", "rooms": len(merged.maps[0].rooms), "storeys": 1}
+    assert list(listing["transforms"]) == ["1"]
+    entry = listing["transforms"]["1"]
+    assert set(entry) == {"into", "matrix", "scale", "yaw_deg", "rmse_m"} and entry["into"] == 0
+    point = np.array([1.0, 2.0, 3.0, 1.0])
+    assert np.allclose((np.array(entry["matrix"]) @ point)[:3], merged.transforms[1].apply(point[None, :3])[0])
+    assert all(set(m) == {"maps", "rooms", "probability"} and m["maps"] == [0, 1] for m in listing["matches"])
+    assert set(listing["seconds"]) == set(STEPS)
+    assert merge_to_json(refused)["transforms"] == {} and merge_to_json(refused)["matches"] == []
+    json.dumps(listing, allow_nan=False)
+
+
+def test_save_writes_all_and_a_refusal_takes_back_the_rest(merged, refused, tmp_path):
+    folder = tmp_path / "deep" / "merged"
+    merged.save(folder)
+    assert sorted(p.name for p in folder.iterdir()) == ["map.tmap", "merge.json", "merged.ply", "report.html"]
+    back = tm.load_map(folder / "map.tmap")
+    assert np.array_equal(back.provenance, merged.map.provenance) and len(back.rooms) == len(merged.map.rooms)
+    assert json.loads((folder / "merge.json").read_text()) == merge_to_json(merged)
+    (folder / "notes.txt").write_text("mine")
+    refused.save(folder)
+    assert sorted(p.name for p in folder.iterdir()) == ["merge.json", "notes.txt", "report.html"]
+
+
+def test_saving_leaves_nothing_half_written(merged, tmp_path, monkeypatch):
+    import topomerge.viz.merge_report as report
+
+    def fail(*_: object) -> None:
+        raise InputError("disk full")
+
+    monkeypatch.setattr(report, "save_map", fail)
+    with pytest.raises(InputError, match="disk full"):
+        merged.save(tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="can't be made"):
+        merged.save(tmp_path / "file" / "merged")
+
+
+def test_the_report_says_it_all(merged, refused):
+    from topomerge.viz.merge_report import merge_html
+
+    text = merge_html(merged)
+    for words in (
+        "Merged · probability",
+        "walls on walls",
+        "Why it is believed",
+        "data-blend",
+        'data-room="a0"',
+        'data-room="b0"',
+    ):
+        assert words in text
+    assert merge_html(merged) == text and "http" not in text.replace("http-equiv", "")
+    no = merge_html(refused)
+    assert "Not merged" in no and "Why it is not believed" in no and "data-scene=" not in no
+
+
+def test_bad_maps_are_refused(halves, stranger):
+    a, b = halves
+    with pytest.raises(InputError, match="a.ply: is the same map as a.ply"):
+        tm.merge([a, a])
+    with pytest.raises(InputError, match="is the same map"):
+        tm.merge([a, replace(a, source="copy.ply")])
+    with pytest.raises(InputError, match="atlas"):
+        tm.merge([a, b, stranger])
+    with pytest.raises(InputError, match="merge takes two"):
+        tm.merge([a])
+    with pytest.raises(InputError, match="fixed or free"):
+        tm.merge([a, b], scale="any")
+    large = replace(a, grid=replace(a.grid, edge=a.grid.edge * 100), source="cm.ply")
+    with pytest.raises(InputError, match="cm.ply: spans .* --unit cm"):
+        tm.merge([large, b])
+    with pytest.raises(ValueError, match="merged or abstained"):
+        MergeResult("perhaps", 0.5, "")
+
+
+def test_maps_with_one_room_or_none_are_tried(halves):
+    room = map_of(Scene().shell(0, 0, 5, 4).points(), "room.ply")
+    assert any("room.ply: has one room" in w for w in tm.merge([room, halves[0]]).warnings)
+    empty = replace(room, rooms=room.rooms[:0], edges=room.edges[:0], areas=room.areas[:0], narrows=room.narrows[:0],
+                    room=np.full_like(room.room, -1), navigable_room=np.full_like(room.navigable_room, -1),
+                    navigable_area=np.full_like(room.navigable_area, -1))  # fmt: skip
+    found = tm.merge([empty, halves[0]], force=True)
+    assert any("has no rooms" in w for w in found.warnings)
+    assert not found.merged
