@@ -12,12 +12,13 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from topomerge.datasets.example import refusal
+from topomerge.datasets.recipe import Item
 
 from topomerge.errors import InputError
 from topomerge.io import archive
@@ -45,13 +46,15 @@ class Counted:
         rows: what is told of each pair (`example.make_arrays`).
         bytes: of each file.
         apart: m, of all pairs: see `middles_apart`.
-        refused: reasons and how often, without the names and numbers in them. What took too long, and what failed in a way that
-            may not fail again, leaves no file and is not among them.
+        outdated: pairs in the folder that are of another version of the data (`recipe.FORMAT`); none of them is counted.
+        refused: reasons and how often, without the names and numbers in them; of all versions in the folder. What took too
+            long, or failed in a way that may not happen again, leaves no file and is not among them.
     """
 
     rows: list[Row]
     bytes: list[int]
     apart: list[float]
+    outdated: int
     refused: dict[str, int]
 
 
@@ -83,21 +86,40 @@ def count_folder(folder: Path) -> Counted:
 
 def _counted(paths: Sequence[Path], folder: Path) -> Counted:
     rows: list[Row] = []
+    sizes: list[int] = []
     apart: list[float] = []
     for path in paths:
         arrays = archive.read(path, "cached pair")
         try:
-            rows.append(json.loads(arrays["about"].tobytes()))
+            row = json.loads(arrays["about"].tobytes())
+            if item_of(row).name != path.stem:
+                continue
             apart += middles_apart(arrays).tolist()
-        except (KeyError, ValueError) as error:
+        except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: is no cached pair ({error}); delete it and build the set again") from error
+        rows.append(row)
+        sizes.append(path.stat().st_size)
     reasons = Counter(kind_of(refusal(folder, p.stem)) for p in sorted(folder.glob("[!.]*.refused")))
-    return Counted(rows, [p.stat().st_size for p in paths], apart, dict(reasons.most_common()))
+    return Counted(rows, sizes, apart, len(paths) - len(rows), dict(reasons.most_common()))
+
+
+def item_of(row: Row) -> Item:
+    """The item that a pair was made from: its name is that of the file if it was made by this version of the code.
+
+    Raises:
+        KeyError: something of it is missing.
+    """
+    told = {**row, "overlap": row["asked_overlap"]}
+    return Item(**{field.name: _fixed(told[field.name]) for field in fields(Item)})
+
+
+def _fixed(value: Any) -> Any:
+    return tuple(map(_fixed, value)) if isinstance(value, list) else value
 
 
 def kind_of(reason: str) -> str:
     """A reason without names, numbers and sensors, and without the advice after it."""
-    short = re.split(r"[;:]| from a map of ", reason)[0]
+    short = re.split(r";| from a map of ", reason)[0]
     return re.sub(r"\S*\d\S*", "…", short)
 
 
@@ -183,6 +205,9 @@ def report(counted: Counted) -> Lines:
         raise InputError("no pair is there yet; build the set, or wait for its first pairs")
     refused = sum(counted.refused.values())
     size, total = np.median(counted.bytes) / 1000, sum(counted.bytes) / 1e6
+    if counted.outdated:
+        yield f"{counted.outdated} pairs of another version of the data are in the folder; they are not counted."
+        yield ""
     yield f"{len(counted.rows)} pairs, {refused} items refused; {size:.0f} kB a file (median), {total:.0f} MB together."
     yield ""
     yield from by_sensor(counted.rows)
@@ -190,8 +215,10 @@ def report(counted: Counted) -> Lines:
     yield from by_source(counted.rows)
     if counted.apart:
         middle, most = np.percentile(counted.apart, [50, 90])
+        over = len(counted.apart)
         yield f"Matched rooms that came out of both maps with an IoU above {CLEAN:g}, one-to-one, have their middles"
-        yield f"{middle:.2f} m apart under the true transform, seen from above (median of {len(counted.apart)}; 90 %: {most:.1f} m)."
+        yield f"{middle:.2f} m apart under the true transform, seen from above (median of {over}; 90 %: {most:.1f} m;"
+        yield "each map may have seen another part of a room, which moves its middle)."
         yield ""
     if refused:
         yield from table(("refused because", "items"), counted.refused.items())

@@ -19,7 +19,7 @@ TRUTH_DTYPE = np.dtype(
 )
 LEAST_IOU = 0.1  # below, an extracted room is no true room
 BESIDE = 0.15  # m: points of a wall lie outside of the room's outline
-OUTSIDE = 0.5  # share of the points outside of the map's cells: a slice that was made into walls and a floor
+FLAT = 0.5  # of the height of the map: points that span less are a slice, which was made into walls and a floor
 
 
 def room_truth(map: TopometricMap, cloud: PointCloud) -> Array:
@@ -50,23 +50,28 @@ def room_truth(map: TopometricMap, cloud: PointCloud) -> Array:
 def cell_labels(map: TopometricMap, cloud: PointCloud) -> Array:
     """(n,) int32 true room of each occupied cell: that of most of its labelled points; -1: none.
 
-    The points of a slice lie below the walls that the extraction made of it: they label the whole column. Its assumed floor has
-    no points and gets its labels from the rooms' outlines.
+    The points of a slice lie in, or below, the walls that the extraction made of it: they label the whole column.
+    Its assumed floor has no points and gets its labels from the rooms' outlines.
     """
     if cloud.labels is None:
         return _by_outline(map, cloud)
     known = np.flatnonzero(cloud.labels >= 0)
     label = cloud.labels[known].astype(np.int64)
     places = map.grid.locate(cloud.points[known].astype(np.float64) + cloud.shift)
-    row = map.grid.rows(places)
-    if (row < 0).sum() <= OUTSIDE * len(known):
-        return _most(row, label, len(map.grid), len(cloud.rooms))
+    if not len(known) or _height(places) >= FLAT * _height(map.grid.cells):
+        return _most(map.grid.rows(places), label, len(map.grid), len(cloud.rooms))
     columns, column = np.unique(map.grid.cells[:, :2], axis=0, return_inverse=True)
     number = np.full(map.grid.shape[:2], -1)
     number[tuple(columns.T)] = np.arange(len(columns))
     inside = ((places[:, :2] >= 0) & (places[:, :2] < map.grid.shape[:2])).all(axis=1)
     walls = _most(number[tuple(places[inside, :2].T)], label[inside], len(columns), len(cloud.rooms))[column.ravel()]
     return np.where(walls >= 0, walls, _by_outline(map, cloud))
+
+
+def _height(cells: Array) -> float:
+    """Levels between the lowest and the highest cells, but for one in a hundred."""
+    low, high = np.percentile(np.unique(cells, axis=0)[:, 2], [1, 99])
+    return float(high - low)
 
 
 def _most(row: Array, label: Array, count: int, rooms: int) -> Array:
