@@ -238,8 +238,8 @@ def _merge(args: argparse.Namespace, folder: Path) -> int:
     warn(result.warnings)
     result.save(folder)
     if not args.quiet:
-        rooms = f", {len(result.map.rooms)} rooms, {len(result.matches)} matches" if result.map else ""
-        print(f"{result.reason}{rooms} -> {folder}")
+        joined = f"; {len(result.matches)} matches, {len(result.map.rooms)} rooms in all" if result.map else ""
+        print(f"{result.reason}{joined} -> {folder}")
     elif not result.merged:
         print(f"topomerge: {result.reason}", file=sys.stderr)
     return 0 if result.merged else 2

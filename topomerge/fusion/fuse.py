@@ -1,4 +1,4 @@
-"""Two maps and where one lies in the other -> one map: their cells are fused, and rooms and doors found anew (seeds 3.3; method 3).
+"""Two maps and where one lies in the other -> one map: cells are fused, rooms and doors found anew (seeds 3.3; method.md, 3).
 
 Cells of b are resampled: a cell of the joined grid is occupied where its middle lies in a cell of b, and where the middle of a
 cell of b lies in it. So no cell of b is lost, and a turned floor or wall gets no holes.

@@ -93,7 +93,7 @@ def merge_html(result: MergeResult) -> str:
 
 def _verdict(result: MergeResult) -> Markup:
     head = "Merged" if result.merged else "Not merged: not believed" if not result.transforms else "Joined by force: not believed"
-    parts = result.reason.split(": ", 1)[-1].split("; ")
+    parts = result.reason.replace(" m2 ", " m² ").split(": ", 1)[-1].split("; ")
     items = element("ul", *(element("li", part) for part in parts))
     words = element("b", f"{head} · probability {result.probability:.2f}")
     return join([element("div", words, items, class_="verdict" if result.merged else "verdict refused"), _figures(result)])
