@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -114,3 +115,35 @@ def test_bad_folders(run: Run, folder: Path) -> None:
         status, _, err = run(first, "c.tmap", "-o", place)
         assert status == 1 and told in err and len(err.splitlines()) == 1
     assert sorted(p.name for p in (folder / "merged").iterdir()) == WHOLE
+
+
+def test_the_report_in_a_browser(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The slider fades one map, rooms that are one light up together, and nothing is said on the console."""
+    from tests.viz import test_report as report
+
+    probe = """
+addEventListener("load", () => setTimeout(() => {
+  const seen = {}, slider = document.querySelector("[data-blend]");
+  const of = (name) => document.querySelector(".of-" + name).style.opacity;
+  seen.both = [of("a"), of("b")];
+  slider.value = 1;
+  slider.dispatchEvent(new Event("input"));
+  seen.b = [of("a"), of("b")];
+  const mates = JSON.parse(document.getElementById("mates").textContent);
+  const room = Object.keys(mates).find((one) => one[0] === "a");
+  document.querySelector(`path[data-room="${room}"]`).dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
+  const lit = (one) => document.querySelector(`path[data-room="${one}"]`).classList.contains("mate");
+  seen.mates = mates[room].every(lit);
+  document.title = JSON.stringify(seen);
+}, 500));
+"""
+    text = (folder / "merged" / "report.html").read_text(encoding="utf-8")
+    page = tmp_path / "report.html"
+    monkeypatch.setattr(report, "PROBE", probe)
+    page.write_text(report.with_probe(text), encoding="utf-8")
+    shown, console = report.browse(page, "--dump-dom", "--disable-3d-apis")
+    assert console == []
+    title = re.search("<title>(.*?)</title>", shown)
+    assert title
+    seen = json.loads(title[1].replace("&quot;", '"'))
+    assert seen == {"both": ["1", "1"], "b": ["0", "1"], "mates": True}

@@ -14,6 +14,7 @@ from scipy import ndimage
 import topomerge as tm
 from topomerge.errors import InputError
 from topomerge.fusion.fuse import fuse, join, resampled, room_of_rooms, rooms_in_common
+from topomerge.fusion.merge import match_probability
 from topomerge.fusion.result import STEPS, MergeResult, merge_to_json
 from topomerge.types import Sim3, TopometricMap, VoxelGrid
 
@@ -85,6 +86,16 @@ def test_rooms_match_where_both_saw_them(merged, halves):
         assert 0 < match.probability <= merged.probability and match.maps == (0, 1)
     within = room_of_rooms(a, merged.map, Sim3()), room_of_rooms(b, merged.map, merged.transforms[1])
     assert all(within[0][m.rooms[0]] == within[1][m.rooms[1]] for m in merged.matches)
+
+
+def test_whole_rooms_are_surer_than_scraps(halves):
+    a = halves[0]
+    whole = np.flatnonzero(~a.rooms["glimpsed"])[0]
+    rooms = np.array([[whole, whole]])
+    one, half = match_probability(a, a, rooms, np.ones(1)), match_probability(a, a, rooms, np.full(1, 0.2))
+    pieces = match_probability(a, a, np.array([[whole, whole], [whole, whole + 1]]), np.ones(2))
+    assert one[0] > 0.85 and half[0] < one[0] - 0.05 and pieces[0] < one[0]
+    assert match_probability(a, a, np.zeros((0, 2), int), np.zeros(0)).shape == (0,)
 
 
 def test_unrelated_maps_are_refused(refused):

@@ -22,7 +22,7 @@ class RoomMatch:
     Args:
         maps: which maps, by their place in the list that was merged.
         rooms: one room of each.
-        probability: that they are one: of the merge, times how well the rooms' floors fit. Not calibrated by itself.
+        probability: that they are one (of the merge, times `merge.match_probability`).
     """
 
     maps: tuple[int, int]
