@@ -92,8 +92,9 @@ def test_force_writes_all_and_keeps_the_status(run: Run, folder: Path) -> None:
         (("b.tmap",), "merge takes two maps, 1 given"),
         (("a.npy", "b.tmap", "c.tmap"), "atlas"),
         (("b.tmap", "missing.ply"), "missing.ply: no such file"),
-        (("b.tmap", "broken.tmap"), "broken.tmap: "),
-        (("b.tmap", "text.ply"), "text.ply: "),
+        (("b.tmap", "broken.tmap"), "topomerge: broken.tmap: "),
+        (("b.tmap", "text.ply"), "topomerge: text.ply: "),
+        (("b.tmap", "mm.npy"), "topomerge: mm.npy: "),
         (("b.tmap", "c.tmap", "--threshold", "2"), "from 0 to 1"),
         (("b.tmap", "c.tmap", "--scale", "2"), "invalid choice"),
     ],
@@ -102,6 +103,7 @@ def test_bad_input_is_told_in_one_line(run: Run, folder: Path, words: tuple[str,
     (folder / "copy.tmap").write_bytes((folder / "b.tmap").read_bytes())
     (folder / "broken.tmap").write_bytes((folder / "b.tmap").read_bytes()[:-2000])
     (folder / "text.ply").write_text("no points\n")
+    np.save(folder / "mm.npy", np.load(folder / "a.npy") * 1000)
     status, out, err = run(*words, "-o", "new")
     assert status == 1 and out == ""
     assert told in err and len(err.splitlines()) == 1

@@ -86,7 +86,8 @@ def _failure(error: BaseException, paths: Sequence[str]) -> str:
 
 def _named_paths(args: argparse.Namespace) -> list[str]:
     """The files that the user named, the input first."""
-    return [str(getattr(args, name)) for name in args.paths if getattr(args, name, None)]
+    given = [getattr(args, name) for name in args.paths if getattr(args, name, None)]
+    return [str(path) for value in given for path in (value if isinstance(value, list) else [value])]
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -225,7 +225,10 @@ def _merge(args: argparse.Namespace, folder: Path) -> int:
     maps, read, extracted = [], 0.0, 0.0
     for path in args.inputs:
         began = perf_counter()
-        found = _map_from(path, args)
+        try:
+            found = _map_from(path, args)
+        except InputError as error:
+            raise InputError(str(error) if path in str(error) else f"{path}: {error}") from error
         took = perf_counter() - began
         steps = 0.0  # of a .tmap, all is reading
         if Path(path).suffix.lower() != ".tmap":
@@ -366,7 +369,7 @@ COMMANDS = (
             *(o for o in MAPS if o[0][0] != "--k"),
             option("-q", "--quiet", action="store_true", default=False, help="print nothing but warnings and a refusal"),
         ),
-        paths=("output",),
+        paths=("inputs", "output"),
         description="Bring two maps together: status 0 and a joined map, or status 2 and the reason why it is not believed.",
     ),
     Command(
