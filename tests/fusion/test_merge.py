@@ -136,6 +136,14 @@ def test_bits_of_joined_maps_follow(halves, merged):
         fuse(full, halves[1], merged.transforms[1])
 
 
+def test_cells_of_maps_that_were_joined_before_are_theirs(merged, halves):
+    from topomerge.viz.merge_report import _seen
+
+    again = tm.merge([merged.map, halves[1]])
+    seen = _seen(again)
+    assert np.array_equal(seen == 1, (again.map.provenance & 0b100) == 0) and np.bincount(seen)[3] > 1000
+
+
 def test_what_one_map_saw_empty_and_the_other_did_not_is_occupied(halves, merged):
     found = fuse(*halves, merged.transforms[1])
     assert found.free is not None and found.contested > 0

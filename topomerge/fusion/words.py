@@ -19,7 +19,7 @@ def why(found: Registration, threshold: float, force: bool = False) -> str:
     believed = found.probability >= threshold
     f = found.features
     sign = "reaches" if believed else "is below"
-    words = [f"{'merged' if believed else 'not merged'}: probability {found.probability:.2f} {sign} {threshold:.2f}"]
+    words = [f"{'merged' if believed else 'not merged'}: probability {chance(found.probability)} {sign} {threshold:.2f}"]
     words.append(f"{f['walls']:.0f} m2 of walls agree, {f['free']:.0f} m2 of free floor seen by both")
     words.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
     if not believed and f["margin"] < CLOSE and len(found.alternatives) > 1:
@@ -27,6 +27,11 @@ def why(found: Registration, threshold: float, force: bool = False) -> str:
     if force and not believed:
         words.append("joined all the same, as was asked for (--force)")
     return "; ".join(words)
+
+
+def chance(probability: float) -> str:
+    """A probability as text that never says that something is certain."""
+    return "over 0.99" if probability > 0.99 else "below 0.01" if probability < 0.01 else f"{probability:.2f}"
 
 
 def evidence_rows(found: Registration) -> list[Row]:

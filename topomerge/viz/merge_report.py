@@ -14,13 +14,13 @@ from topomerge.errors import InputError
 from topomerge.fusion.fuse import room_of_rooms
 from topomerge.fusion.registration import Registration
 from topomerge.fusion.result import MergeResult, merge_to_json
-from topomerge.fusion.words import evidence_rows, hypothesis_row
+from topomerge.fusion.words import chance, evidence_rows, hypothesis_row
 from topomerge.io.atomic import replacing
 from topomerge.io.listing import json_text
 from topomerge.io.maps import save_map
 from topomerge.io.palette import room_colours
 from topomerge.io.rooms_ply import save_rooms_ply
-from topomerge.types import Array, Sim3, TopometricMap
+from topomerge.types import Array, Sim3
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.merge_plan import Drawn, blend_view, laid_alike
 from topomerge.viz.report import page, plan_view, scene_view, scroller, section, warnings
@@ -82,8 +82,8 @@ def merge_html(result: MergeResult) -> str:
         sheet, plans = lay_out(result.map, turn=drawn[0][0].turn)
         view = element("div", plan_view(result.map, sheet, plans), scroller(rooms_table(result.map)), class_="beside")
         sections.append(section("The joined map, rooms found anew", view, "joined"))
-        sections.append(_space(result.map))
-        data = {"scene-data": _scene(result.map, sheet.turn), "mates": _mates(result)}
+        sections.append(_space(result))
+        data = {"scene-data": _scene(result, sheet.turn), "mates": _mates(result)}
     if found is not None:
         sections.append(_evidence(result, found))
     sections.append(_made(result))
@@ -95,7 +95,7 @@ def _verdict(result: MergeResult) -> Markup:
     head = "Merged" if result.merged else "Not merged: not believed" if not result.transforms else "Joined by force: not believed"
     parts = result.reason.replace(" m2 ", " m² ").split(": ", 1)[-1].split("; ")
     items = element("ul", *(element("li", part) for part in parts))
-    words = element("b", f"{head} · probability {result.probability:.2f}")
+    words = element("b", f"{head} · probability {chance(result.probability)}")
     return join([element("div", words, items, class_="verdict" if result.merged else "verdict refused"), _figures(result)])
 
 
@@ -104,7 +104,7 @@ def _figures(result: MergeResult) -> Markup:
     figures = [(str(len(m.rooms)), f"rooms of {name}") for name, m in zip("ab", result.maps, strict=True)]
     if result.map is not None:
         joined, pose = result.map, result.transforms[1]
-        bits = np.bincount(_seen(joined), minlength=4) / max(len(joined.grid), 1)
+        bits = np.bincount(_seen(result), minlength=4) / max(len(joined.grid), 1)
         figures += [
             (str(len(result.matches)), "pairs of rooms that are one"),
             (f"{len(joined.rooms)}", "rooms of the joined map"),
@@ -203,27 +203,31 @@ def _over(result: MergeResult, drawn: tuple[Drawn, Drawn], pose: Sim3) -> Markup
     return section("One over the other", join(parts), "over")
 
 
-def _seen(joined: TopometricMap) -> Array:
-    """(n,) 0 assumed, 1 seen by a only, 2 by b only, 3 by both; a joined map of more than two counts all after the first as b."""
-    bits = joined.provenance if joined.provenance is not None else np.zeros(len(joined.grid), np.uint32)
-    out: Array = (bits & 1) + 2 * (bits > 1)
+def _seen(result: MergeResult) -> Array:
+    """(n,) 0 assumed, 1 seen by a only, 2 by b only, 3 by both; either may be joined of several maps already."""
+    assert result.map is not None and result.map.provenance is not None
+    before = result.maps[0].provenance
+    count = 1 if before is None else max(int(np.bitwise_or.reduce(before, initial=0)).bit_length(), 1)
+    bits = result.map.provenance.astype(np.int64)
+    out: Array = ((bits & ((1 << count) - 1)) > 0) + 2 * ((bits >> count) > 0)
     return out.astype(np.int64)
 
 
-def _scene(joined: TopometricMap, turn: float) -> dict[str, Any]:
-    data = scene_data(joined, turn=turn, seen=_seen(joined))
+def _scene(result: MergeResult, turn: float) -> dict[str, Any]:
+    assert result.map is not None
+    data = scene_data(result.map, turn=turn, seen=_seen(result))
     data["colours"]["map"] = [SEEN[group[2]] for group in data["groups"]]
     return data
 
 
-def _space(joined: TopometricMap) -> Markup:
-    share = np.bincount(_seen(joined), minlength=4)
+def _space(result: MergeResult) -> Markup:
+    share = np.bincount(_seen(result), minlength=4)
     names = {1: "seen by a only", 2: "seen by b only", 3: "seen by both", 0: "assumed"}
     items = []
     for k, name in names.items():
         if share[k]:
             sign = element("i", style=f"background:{SEEN[k]}")
-            items.append(element("li", sign, f"{name}: {100 * share[k] / len(joined.grid):.0f} %"))
+            items.append(element("li", sign, f"{name}: {100 * share[k] / share.sum():.0f} %"))
     legend = element("ul", *items, class_="legend")
     words = element("p", "Colour by “map” shows which map saw what.", class_="note")
     return section("In three dimensions", join([words, scene_view("scene-data"), legend]), "space")
