@@ -19,6 +19,7 @@ from topomerge.types import Array, VoxelGrid
 
 BANDS = np.linspace(0.5, 2.0, 7)  # m above the floor: a wall is seen in most of these
 WALL_BANDS = 4 / 6
+LEAST_BANDS = 3  # with fewer looked at, nothing is known of walls
 THIN = 0.4  # share of the usual wall's levels: what has fewer is no wall
 OBSERVED = 0.2  # of the fullest band's columns: below, the sensor did not look at that height
 UPRIGHT = 1.9  # m: nothing lower is a ceiling
@@ -117,6 +118,8 @@ def _bands(profile: Array, edge: float) -> Array:
     filled = np.stack([(profile & _bits(a, b, edge)) != 0 for a, b in pairwise(BANDS)])
     count = filled.sum(axis=(1, 2))
     filled = filled[count >= OBSERVED * count.max()]
+    if len(filled) < LEAST_BANDS:  # the upper side of a ceiling, beside higher ones
+        return np.zeros(profile.shape, bool)
     need = np.ceil(WALL_BANDS * len(filled) - 1e-6)
     own = filled.sum(axis=0)
     around = np.stack([ndimage.maximum_filter(f, 3) for f in filled]).sum(axis=0)
