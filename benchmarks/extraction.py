@@ -121,6 +121,7 @@ def arguments(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--pictures", action="store_true", help="a picture of each case, into OUT/pictures")
     parser.add_argument("--fresh", action="store_true", help="make the scans again: the simulator has changed")
     parser.add_argument("--write", type=Path, help="file whose section between the marks of the extraction is replaced")
+    parser.add_argument("--mark", default="extraction", help="name of that section's marks")
     return parser.parse_args(words)
 
 
@@ -131,9 +132,8 @@ def main(words: list[str] | None = None) -> int:
     rows = results(cases, settings.preset.split(","), settings)
     print(listing(rows), summary(rows), sep="\n\n")
     if settings.write:
-        write(
-            settings.write, rows, " ".join(["python benchmarks/extraction.py", *(words if words is not None else sys.argv[1:])])
-        )
+        command = " ".join(["python benchmarks/extraction.py", *(words if words is not None else sys.argv[1:])])
+        write(settings.write, rows, command, settings.mark)
     return 0
 
 

@@ -16,7 +16,7 @@ COLUMNS = {
     "edge_precision": "edges P", "edge_recall": "edges R", "storeys": "storeys", "agreement": "agree", "seconds": "s",
 }  # fmt: skip
 FAILED = 0.5  # mean IoU
-BEGIN, END = "<!-- extraction:begin -->", "<!-- extraction:end -->"
+MARK = "extraction"
 FIRST = ("thesis", "default")  # presets, in this order
 
 
@@ -125,15 +125,16 @@ def _storeys(rows: list[Row]) -> str:
     return "Storeys wrong: " + "; ".join(told) + "."
 
 
-def write(path: Path, rows: list[Row], command: str) -> None:
+def write(path: Path, rows: list[Row], command: str, mark: str = MARK) -> None:
     """Replace what stands between the two marks of a file, or add marks and section at its end."""
+    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
     text = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
-    if BEGIN not in text or END not in text:
-        text = f"{text.rstrip()}\n\n## Extraction\n\n{BEGIN}\n{END}\n"
-    before, rest = text.split(BEGIN, 1)
-    after = rest.split(END, 1)[1]
+    if begin not in text or end not in text:
+        text = f"{text.rstrip()}\n\n## {mark.capitalize()}\n\n{begin}\n{end}\n"
+    before, rest = text.split(begin, 1)
+    after = rest.split(end, 1)[1]
     with replacing(path) as beside:
-        beside.write_text(f"{before}{BEGIN}\n{report(rows, command)}\n{END}{after}", encoding="utf-8")
+        beside.write_text(f"{before}{begin}\n{report(rows, command)}\n{end}{after}", encoding="utf-8")
 
 
 def _head(names: list[str], count: int | None = None) -> list[str]:
