@@ -58,7 +58,7 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
         contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))
         parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
         found = [_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts]
-        edges += _apart([edge for edge in found if edge[2] >= LEAST_WIDTH or edge[6]])
+        edges += _apart([edge for edge in found if edge[2] >= LEAST_WIDTH or (edge[6] and edge[5] != "stairs")])
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
     _add_stairs(table, floor)
     return table
