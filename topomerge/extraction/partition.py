@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from heapq import heappop, heappush
 
 import numpy as np
 
@@ -85,6 +86,11 @@ class _Links:
         self.passages = dict(passages)
         self.judge = judge
         self.scores: dict[Pair, float] = {}
+        self.queue: list[tuple[float, Pair]] = []  # holds outdated scores, too
+        self.beside: list[set[int]] = [set() for _ in range(count)]
+        for a, b in passages:
+            self.beside[a].add(b)
+            self.beside[b].add(a)
         self._score(sorted(passages))
 
     def _score(self, pairs: list[Pair]) -> None:
@@ -92,10 +98,15 @@ class _Links:
             x = [
                 features(self.passages[p], (self.peak[p[0]], self.peak[p[1]]), (self.area[p[0]], self.area[p[1]])) for p in pairs
             ]
-            self.scores.update(zip(pairs, self.judge(np.array(x)).tolist(), strict=True))
+            for pair, score in zip(pairs, self.judge(np.array(x)).tolist(), strict=True):
+                self.scores[pair] = score
+                heappush(self.queue, (score, pair))
 
     def weakest(self) -> Pair:
-        return min(self.scores, key=lambda p: (self.scores[p], p))
+        """The pair that the least likely door parts; there must be one."""
+        while self.scores.get(self.queue[0][1]) != self.queue[0][0]:
+            heappop(self.queue)
+        return self.queue[0][1]
 
     def merge(self, pair: Pair) -> None:
         """The second becomes part of the first."""
@@ -104,11 +115,18 @@ class _Links:
         self.into[self.into == gone] = keep
         self.peak[keep] = max(self.peak[keep], self.peak[gone])
         self.area[keep] += self.area[gone]
-        for old in [p for p in self.passages if gone in p]:
-            other = old[0] if old[1] == gone else old[1]
-            new = (min(keep, other), max(keep, other))
+        self.beside[keep].discard(gone)
+        for other in self.beside[gone] - {keep}:
+            old, new = _pair(gone, other), _pair(keep, other)
+            self.beside[other].discard(gone)
+            self.beside[other].add(keep)
+            self.beside[keep].add(other)
             passage = self.passages.pop(old)
             del self.scores[old]
             if new not in self.passages or passage.width > self.passages[new].width:
                 self.passages[new] = passage
-        self._score(sorted(p for p in self.passages if keep in p))
+        self._score(sorted(_pair(keep, other) for other in self.beside[keep]))
+
+
+def _pair(a: int, b: int) -> Pair:
+    return (a, b) if a < b else (b, a)
