@@ -5,18 +5,18 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.fusion.evidence import cell_middles, plans
-from topomerge.fusion.refine import refine_pose, surface
+from topomerge.fusion.refine import Surface, refine_pose, surface
 from topomerge.fusion.scale import search_scaled
 from topomerge.fusion.search import Candidate, View, search
 from topomerge.fusion.verify import MARGIN_CAP, Judge, model, probability, rank
-from topomerge.types import Sim3, TopometricMap, VoxelGrid
+from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
 log = logging.getLogger(__name__)
 ALTERNATIVES = 10
@@ -58,9 +58,40 @@ class Registration:
 Map = TopometricMap | VoxelGrid
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What registration needs of a map; made once where a map is registered with several.
+
+    Args:
+        views: its storeys, lowest first.
+        order: larger maps come first; among equal ones the order is arbitrary, but always the same.
+        middle: (3,) of its cells, m.
+        surface: makes its points and normals, for the fine registration.
+    """
+
+    views: tuple[View, ...]
+    order: tuple[int, str]
+    middle: Array
+    surface: Callable[[], Surface]
+
+
+def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
+    """Plans of a map, with what is drawn from them when it is first needed.
+
+    Args:
+        free: cells known to be empty; a topometric map brings its own.
+
+    Raises:
+        InputError: an empty map.
+    """
+    grid = _grid(map)
+    views = tuple(View(p) for p in plans(map, free))
+    return Prepared(views, _order(map), cell_middles(grid).mean(axis=0), lambda: surface(grid))
+
+
 def register(
-    a: Map,
-    b: Map,
+    a: Map | Prepared,
+    b: Map | Prepared,
     *,
     scale: str = "fixed",
     hypotheses: Sequence[Sim3] = (),
@@ -70,7 +101,7 @@ def register(
     """The pose of map b in map a's frame. `register(b, a)` gives its inverse.
 
     Args:
-        a, b: topometric maps or occupied cells.
+        a, b: topometric maps or occupied cells, or what `prepare` made of them.
         scale: "fixed", or "free" where b's unit may differ (found between 0.5 and 2).
         hypotheses: poses T_ab from matched rooms, tried beside those found by correlation.
         free: cells of a and of b known to be empty; topometric maps bring their own.
@@ -81,12 +112,14 @@ def register(
     """
     if scale not in ("fixed", "free"):
         raise InputError(f"scale must be fixed or free, not {scale!r}")
-    if _order(b) < _order(a):  # so that nothing depends on which comes first
-        turned = [h.inverse() for h in hypotheses], [-y for y in yaws]
-        return _inverse(register(b, a, scale=scale, hypotheses=turned[0], free=(free[1], free[0]), yaws=turned[1]))
     clock = _Clock()
-    first, second = ([View(p) for p in plans(m, f)] for m, f in zip((a, b), free, strict=True))
+    a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
     clock("plans")
+    if b.order < a.order:  # so that nothing depends on which comes first
+        turned = [h.inverse() for h in hypotheses], [-y for y in yaws]
+        found = register(b, a, scale=scale, hypotheses=turned[0], yaws=turned[1])
+        return replace(_inverse(found), seconds={**found.seconds, **clock.seconds})
+    first, second = a.views, b.views
     candidates = (search_scaled if scale == "free" else search)(first, second, hypotheses, yaws)
     clock("search")
     if not candidates:
@@ -95,7 +128,7 @@ def register(
     clock("verify")
     pose, rmse = ranked[0][0].pose, float("nan")
     if not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
-        pose, rmse = _fine(_grid(a), _grid(b), pose, scale == "free")
+        pose, rmse = fine(a, b, pose, scale == "free")
     clock("refine")
     return _verdict(ranked, pose, rmse, clock.seconds)
 
@@ -139,10 +172,10 @@ def _order(m: Map) -> tuple[int, str]:
     return -len(grid), digest
 
 
-def _fine(a: VoxelGrid, b: VoxelGrid, start: Sim3, scaled: bool) -> tuple[Sim3, float]:
-    """Point-to-plane refinement, unless it runs away."""
-    found = refine_pose(surface(a), surface(b), start, scaled)
-    middle = cell_middles(b).mean(axis=0)[None]
+def fine(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
+    """Point-to-plane refinement of T_ab, unless it runs away, and the root mean square distance of the surfaces, m."""
+    found = refine_pose(a.surface(), b.surface(), start, scaled)
+    middle = b.middle[None]
     moved = float(np.linalg.norm(found.pose.apply(middle) - start.apply(middle)))
     turned = abs((found.pose.yaw - start.yaw + np.pi) % (2 * np.pi) - np.pi)
     if not np.isfinite(found.rmse) or moved > DRIFTED[0] or turned > DRIFTED[1]:
