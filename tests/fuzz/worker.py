@@ -1,0 +1,68 @@
+"""A process that reads mutants within limits, driven by lines "name seed" on stdin; it answers each with one line of JSON.
+
+It may die: of a fault in a native library, or by the hand of the driver, which waits only so long.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import time
+import warnings
+from pathlib import Path
+
+from tests.fuzz.corpus import beside, reader
+from tests.fuzz.mutate import mutant
+from topomerge.errors import InputError
+
+ROOM = 1 << 30  # bytes that reading a small file may take beyond what the libraries hold
+
+
+def _size() -> int:
+    """Bytes of address space of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def attempt(path: Path, data: bytes) -> tuple[str, str]:
+    """(read | refused | fault, message) of reading a mutant."""
+    path.write_bytes(data)
+    try:
+        return "read", str(reader(path)(path))
+    except InputError as error:
+        message = str(error)
+    except BaseException as error:
+        return "fault", f"{type(error).__name__}: {error}"[:500]
+    if "does not fit into memory" in message:
+        return "fault", message
+    if "\n" in message or str(path) not in message or len(message) > 1000:
+        return "fault", f"a poor message: {message[:300]!r}"
+    return "refused", message
+
+
+def main(corpus: Path, folder: Path) -> None:
+    """Warm up on the valid files, limit the memory, then do what is asked for."""
+    warnings.simplefilter("ignore")
+    told = json.loads((corpus / "names.json").read_text())
+    data = {name: Path(path).read_bytes() for name, path in told["files"].items()}
+    for name in told["tried"]:
+        beside(name, corpus, folder)
+        state = attempt(folder / name, data[name])
+        assert state[0] == "read", (name, state)
+    limit = _size() + ROOM
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    print(json.dumps(["ready"]), flush=True)
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print is no answer
+    for line in sys.stdin:
+        name, seed = line.split()
+        beside(name, corpus, folder)
+        before = time.monotonic()
+        state, message = attempt(folder / name, mutant(name, data, int(seed)))
+        print(json.dumps([name, int(seed), state, message, time.monotonic() - before]), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
