@@ -97,6 +97,7 @@ def register(
     hypotheses: Sequence[Sim3] = (),
     free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
     yaws: Sequence[float] = (),
+    refined: bool = True,
 ) -> Registration:
     """The pose of map b in map a's frame. `register(b, a)` gives its inverse.
 
@@ -106,6 +107,7 @@ def register(
         hypotheses: poses T_ab from matched rooms, tried beside those found by correlation.
         free: cells of a and of b known to be empty; topometric maps bring their own.
         yaws: further turns of b to try, rad.
+        refined: finish with the fine registration? Without it the pose is right to a cell.
 
     Raises:
         InputError: an empty map, or another word for the scale.
@@ -117,7 +119,7 @@ def register(
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
         turned = [h.inverse() for h in hypotheses], [-y for y in yaws]
-        found = register(b, a, scale=scale, hypotheses=turned[0], yaws=turned[1])
+        found = register(b, a, scale=scale, hypotheses=turned[0], yaws=turned[1], refined=refined)
         return replace(_inverse(found), seconds={**found.seconds, **clock.seconds})
     first, second = a.views, b.views
     candidates = (search_scaled if scale == "free" else search)(first, second, hypotheses, yaws)
@@ -127,7 +129,7 @@ def register(
     ranked = rank(candidates, Judge(first, second))
     clock("verify")
     pose, rmse = ranked[0][0].pose, float("nan")
-    if not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
+    if refined and not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
         pose, rmse = fine(a, b, pose, scale == "free")
     clock("refine")
     return _verdict(ranked, pose, rmse, clock.seconds)
