@@ -6,7 +6,7 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 from topomerge.datasets.building import Building
 from topomerge.datasets.buildings import make_building
+from topomerge.datasets.degrade import UNCHANGED, degraded
 from topomerge.datasets.erect import erect
+from topomerge.datasets.kept import kept_arrays, save_maps, told_of_maps
 from topomerge.datasets.pairs import Pair, make_pair
 from topomerge.datasets.plan import Plan
 from topomerge.datasets.recipe import Item, difficulty_of
@@ -27,7 +29,7 @@ from topomerge.extraction.extract import extract
 from topomerge.io import archive
 from topomerge.io.atomic import replacing
 from topomerge.io.listing import plain
-from topomerge.types import Array
+from topomerge.types import Array, TopometricMap
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -76,7 +78,8 @@ def make_file(item: Item, plans: Sequence[Sequence[Plan]], folder: str) -> Row:
     began = time.perf_counter()
     try:
         with one_thread(), time_limit(LONGEST):
-            archive.write(make_arrays(item, plans), Path(folder) / f"{item.name}.npz")
+            arrays = keep(item, plans, Path(folder)) if item.maps else make_arrays(item, plans)
+            archive.write(arrays, Path(folder) / f"{item.name}.npz")
         reason = ""
     except Exception as error:  # one bad item must not end a build
         reason = " ".join(str(error).split())[:200]
@@ -133,33 +136,64 @@ def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]
     Raises:
         InputError: no candidate has such a pair, or a map has hardly a room.
     """
-    pair = _first_pair(item, plans)
-    maps = [extract(cloud, voxel_size=item.voxel_size, carve=False) for cloud in (pair.a, pair.b)]
-    if min(len(m.rooms) for m in maps) < FEWEST:
+    pair = degraded(_first_pair(item, plans), item.change, item.seed)
+    return pair_arrays(pair, extracted(pair, item), told_of(item))
+
+
+def keep(item: Item, plans: Sequence[Sequence[Plan]], folder: Path) -> dict[str, Array]:
+    """As `make_arrays`, with what evaluation needs (`kept`); the maps are written into the folder."""
+    pair = degraded(_first_pair(item, plans), item.change, item.seed)
+    maps = extracted(pair, item)
+    arrays = pair_arrays(pair, maps, {**told_of(item), **told_of_maps(pair, maps)})
+    arrays |= kept_arrays(pair, maps, (arrays["a.true_room"], arrays["b.true_room"]))
+    save_maps(maps, folder, item.name)
+    return arrays
+
+
+def extracted(pair: Pair, item: Item) -> tuple[TopometricMap, TopometricMap]:
+    """The maps of both clouds; with the space that rays crossed where they are kept.
+
+    Raises:
+        InputError: hardly a room comes out of one of them.
+    """
+    a, b = (extract(cloud, voxel_size=item.voxel_size, carve=item.maps) for cloud in (pair.a, pair.b))
+    if min(len(a.rooms), len(b.rooms)) < FEWEST:
         raise InputError(f"fewer than {FEWEST} rooms were extracted from a map of {' or '.join(item.sensors)}")
+    return a, b
+
+
+def told_of(item: Item) -> dict[str, Any]:
+    """What a file tells of its item; names of what came later are left out where they say nothing."""
+    told = asdict(item)
+    if item.change == UNCHANGED:
+        del told["change"]
+    if not item.maps:
+        del told["maps"]
+    return {**told, "file": f"{item.name}.npz", "asked_overlap": item.overlap, "points_per_room": item.points_per_room}
+
+
+def pair_arrays(pair: Pair, maps: Sequence[TopometricMap], told: Mapping[str, Any]) -> dict[str, Array]:
+    """The arrays of a file: the graphs of two maps, their true rooms, and what is told of them."""
     truths = [room_truth(m, cloud) for m, cloud in zip(maps, (pair.a, pair.b), strict=True)]
     matches = true_matches(truths[0], truths[1], pair.shared)
     arrays: dict[str, Array] = {}
     for side, found, truth in zip("ab", maps, truths, strict=True):
-        arrays |= {f"{side}.{name}": array for name, array in graph_arrays(found, item.points_per_room).items()}
+        arrays |= {f"{side}.{name}": array for name, array in graph_arrays(found, told["points_per_room"]).items()}
         arrays |= {f"{side}.true_{name}": truth[name] for name in ("room", "iou", "one")}
     arrays["matches"] = matches
     arrays["transform"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
-    partners = [len(set(matches[:, k].tolist())) for k in (0, 1)]
-    about = {
-        **asdict(item),
-        "file": f"{item.name}.npz",
+    known = {
+        **told,
         "building": pair.building,
         "overlap": round(pair.overlap, 4),
-        "asked_overlap": item.overlap,
         "visited": [len(v) for v in pair.visited],
         "extracted": [len(t) for t in truths],
         "identified": [int((t["room"] >= 0).sum()) for t in truths],
         "one_to_one": [int(t["one"].sum()) for t in truths],
-        "partners": partners,
+        "partners": [len(set(matches[:, k].tolist())) for k in (0, 1)],
         "points": [len(pair.a), len(pair.b)],
     }
-    text = json.dumps(plain(about), sort_keys=True, ensure_ascii=False)
+    text = json.dumps(plain(known), sort_keys=True, ensure_ascii=False)
     arrays["about"] = np.frombuffer(text.encode(), np.uint8)
     return arrays
 

@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 from topomerge.datasets import splits
 from topomerge.datasets.buildings import PROFILES
+from topomerge.datasets.degrade import UNCHANGED, apart_in_time, check_change
 from topomerge.datasets.difficulty import Difficulty
 from topomerge.datasets.pairs import HARD
 from topomerge.datasets.plan import Plan
@@ -29,6 +30,7 @@ LEAST_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told
 LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
 CANDIDATES = 4  # buildings tried for an item: not every one has two parts with the overlap that is wanted
 TWINS = 6  # rooms over rooms of the same outline, from which on two real storeys are hard to tell apart
+PLACES = {**splits.FOLDERS, "ipa": splits.TEST_ONLY["ipa"][0]}  # source -> folder; IPA's are for the test only
 Library = Mapping[str, Mapping[str, tuple[Plan, ...]]]  # source -> name -> plans of its storeys, lowest first
 
 
@@ -40,7 +42,7 @@ class Recipe:
         name: of the manifest.
         split: train, validation or test.
         folder: of the real data; may be empty where `sources` is procedural only.
-        sources: weight of each: procedural, r2v, campus, mall, rmf.
+        sources: weight of each: procedural, r2v, campus, mall, rmf; for the test also ipa.
         kinds: weight of each kind of procedural building.
         overlaps: shares of rooms in common, drawn alike often.
         sensors: weight of each, drawn for each map by itself.
@@ -52,6 +54,8 @@ class Recipe:
         voxel_size: of the extraction, m.
         stacks: share of the real buildings with two storeys, where the source has sibling storeys that fit (`stack`).
         over_stairs: share of the overlapping pairs in buildings of several storeys whose walks lead over stairs.
+        maps: keep the extracted maps (`kept`), too: for evaluation.
+        vary: name of a change (`degrade.CHANGES`) -> values; every pair is made once for each of all these.
     """
 
     name: str = "set"
@@ -72,6 +76,8 @@ class Recipe:
     points_per_room: int = graph.POINTS
     stacks: float = 0.0
     over_stairs: float = 0.0
+    maps: bool = False
+    vary: dict[str, list[float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,8 @@ class Item:
         plans: digests of those plans; empty for procedural ones.
         other: the building of "other-building", likewise, and its digest.
         difficulty: what differs from the defaults.
+        maps: are the extracted maps kept beside the pair?
+        change: what is done to the clouds before they are extracted, and how much (`degrade`).
     """
 
     source: str
@@ -102,11 +110,15 @@ class Item:
     voxel_size: float
     points_per_room: int
     over_stairs: bool = False
+    maps: bool = False
+    change: tuple[str, float] = UNCHANGED
 
     @property
     def name(self) -> str:
         """A hash of the inputs and of the versions of what is made from them."""
-        inputs = [FORMAT, graph.FORMAT, plain(asdict(self))]
+        known = asdict(self)
+        later = {"maps": False, "change": UNCHANGED}  # these came later: at their defaults older names hold
+        inputs = [FORMAT, graph.FORMAT, plain({k: v for k, v in known.items() if k not in later or v != later[k]})]
         return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:24]
 
 
@@ -119,7 +131,7 @@ def check(recipe: Recipe) -> None:
     splits.seeds(recipe.split)
     for sensor in recipe.sensors:
         get_sensor(sensor)
-    known = {"sources": ("procedural", *splits.FOLDERS), "kinds": tuple(PROFILES), "hard": HARD}
+    known = {"sources": ("procedural", *PLACES), "kinds": tuple(PROFILES), "hard": HARD}
     for key in ("sources", "kinds", "sensors", "hard"):
         weights: dict[str, float] = getattr(recipe, key)
         for name, weight in weights.items():
@@ -135,6 +147,8 @@ def check(recipe: Recipe) -> None:
     for key, value in shares.items():
         if not 0 <= value <= 1:
             raise InputError(f"{key} must be 0 to 1, not {value}")
+    for what, values in recipe.vary.items():
+        check_change(what, values)
     if recipe.pairs < 1 or not recipe.overlaps or len(recipe.rooms) != 2 or not 3 <= recipe.rooms[0] <= recipe.rooms[1]:
         raise InputError("pairs must be 1 or more, overlaps one or more, rooms [fewest, most] with 3 or more each")
     if not 0.02 <= recipe.voxel_size <= 1 or recipe.points_per_room < 1:
@@ -153,13 +167,15 @@ def library(recipe: Recipe) -> Library:
     for source in (s for s, weight in recipe.sources.items() if s != "procedural" and weight > 0):
         if not recipe.folder:
             raise InputError(f"sources.{source} needs the real data: set folder or TOPOMERGE_DATA, or take procedural only")
-        wanted = set(splits.members(recipe.split, source))
-        folder = Path(recipe.folder) / splits.FOLDERS[source]
+        if source in splits.TEST_ONLY and recipe.split != "test":
+            raise InputError(f"sources.{source}: is for the test only, not for {recipe.split}")
+        wanted = None if source in splits.TEST_ONLY else set(splits.members(recipe.split, source))
+        folder = Path(recipe.folder) / PLACES[source]
         plans = {n: p for n, p in iter_plans(folder, wanted) if not isinstance(p, Refusal) and _fits(p)}
         if not plans:
             raise InputError(f"sources.{source}: no plan of split {recipe.split} in {recipe.folder}")
         out[source] = {name: (plan,) for name, plan in plans.items()}
-        if source != "r2v" and (recipe.stacks > 0 or recipe.hard.get("other-storey", 0) > 0):  # apartments have one storey
+        if source not in ("r2v", "ipa") and (recipe.stacks > 0 or recipe.hard.get("other-storey", 0) > 0):  # of one storey
             found = iter_stacks(folder, dict(plans))
             out[source] |= {name: stack.plans for name, stack in found if isinstance(stack, Stack)}
     return out
@@ -187,7 +203,9 @@ def _rounded(value: Any) -> Any:
 def draw_items(recipe: Recipe, plans: Library) -> list[Item]:
     """The items of a recipe, each from its own number: a longer set begins with the shorter one."""
     shelves = {source: _shelf(of) for source, of in plans.items()}
-    return [_draw(recipe, shelves, i) for i in range(recipe.pairs)]
+    items = [replace(_draw(recipe, shelves, i), maps=recipe.maps) for i in range(recipe.pairs)]
+    changes = [(what, float(value)) for what, values in sorted(recipe.vary.items()) for value in values]
+    return [replace(item, change=change) for item in items for change in changes or [UNCHANGED]]
 
 
 @dataclass(frozen=True)
@@ -262,7 +280,7 @@ def _difficulty(spread: float, rng: np.random.Generator) -> tuple[tuple[str, flo
 
 def difficulty_of(item: Item) -> Difficulty:
     """The item's difficulty; storeys are alike where that is what makes the item hard."""
-    difficulty = Difficulty(**dict(item.difficulty))
+    difficulty = apart_in_time(Difficulty(**dict(item.difficulty)), item.change)
     return replace(difficulty, differ=0.0) if item.hard == "other-storey" else difficulty
 
 
