@@ -29,6 +29,7 @@ RANKS = {
     "training": 10,
     "evaluation": 10,
     "console": 11,
+    "completion": 11,
     "commands": 12,
     "cli": 13,
     "__main__": 14,

@@ -151,6 +151,14 @@ def simulate_command(args: argparse.Namespace) -> int:
     return 0
 
 
+def completion_command(args: argparse.Namespace) -> int:
+    """`topomerge completion`: a script for the shell."""
+    from topomerge.completion import script
+
+    sys.stdout.write(script(args.shell, COMMANDS))
+    return 0
+
+
 def embed_command(args: argparse.Namespace) -> int:
     """`topomerge embed`: a row of numbers for each room."""
     check_outputs([args.output], [args.input])
@@ -395,5 +403,14 @@ COMMANDS = (
         ),
         paths=("output",),
         description="Make partial maps of a building from a seed: clouds in random frames, the truth about them, and a picture.",
+    ),
+    Command(
+        "completion",
+        completion_command,
+        "print a script that completes commands and options in your shell",
+        "topomerge completion bash >> ~/.bashrc",
+        (option("shell", choices=("bash", "zsh", "fish"), help="the shell that is to learn it"),),
+        description="Print a script with which the Tab key completes commands, options and their values: for bash to go into "
+        "~/.bashrc, for zsh into ~/.zshrc, for fish into ~/.config/fish/completions/topomerge.fish.",
     ),
 )
