@@ -15,7 +15,9 @@ TILE = 5.0  # m
 COVERED = 0.1  # share of a floor with something above it
 HANGING = 0.5  # share of the columns that begin high over the lowest ones
 LEAST_AREA = 2.0  # m2
-HEADROOM = 2.3  # m between an assumed floor and the ceiling
+HEADROOM = 2.6  # m between an assumed floor and the ceiling: that of most homes and offices, within 0.4 m
+CARRIED = 1.4  # m above the floor: a tablet in the hands, a helmet, a tripod
+LEAST_HEADROOM, MOST_HEADROOM = 2.0, 6.0  # m under the ceiling of somebody who carries a sensor
 OVERHEAD = 1.0  # m above the bottom: what is higher and no wall is a ceiling
 ENCLOSED = 0.75  # share of the directions in which a place inside sees a wall
 DIRECTIONS = 24
@@ -66,13 +68,22 @@ def any_ceiling(grid: VoxelGrid) -> bool:
     return bool(_under_ceiling(grid)[0].sum() * grid.edge**2 >= LEAST_AREA)
 
 
-def with_assumed_floor(grid: VoxelGrid) -> VoxelGrid:
-    """The grid with a floor under whatever seems to be a ceiling, at the lowest points around, or so far below the ceiling that
-    one can stand."""
+def with_assumed_floor(grid: VoxelGrid, rays: tuple[Array, Array] | None = None) -> VoxelGrid:
+    """The grid with a floor under whatever seems to be a ceiling: at the lowest points around, or so far below the ceiling that one
+    can stand; where the places of the sensor are known, as far below them as it is usually carried.
+
+    Args:
+        rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, where they are known.
+    """
     inside, height, top = _under_ceiling(grid)
     inside = ndimage.binary_closing(np.pad(inside, 5), np.ones((7, 7)))[5:-5, 5:-5]
-    level = int(min(np.median(height[inside]), np.median(top[inside & (top >= 0)]) - round(HEADROOM / grid.edge)))
-    return _with_cells(grid, np.argwhere(inside), level)
+    lowest, ceiling = float(np.median(height[inside])), float(np.median(top[inside & (top >= 0)]))
+    below = ceiling - round(HEADROOM / grid.edge)
+    if rays is not None:
+        eyes = (float(np.median(rays[0][:, 2])) - grid.origin[2]) / grid.edge
+        carried = round(eyes - CARRIED / grid.edge)
+        below = carried if LEAST_HEADROOM <= (ceiling - carried) * grid.edge <= MOST_HEADROOM else below
+    return _with_cells(grid, np.argwhere(inside), int(min(lowest, below)))
 
 
 def _under_ceiling(grid: VoxelGrid) -> tuple[Array, Array, Array]:

@@ -185,8 +185,8 @@ def _standing(grid: VoxelGrid, p: Preset, known: dict[str, Any]) -> tuple[VoxelG
     except InputError:
         if not p.assume or not any_ceiling(grid):
             raise
-    known["warnings"].append("no floor was seen: one was assumed below the lowest points")
-    grid = with_assumed_floor(grid)
+    known["warnings"].append("no floor was seen: one was assumed")
+    grid = with_assumed_floor(grid, known.get("rays"))
     return grid, navigable_volume(grid, p)
 
 
