@@ -25,7 +25,7 @@ RANKS = {
     "config": 8,
     "metrics": 8,
     "datasets": 9,
-    "checkpoint": 10,
+    "checkpoint": 9,
     "training": 10,
     "evaluation": 10,
     "console": 11,

@@ -22,16 +22,30 @@ def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schem
         from hydra import compose as hydra_compose
         from hydra import initialize_config_module
         from hydra.errors import HydraException
-        from omegaconf import OmegaConf
         from omegaconf.errors import OmegaConfBaseException
     except ImportError as error:
         raise InputError("settings need Hydra: pip install topomerge[learn]") from error
     try:
         with initialize_config_module("topomerge.configs", version_base="1.3"):
             given = hydra_compose(name, overrides=list(words))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(_one_line(error)) from error
+    return typed(given, schema)
+
+
+def typed(given: Any, schema: type[Schema]) -> Schema:
+    """What Hydra composed, as a dataclass.
+
+    Raises:
+        InputError: one line with the key's name.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
         merged: Any = OmegaConf.merge(OmegaConf.structured(schema), given)
         settings: Schema = OmegaConf.to_object(merged)  # type: ignore[assignment]
-    except (HydraException, OmegaConfBaseException) as error:
+    except OmegaConfBaseException as error:
         raise InputError(_one_line(error)) from error
     return settings
 

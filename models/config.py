@@ -1,0 +1,142 @@
+"""What a network is made of: plain dataclasses, stored as JSON beside its weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+from topomerge.errors import InputError
+
+GEOMETRY = {  # part -> width of the rows it reads; 0: it reads the points
+    "scalars": 16,
+    "engineered": 12,
+    "shapedna": 32,
+    "pointnet": 0,
+    "pointnet_local": 0,
+    "voxelcnn": 0,
+}
+NODES = ("none", "sage", "gat")
+JUMPS = ("last", "cat", "max")
+
+
+@dataclass
+class Geometry:
+    """Room -> vector.
+
+    Args:
+        parts: of `GEOMETRY`; several are concatenated.
+        width: of the vector.
+        yaws: turns over which an encoder of points takes the mean.
+        canonical: turn the longest axis into x first.
+    """
+
+    parts: list[str] = field(default_factory=lambda: ["scalars"])
+    width: int = 64
+    yaws: int = 4
+    canonical: bool = False
+
+
+@dataclass
+class Node:
+    """Rooms and the edges between them -> vector.
+
+    Args:
+        kind: of `NODES`.
+        layers: 1 to 4.
+        heads: of the attention.
+        edges: use the features of edges.
+        told: attention sums them, too (`gat.GatLayer`).
+        doors: layers over the pairs of doors of each room; needs `edges`.
+        skip: add what goes into a layer to what comes out.
+        jump: what the last layer says, or all of them joined or their maximum (jumping knowledge: Xu et al. 2018).
+        width: of edges.
+    """
+
+    kind: str = "gat"
+    layers: int = 2
+    heads: int = 4
+    edges: bool = True
+    told: bool = True
+    doors: int = 0
+    skip: bool = True
+    jump: str = "cat"
+    width: int = 32
+
+
+@dataclass
+class Network:
+    """The whole of it; `size` is the width of an embedding."""
+
+    geometry: Geometry = field(default_factory=Geometry)
+    node: Node = field(default_factory=Node)
+    size: int = 64
+    dropout: float = 0.1
+
+
+def check(network: Network) -> None:
+    """Refuse what can't be built.
+
+    Raises:
+        InputError: names the key.
+    """
+    geometry, node = network.geometry, network.node
+    if not geometry.parts or len(set(geometry.parts)) < len(geometry.parts):
+        raise InputError("geometry.parts must be one or more, each once")
+    for part in geometry.parts:
+        if part not in GEOMETRY:
+            raise InputError(f"geometry.parts: unknown {part!r}; {', '.join(GEOMETRY)} are possible")
+    if node.kind not in NODES:
+        raise InputError(f"node.kind: unknown {node.kind!r}; {', '.join(NODES)} are possible")
+    if node.jump not in JUMPS:
+        raise InputError(f"node.jump: unknown {node.jump!r}; {', '.join(JUMPS)} are possible")
+    if node.kind != "none" and not 1 <= node.layers <= 4:
+        raise InputError(f"node.layers must be 1 to 4, not {node.layers}")
+    if node.doors and not node.edges:
+        raise InputError("node.doors are features of edges: set node.edges=true")
+    if geometry.canonical and geometry.yaws % 2:
+        raise InputError(f"geometry.yaws must be even where canonical is set (an axis has two ends), not {geometry.yaws}")
+    least = {"geometry.width": geometry.width, "geometry.yaws": geometry.yaws, "node.heads": node.heads, "size": network.size}
+    for key, value in least.items() | {("node.width", node.width)}:
+        if value < 1:
+            raise InputError(f"{key} must be 1 or more, not {value}")
+    if geometry.width % node.heads:
+        raise InputError(f"geometry.width must be a multiple of node.heads: {geometry.width} and {node.heads}")
+    if not 0 <= network.dropout < 1:
+        raise InputError(f"dropout must be 0 or more and below 1, not {network.dropout}")
+
+
+def network_from(told: Mapping[str, Any]) -> Network:
+    """From what `dataclasses.asdict` gave.
+
+    Raises:
+        InputError: an unknown key, a value of another type, or what can't be built.
+    """
+    network = Network(
+        geometry=_filled(Geometry, told.get("geometry", {}), "geometry."),
+        node=_filled(Node, told.get("node", {}), "node."),
+        **{k: v for k, v in _values(Network, told, "").items() if k not in ("geometry", "node")},
+    )
+    check(network)
+    return network
+
+
+def _filled(kind: type, told: Any, where: str) -> Any:
+    return kind(**_values(kind, told, where))
+
+
+def _values(kind: type, told: Any, where: str) -> dict[str, Any]:
+    """The values of a dataclass' fields, if each is of the type of its default."""
+    if not isinstance(told, Mapping):
+        raise InputError(f"{where.rstrip('.') or 'network'} must be a table of keys, not {told!r}")
+    defaults = asdict(kind())
+    known = {f.name for f in fields(kind)}
+    for key, value in told.items():
+        if key not in known:
+            raise InputError(f"unknown key {where}{key}; {', '.join(sorted(known))} are possible")
+        wanted = float if isinstance(defaults[key], float) and not isinstance(value, bool) else type(defaults[key])
+        if not (isinstance(value, wanted) or (wanted is float and isinstance(value, int))) or (
+            wanted is int and isinstance(value, bool)
+        ):
+            raise InputError(f"{where}{key} must be {wanted.__name__}, not {value!r}")
+    return dict(told)

@@ -1,0 +1,114 @@
+"""The network: rooms of a map with their points, doors and neighbours -> a vector each, and whether it has a partner."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from topomerge.models.config import GEOMETRY, Network, check
+from topomerge.models.layers import Standardise, mlp
+from topomerge.models.nodes import NodeEncoder
+from topomerge.models.pointnet import LocalPointNet, PointNet
+from topomerge.models.voxelcnn import VoxelCNN
+from topomerge.models.yaw import Turned
+from torch import Tensor, nn
+
+POINTS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}
+TENSORS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> tensor of the graph that it reads
+GRAPH = ("edge_index", "edge_attr", "door_index", "door_attr")
+
+
+class Table(nn.Module):
+    """Rows (R, n) of numbers -> (R, width)."""
+
+    def __init__(self, columns: int, width: int, dropout: float) -> None:
+        super().__init__()
+        self.scale = Standardise(columns)
+        self.each = mlp(columns, 2 * width, width, dropout=dropout)
+
+    def forward(self, values: Tensor) -> Tensor:
+        out: Tensor = self.each(self.scale(values))
+        return out
+
+
+class GeometryEncoder(nn.Module):
+    """What each room looks like by itself: (R, width)."""
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        geometry, self.width = network.geometry, network.geometry.width
+        self.parts = nn.ModuleDict()
+        for part in geometry.parts:
+            if part in POINTS:
+                self.parts[part] = Turned(POINTS[part](self.width), geometry.yaws, geometry.canonical)
+            else:
+                self.parts[part] = Table(GEOMETRY[part], self.width, network.dropout)
+        self.join = nn.Sequential(nn.LayerNorm(len(self.parts) * self.width), nn.ReLU(), nn.Dropout(network.dropout))
+        self.out = nn.Linear(len(self.parts) * self.width, self.width)
+
+    def forward(self, tensors: Mapping[str, Tensor]) -> Tensor:
+        found = [module(tensors[needed(part)]) for part, module in self.parts.items()]
+        out: Tensor = self.out(self.join(torch.cat(found, dim=1)))
+        return out
+
+
+def needed(part: str) -> str:
+    """The tensor of the graph that a part of the geometry reads."""
+    return TENSORS.get(part, "room_points")
+
+
+class Embedder(nn.Module):
+    """Tensors of one or more maps (`embedding.graph`) -> embeddings (R, size) of length 1, dustbins (R,).
+
+    A room's dustbin is how alike another one must at least be to be its partner, as a logit: high for rooms that are likely
+    seen by this map only, such as those that were glimpsed.
+    """
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        check(network)
+        self.network = network
+        self.geometry = GeometryEncoder(network)
+        self.node = NodeEncoder(network.node, network.geometry.width, network.dropout)
+        self.project = mlp(self.node.out, 2 * network.size, network.size, dropout=network.dropout)
+        self.dustbin = mlp(self.node.out, 32, 1)
+        self.log_temperature = nn.Parameter(torch.tensor(-2.3))  # 0.1; similarities are divided by it
+
+    @property
+    def tensors(self) -> tuple[str, ...]:
+        """Names of the tensors that the network reads."""
+        return (*dict.fromkeys(needed(part) for part in self.network.geometry.parts), *GRAPH)
+
+    @property
+    def temperature(self) -> Tensor:
+        """Learned, but kept between 0.02 and 1."""
+        return self.log_temperature.exp().clamp(0.02, 1.0)
+
+    def forward(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        rooms = self.node(self.geometry(tensors), *(tensors[name] for name in GRAPH))
+        return nn.functional.normalize(self.project(rooms), dim=1), self.dustbin(rooms)[:, 0]
+
+    def fit_scales(self, graphs: Iterable[Mapping[str, Any]]) -> None:
+        """Take the statistics of all inputs from the graphs of the training set."""
+        graphs = list(graphs)
+        tables = [(needed(name), part.scale) for name, part in self.geometry.parts.items() if isinstance(part, Table)]
+        tables += [(name, s) for name, s in (("edge_attr", self.node.edges), ("door_attr", self.node.pairs)) if s is not None]
+        for name, scale in tables:
+            scale.fit(torch.cat([graph[name] for graph in graphs]))
+
+
+def match_scores(a: Tensor, b: Tensor, bin_a: Tensor, bin_b: Tensor, temperature: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Logarithms of the probabilities that row i's partner is column j, or, in the last place, that it has none; and vice versa.
+
+    Args:
+        a, b: (n, D), (m, D) embeddings of two maps.
+        bin_a, bin_b: (n,), (m,) their dustbins.
+
+    Returns:
+        (n, m + 1) of the rooms of a, (m, n + 1) of those of b.
+    """
+    logits = a @ b.T / temperature
+    rows = torch.cat([logits, bin_a[:, None]], dim=1).log_softmax(dim=1)
+    columns = torch.cat([logits.T, bin_b[:, None]], dim=1).log_softmax(dim=1)
+    return rows, columns

@@ -1,0 +1,147 @@
+"""Losses that bring the views of one room together: InfoNCE with a dustbin, NT-Xent and triplets.
+
+A batch holds several pairs of maps. For a room of a, the rooms of the other map that are the same true room are its partners
+(several, where one of the maps has it in pieces). The other rooms of both maps are hard negatives: they stand in the same
+building. The rooms of the other pairs are easy ones. Rooms of one true room are no negatives of each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from topomerge.errors import InputError
+
+KINDS = ("infonce", "ntxent", "triplet")
+NEVER = -1e4  # a logit that is never chosen; minus infinity would make gradients of rows without a partner nan
+
+
+@dataclass
+class LossSettings:
+    """Args:
+    kind: of `KINDS`.
+    easy: weight of the other buildings' rooms among the negatives.
+    dustbin: weight of the choice between the other map's rooms and no partner at all.
+    margin: of the triplets, in distances between unit vectors.
+    temperature: of NT-Xent; that of InfoNCE is learned.
+    """
+
+    kind: str = "infonce"
+    easy: float = 0.3
+    dustbin: float = 1.0
+    margin: float = 0.3
+    temperature: float = 0.1
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What belongs together in a batch of N rooms.
+
+    Args:
+        pair: (N,) which pair of maps a room is of.
+        side: (N,) 0 for a, 1 for b.
+        same: (N, N) bool, the two are one true room, in the two maps of a pair.
+        piece: (N, N) bool, the two are of one true room in one map.
+    """
+
+    pair: Tensor
+    side: Tensor
+    same: Tensor
+    piece: Tensor
+
+
+def check(settings: LossSettings) -> None:
+    """Refuse what makes no sense.
+
+    Raises:
+        InputError: names the key.
+    """
+    if settings.kind not in KINDS:
+        raise InputError(f"loss.kind: unknown {settings.kind!r}; {', '.join(KINDS)} are possible")
+    for key in ("easy", "dustbin", "margin"):
+        if getattr(settings, key) < 0:
+            raise InputError(f"loss.{key} must be 0 or more, not {getattr(settings, key)}")
+    if settings.temperature <= 0:
+        raise InputError(f"loss.temperature must be above 0, not {settings.temperature}")
+
+
+def matching_loss(
+    settings: LossSettings, embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth
+) -> dict[str, Tensor]:
+    """Losses by name; `loss` is their weighted sum.
+
+    Args:
+        embedding: (N, D) of length 1.
+        dustbin: (N,) logits.
+        temperature: learned one.
+    """
+    if settings.kind == "infonce":
+        main = info_nce(embedding, temperature, truth, settings.easy)
+    elif settings.kind == "ntxent":
+        main = info_nce(embedding, embedding.new_tensor(settings.temperature), truth, 1.0)
+    else:
+        main = triplet(embedding, truth, settings.margin)
+    # Where another loss than InfoNCE shapes the embedding, only the dustbins and the temperature are fitted to it.
+    fixed = embedding if settings.kind == "infonce" else embedding.detach()
+    none = dustbin_loss(fixed, dustbin, temperature, truth)
+    return {"loss": main + settings.dustbin * none, settings.kind: main.detach(), "dustbin": none.detach()}
+
+
+def info_nce(embedding: Tensor, temperature: Tensor, truth: Truth, easy: float = 1.0) -> Tensor:
+    """Mean over rooms with a partner of -log(sum of exp(s) of partners / sum of exp(s) of partners and negatives), s being the
+    cosine over the temperature; negatives of other pairs count `easy` times (van den Oord et al. 2018; both directions)."""
+    logits = embedding @ embedding.T / temperature
+    own = truth.pair[:, None] == truth.pair[None]
+    weight = torch.where(own, 1.0, easy) * ~(truth.piece | torch.eye(len(own), dtype=torch.bool, device=own.device))
+    has = truth.same.any(dim=1)
+    if not has.any():
+        return logits.sum() * 0
+    logits, same, weight = logits[has], truth.same[has], weight[has]
+    every = (logits + weight.clamp(min=1e-30).log()).masked_fill(weight == 0, NEVER).logsumexp(dim=1)
+    partners = logits.masked_fill(~same, NEVER).logsumexp(dim=1)
+    return (every - partners).mean()
+
+
+def triplet(embedding: Tensor, truth: Truth, margin: float) -> Tensor:
+    """Mean over rooms with a partner of max(0, d(partner) - d(negative) + margin): the farthest partner, the nearest negative of
+    the same pair of maps (Hermans et al. 2017)."""
+    # Distances of unit vectors; the root needs a gradient at 0.
+    apart = (2 - 2 * embedding @ embedding.T).clamp(min=0).add(1e-8).sqrt()
+    own = truth.pair[:, None] == truth.pair[None]
+    negative = own & ~truth.same & ~truth.piece & ~torch.eye(len(own), dtype=torch.bool, device=own.device)
+    has = truth.same.any(dim=1) & negative.any(dim=1)
+    if not has.any():
+        return apart.sum() * 0
+    far = apart[has].masked_fill(~truth.same[has], NEVER).amax(dim=1)
+    near = apart[has].masked_fill(~negative[has], -NEVER).amin(dim=1)
+    return (far - near + margin).relu().mean()
+
+
+def dustbin_loss(embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth) -> Tensor:
+    """Mean over all rooms of -log(probability of their partners, or of having none where they have none), among the rooms of the
+    other map of the pair and the dustbin."""
+    logits = embedding @ embedding.T / temperature
+    other = (truth.pair[:, None] == truth.pair[None]) & (truth.side[:, None] != truth.side[None])
+    every = torch.cat([logits.masked_fill(~other, NEVER), dustbin[:, None]], dim=1).logsumexp(dim=1)
+    partners = logits.masked_fill(~truth.same, NEVER).logsumexp(dim=1)
+    right = torch.where(truth.same.any(dim=1), partners, dustbin)
+    return (every - right).mean()
+
+
+class Objective(nn.Module):
+    """Network and loss in one module, so that a training step is one call of it (as several processes need).
+
+    Args:
+        network: an `Embedder`.
+    """
+
+    def __init__(self, network: nn.Module, settings: LossSettings) -> None:
+        super().__init__()
+        check(settings)
+        self.network, self.settings = network, settings
+
+    def forward(self, tensors: dict[str, Tensor], truth: Truth) -> dict[str, Tensor]:
+        embedding, dustbin = self.network(tensors)
+        return matching_loss(self.settings, embedding, dustbin, self.network.temperature, truth)

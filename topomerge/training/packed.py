@@ -1,0 +1,147 @@
+"""A cached set of pairs as one file that is read in a second, and then stays in memory.
+
+It stands in `packed/` beside the manifest, named by a hash of what is in it. Points are millimetres in 16 bits. Nothing but
+NumPy is needed to read it: a machine that only trains has no use for the extraction.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from topomerge.errors import InputError
+from topomerge.io import archive
+from topomerge.types import Array
+
+FORMAT = 1
+CHUNK = 100  # pairs; descriptors that take long are kept chunk by chunk
+TABLES = ("x", "edge_attr", "door_attr", "pos")  # positions are for figures, no network reads them
+INDICES = ("edge_index", "door_index")
+COUNTS = {"edge_attr": "edges", "edge_index": "edges", "door_attr": "doors", "door_index": "doors"}  # of the others: rooms
+EXTRAS = ("engineered", "shapedna")
+Graph = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class GraphPair:
+    """Tensors of two maps by name (`embedding.graph`; `room_points` are int16 millimetres) and what is true about them.
+
+    Args:
+        matches: (M, 2) rooms of a and of b that are one true room.
+        true: (R,) true room of each room of a and of b, -1 none.
+        about: building, sensors, overlap, source, ...
+    """
+
+    a: Graph
+    b: Graph
+    matches: Tensor
+    true: tuple[Tensor, Tensor]
+    about: dict[str, Any]
+
+
+def load_pairs(
+    manifest: str | Path, extras: Sequence[str] = (), say: Callable[[str], None] = lambda text: None
+) -> list[GraphPair]:
+    """The pairs of a manifest (`datasets.build`), from the packed file, which is made if there is none.
+
+    Args:
+        manifest: or a packed file itself.
+        extras: descriptors that are wanted, too: of `EXTRAS`.
+
+    Raises:
+        InputError: no such manifest, or a file is damaged.
+    """
+    path = Path(manifest)
+    if path.suffix == ".npz":
+        return _unpacked(archive.read(path, "packed set"), {})
+    rows = _rows(path)
+    names = [str(row["file"]) for row in rows]
+    digest = hashlib.sha256(json.dumps([FORMAT, names]).encode()).hexdigest()[:12]
+    folder = path.parent / "packed"
+    folder.mkdir(exist_ok=True)
+    whole = folder / f"{path.stem}-{digest}.npz"
+    if not whole.exists():
+        say(f"packing {len(names)} pairs")
+        archive.write(_packed([archive.read(path.parent / "pairs" / name, "cached pair") for name in names], rows), whole)
+    arrays = archive.read(whole, "packed set")
+    return _unpacked(arrays, {name: _extra(name, arrays, whole, say) for name in extras})
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        made = f"make it with python -m topomerge.datasets.build data={path.stem}"
+        raise InputError(f"{path}: {error.strerror or error}; {made}") from error
+    rows = [json.loads(line) for line in text.splitlines()]
+    if not rows:
+        raise InputError(f"{path}: no pairs in it")
+    return rows
+
+
+def _packed(pairs: list[dict[str, Array]], rows: list[dict[str, Any]]) -> dict[str, Array]:
+    """All maps behind each other, a0 b0 a1 b1 ..., with how many rooms, edges and pairs of doors each has."""
+    sides = [{n[2:]: v for n, v in pair.items() if n.startswith(f"{s}.")} for pair in pairs for s in "ab"]
+    out = {name: np.concatenate([side[name] for side in sides]).astype(np.float32) for name in TABLES}
+    out |= {name: np.concatenate([side[name] for side in sides], axis=1).astype(np.int32) for name in INDICES}
+    points = np.concatenate([np.round(side["room_points"] * 1000).clip(-32767, 32767).astype(np.int16) for side in sides])
+    out["room_points"] = points
+    for name, of in (("rooms", "x"), ("edges", "edge_attr"), ("doors", "door_attr")):
+        out[name] = np.array([len(side[of]) for side in sides])
+    out["true"] = np.concatenate([side["true_room"] for side in sides]).astype(np.int32)
+    out["matches"] = np.concatenate([pair["matches"] for pair in pairs]).astype(np.int32)
+    out["partners"] = np.array([len(pair["matches"]) for pair in pairs])
+    told = json.dumps([_short(row) for row in rows], ensure_ascii=False)
+    return out | {"about": np.frombuffer(told.encode(), np.uint8)}
+
+
+def _short(row: dict[str, Any]) -> dict[str, Any]:
+    kept = ("file", "building", "source", "kind", "sensors", "overlap", "hard", "storeys")
+    return {key: row[key] for key in kept if key in row}
+
+
+def _unpacked(arrays: dict[str, Array], extras: dict[str, Array]) -> list[GraphPair]:
+    counts = {name: arrays[name].tolist() for name in ("rooms", "edges", "doors")}
+    tensors = {name: torch.from_numpy(arrays[name]) for name in (*TABLES, *INDICES, "room_points")}
+    tensors |= {name: torch.from_numpy(values) for name, values in extras.items()}
+    split = {}
+    for name, tensor in tensors.items():
+        split[name] = tensor.split(counts[COUNTS.get(name, "rooms")], dim=1 if name in INDICES else 0)
+    maps = range(len(counts["rooms"]))
+    graphs = [{name: parts[i].long() if name in INDICES else parts[i] for name, parts in split.items()} for i in maps]
+    true = torch.from_numpy(arrays["true"]).long().split(counts["rooms"])
+    matches = torch.from_numpy(arrays["matches"]).long().split(arrays["partners"].tolist())
+    told = json.loads(arrays["about"].tobytes())
+    sides = zip(graphs[::2], graphs[1::2], matches, zip(true[::2], true[1::2], strict=True), told, strict=True)
+    return [GraphPair(*one) for one in sides]
+
+
+def _extra(name: str, arrays: dict[str, Array], whole: Path, say: Callable[[str], None]) -> Array:
+    """A descriptor of all rooms; chunks that were reckoned before are read."""
+    from topomerge.embedding.point_features import point_features, point_spectra
+
+    reckon = {"engineered": point_features, "shapedna": point_spectra}[name]
+    ends = np.concatenate([[0], np.cumsum(arrays["rooms"])])[:: 2 * CHUNK]
+    starts = np.append(ends[ends < len(arrays["x"])], len(arrays["x"]))
+    found = []
+    for k, (first, last) in enumerate(itertools.pairwise(starts)):
+        path = whole.with_name(f"{whole.stem}-{name}-{k}.npz")
+        if not path.exists():
+            say(f"{name} of rooms {first} to {last} of {len(arrays['x'])}")
+            archive.write({"values": reckon(metres(arrays["room_points"][first:last]))}, path)
+        found.append(archive.read(path, "descriptors")["values"])
+    return np.concatenate(found)
+
+
+def metres(points: Array) -> Array:
+    """Points in millimetres as float32 in metres."""
+    return points.astype(np.float32) * np.float32(0.001)

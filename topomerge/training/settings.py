@@ -1,0 +1,198 @@
+"""Settings of a training, as one dataclass: from Hydra's words, or from a JSON or YAML file that a run wrote."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, make_dataclass
+from pathlib import Path
+from typing import Any
+
+from topomerge.errors import InputError
+from topomerge.models.config import Network, network_from
+from topomerge.models.config import check as check_network
+from topomerge.models.losses import LossSettings
+from topomerge.models.losses import check as check_loss
+
+FREEZE = ("", "geometry")
+
+
+@dataclass
+class Augment:
+    """What is changed about maps while training, anew in each step.
+
+    Args:
+        rooms: share of rooms that are lost, drawn for each map between 0 and this.
+        edges: share of doors that are lost, likewise.
+        jitter: standard deviation of sizes, as logarithms.
+        scale: standard deviation of a map's scale, as a logarithm.
+        points: of each room that are taken; 0: all.
+        noise: m, standard deviation of points.
+    """
+
+    rooms: float = 0.15
+    edges: float = 0.1
+    jitter: float = 0.03
+    scale: float = 0.0
+    points: int = 256
+    noise: float = 0.02
+
+
+@dataclass
+class Training:
+    """Args:
+    name: of the run; its folder is `runs`/`name`.
+    data: name of the set of pairs to train on: `cache`/`data`.jsonl, or the path of a manifest or packed file.
+    validation: likewise of the set to watch; empty: a tenth of the training buildings is held out.
+    limit: of the first pairs only; 0: all.
+    epochs: at most; rate: of learning, rises over `warmup` of all steps and falls to nothing.
+    batch: pairs of maps a step, of each process.
+    patience: epochs without a better validation after which it ends; 0: never.
+    geometry_from: run whose geometry encoder is the start; freeze: `geometry` keeps it as it is.
+    overfit: train on one batch, without augmentation, and validate on it.
+    resume: go on where the run of this name stopped.
+    watch: what is best: a score of validation.
+    """
+
+    name: str = "run"
+    runs: str = "runs"
+    cache: str = "cache"
+    data: str = "train_small"
+    validation: str = "val_small"
+    limit: int = 0
+    seed: int = 0
+    epochs: int = 40
+    batch: int = 16
+    rate: float = 2e-3
+    decay: float = 1e-4
+    warmup: float = 0.05
+    clip: float = 1.0
+    patience: int = 8
+    watch: str = "recall@1"
+    accelerator: str = "cpu"
+    devices: int = 1
+    precision: str = "32-true"
+    geometry_from: str = ""
+    freeze: str = ""
+    overfit: bool = False
+    resume: bool = False
+    tensorboard: bool = True
+    network: Network = field(default_factory=Network)
+    loss: LossSettings = field(default_factory=LossSettings)
+    augment: Augment = field(default_factory=Augment)
+
+    @property
+    def folder(self) -> Path:
+        """Where the run is written."""
+        return Path(self.runs) / self.name
+
+
+def check(settings: Training) -> None:
+    """Refuse what makes no sense.
+
+    Raises:
+        InputError: names the key.
+    """
+    check_network(settings.network)
+    check_loss(settings.loss)
+    for key, least in (("epochs", 1), ("batch", 1), ("devices", 1), ("limit", 0), ("patience", 0), ("seed", 0)):
+        if getattr(settings, key) < least:
+            raise InputError(f"{key} must be {least} or more, not {getattr(settings, key)}")
+    for key in ("rate", "clip"):
+        if not getattr(settings, key) > 0:
+            raise InputError(f"{key} must be above 0, not {getattr(settings, key)}")
+    shares = {"warmup": settings.warmup, "augment.rooms": settings.augment.rooms, "augment.edges": settings.augment.edges}
+    for key, value in shares.items():
+        if not 0 <= value < 1:
+            raise InputError(f"{key} must be 0 or more and below 1, not {value}")
+    if settings.freeze not in FREEZE:
+        raise InputError(f"freeze: unknown {settings.freeze!r}; geometry or nothing are possible")
+    if settings.freeze and not settings.geometry_from:
+        raise InputError("freeze=geometry needs geometry_from=<run>, or random weights would be frozen")
+    if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
+        raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
+
+
+def from_words(words: Sequence[str] = ()) -> Training:
+    """From `configs/train.yaml` and words like ``node=sage loss.kind=triplet``, by Hydra.
+
+    Raises:
+        InputError: one line with the key's name.
+    """
+    from topomerge.config import compose
+
+    return composed(compose("train", with_recipe(), words))
+
+
+def with_recipe() -> type[Training]:
+    """`Training` with all of `configs/data/<name>.yaml` in the place of its name, as Hydra composes it."""
+    from topomerge.datasets.recipe import Recipe
+
+    return make_dataclass("Training", [("data", Recipe, field(default_factory=Recipe))], bases=(Training,))
+
+
+def composed(given: Any) -> Training:
+    """`Training` out of what `with_recipe` says: of the data only the name is needed."""
+    told = {f.name: getattr(given, f.name) for f in fields(Training)}
+    return Training(**{**told, "data": given.data.name})
+
+
+def from_file(path: str | Path) -> Training:
+    """From a run's `config.json` or `config.yaml`, or one written by hand; what is not in it has its default.
+
+    Raises:
+        InputError: no such file, damaged, or an unknown key.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}; give the config.json of a run") from error
+    try:
+        if path.suffix == ".json":
+            told = json.loads(text)
+        else:
+            import yaml
+
+            told = yaml.safe_load(text)
+    except Exception as error:  # of json or of yaml, which need not be installed for the other
+        raise InputError(f"{path}: damaged ({' '.join(str(error).split())[:120]})") from error
+    try:
+        return from_dict(told)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def from_dict(told: Any) -> Training:
+    """From what `to_dict` gave.
+
+    Raises:
+        InputError: an unknown key, or a value of another type.
+    """
+    if not isinstance(told, Mapping):
+        raise InputError(f"settings must be a table of keys, not {type(told).__name__}")
+    values = {**told}
+    parts: dict[str, Any] = {"network": network_from(values.pop("network", {}))}
+    for key, kind in (("loss", LossSettings), ("augment", Augment)):
+        parts[key] = _filled(kind, values.pop(key, {}), f"{key}.")
+    settings: Training = _filled(Training, values, "", **parts)
+    check(settings)
+    return settings
+
+
+def _filled(kind: Any, told: Any, where: str, **given: Any) -> Any:
+    if not isinstance(told, Mapping):
+        raise InputError(f"{where.rstrip('.')} must be a table of keys, not {told!r}")
+    defaults = {f.name: getattr(kind(), f.name) for f in fields(kind)}
+    for key, value in told.items():
+        if key not in defaults or is_dataclass(defaults[key]):
+            raise InputError(f"unknown key {where}{key}; {', '.join(sorted(defaults))} are possible")
+        wanted = type(defaults[key])
+        if not (type(value) is wanted or (wanted is float and type(value) is int)):
+            raise InputError(f"{where}{key} must be {wanted.__name__}, not {value!r}")
+    return kind(**told, **given)
+
+
+def to_dict(settings: Training) -> dict[str, Any]:
+    """Plain values."""
+    return asdict(settings)

@@ -1,0 +1,79 @@
+"""The runs of a folder as one table, Markdown: ``python -m topomerge.training.table runs/sweep``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+
+SHOWN = ("recall@1", "recall@1_single", "recall@1_twin", "recall@5", "mrr", "precision", "recall", "f1")
+
+
+class SweepTable:
+    """Hydra's callback that writes table.md when all runs of a sweep have ended."""
+
+    def _nothing(self, **_: Any) -> None:
+        """What Hydra tells besides."""
+
+    on_run_start = on_run_end = on_multirun_start = on_job_start = on_job_end = on_compose_config = _nothing
+
+    def on_multirun_end(self, config: Any, **_: Any) -> None:
+        """Called by Hydra."""
+        folder = Path(str(config.hydra.sweep.dir))
+        if folder.is_dir():
+            print(f"{write_table(folder)}")
+
+
+def write_table(folder: str | Path) -> Path:
+    """Write table.md into a folder of runs, best first.
+
+    Raises:
+        InputError: no runs in it.
+    """
+    folder = Path(folder)
+    rows = [row for path in sorted(folder.rglob("metrics.jsonl")) if (row := _best(path.parent)) is not None]
+    if not rows:
+        raise InputError(f"{folder}: no runs in it")
+    rows.sort(key=lambda row: -row["recall@1"])
+    head = ["run", "geometry", "node", "edges", "loss", "seed", *SHOWN, "epoch", "s an epoch"]
+    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+    lines += [f"| {' | '.join(_cell(row[name]) for name in head)} |" for row in rows]
+    with replacing(folder / "table.md") as beside:
+        beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder / "table.md"
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def _best(run: Path) -> dict[str, Any] | None:
+    """The best epoch of a run; None where there is none yet."""
+    told = json.loads((run / "config.json").read_text(encoding="utf-8"))
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    if not rows:
+        return None
+    best = max(rows, key=lambda row: float(row[f"val/{told['watch']}"]))
+    geometry, node = told["network"]["geometry"], told["network"]["node"]
+    return {
+        "run": run.name,
+        "geometry": "+".join(geometry["parts"]),
+        "node": node["kind"] if node["kind"] == "none" else f"{node['kind']} {node['layers']}",
+        "edges": "–" if node["kind"] == "none" or not node["edges"] else "doors" if node["doors"] else "yes",
+        "loss": told["loss"]["kind"],
+        "seed": told["seed"],
+        **{name: best[f"val/{name}"] for name in SHOWN},
+        "epoch": best["epoch"] + 1,
+        "s an epoch": sum(float(row["seconds"]) for row in rows) / len(rows),
+    }
+
+
+if __name__ == "__main__":
+    try:
+        print(write_table(sys.argv[1]).read_text(encoding="utf-8"))
+    except (InputError, IndexError) as error:
+        sys.exit(f"table: {error if isinstance(error, InputError) else 'name a folder of runs'}")

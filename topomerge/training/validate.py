@@ -1,0 +1,74 @@
+"""How well a network finds the rooms of one map in another, on pairs of which the truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from topomerge.matching.scores import assign_with_none, has_twin, pair_counts, partner_ranks
+from topomerge.models.embedder import Embedder, match_scores
+from topomerge.training.batches import make_batch
+from topomerge.training.packed import GraphPair
+from topomerge.types import Array
+
+SIZES = (0, 3, 4)  # area, length, width: columns of x
+AT_ONCE = 8  # pairs
+
+
+@torch.no_grad()
+def embed(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> list[tuple[Tensor, Tensor]]:
+    """(embedding, dustbin) of each map, a0 b0 a1 b1 ..., on the CPU."""
+    training = network.training
+    network.eval()
+    out: list[tuple[Tensor, Tensor]] = []
+    for start in range(0, len(pairs), AT_ONCE):
+        batch = make_batch(pairs[start : start + AT_ONCE], network.tensors).to(device)
+        embedding, dustbin = network(batch.tensors)
+        found = (part.float().cpu().split(batch.rooms) for part in (embedding, dustbin))
+        out += list(zip(*found, strict=True))
+    network.train(training)
+    return out
+
+
+def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> dict[str, float]:
+    """Scores over all rooms with a partner, of both maps: recall@1, recall@5 and MRR, apart for those with and without a
+    near-identical twin; precision, recall and F1 of the assignment in which a room may stay alone."""
+    found, temperature = embed(network, pairs, device), float(network.temperature.detach())
+    ranks, twins, counts = [], [], np.zeros(4, int)
+    for pair, (a, bin_a), (b, bin_b) in zip(pairs, found[::2], found[1::2], strict=True):
+        similarity, matches = (a @ b.T).numpy(), pair.matches.numpy()
+        for one, truth, other in ((similarity, matches, pair.b), (similarity.T, matches[:, ::-1], pair.a)):
+            rooms, rank = partner_ranks(one, truth)
+            ranks.append(rank)
+            twins.append(has_twin(other["x"][:, SIZES].numpy(), truth, rooms))
+        rows, columns = match_scores(a, b, bin_a, bin_b, temperature)
+        counts += pair_counts(assign_with_none(rows.exp().numpy(), columns.exp().numpy()), matches)
+    return scores(np.concatenate(ranks), np.concatenate(twins), counts)
+
+
+def scores(ranks: Array, twins: Array, counts: Array) -> dict[str, float]:
+    """Ranks (n,) and whether each room has a twin (n,); the sums of `pair_counts`."""
+    found, right, wanted, got = (int(c) for c in counts)
+    precision, recall = right / max(found, 1), got / max(wanted, 1)
+
+    def share(of: Array, most: int) -> float:
+        return float((of <= most).mean()) if len(of) else 0.0
+
+    return {
+        "recall@1": share(ranks, 1),
+        "recall@5": share(ranks, 5),
+        "mrr": float((1 / ranks).mean()) if len(ranks) else 0.0,
+        "recall@1_twin": share(ranks[twins], 1),
+        "recall@1_single": share(ranks[~twins], 1),
+        "recall@5_twin": share(ranks[twins], 5),
+        "recall@5_single": share(ranks[~twins], 5),
+        "twins": float(twins.mean()) if len(twins) else 0.0,
+        "precision": precision,
+        "recall": recall,
+        "f1": 2 * precision * recall / max(precision + recall, 1e-9),
+        "rooms": float(len(ranks)),
+    }
