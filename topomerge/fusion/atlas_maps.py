@@ -1,0 +1,95 @@
+"""The maps of an atlas: plans of all are kept, the cells of those that are files only while they are needed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from topomerge.embedding.embedders import embedder as make_embedder
+from topomerge.embedding.room_cells import Descriptor
+from topomerge.fusion.refine import Surface, surface
+from topomerge.fusion.registration import Prepared, prepare
+from topomerge.io.maps import load_map
+from topomerge.types import Array, TopometricMap
+
+AT_ONCE = 3  # maps in memory, of those that are files
+SURFACES = 8  # of maps that are kept for the fine registration
+T = TypeVar("T")
+
+
+class Maps:
+    """A sequence of maps with what is made of them once.
+
+    Args:
+        maps: topometric maps, or `.tmap` files.
+        embedder: of rooms; None where only geometry shall propose poses.
+    """
+
+    def __init__(self, maps: Sequence[TopometricMap | str | Path], embedder: str | Descriptor | None = None) -> None:
+        self._maps = list(maps)
+        self.matched = embedder is not None
+        self._describe = make_embedder(embedder or "engineered", 0)
+        self._recent: OrderedDict[int, TopometricMap] = OrderedDict()
+        self._surfaces: OrderedDict[int, Surface] = OrderedDict()
+        self._rows: dict[int, Array] = {}
+        self._prepared: dict[int, Prepared] = {}
+        self._keys: dict[int, str] = {}
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    def __getitem__(self, k: int) -> TopometricMap:
+        known = self._maps[k]
+        return known if isinstance(known, TopometricMap) else _recent(self._recent, k, AT_ONCE, lambda: load_map(known))
+
+    def key(self, k: int) -> str:
+        """A hash of what a map holds; its name and how long it took do not count."""
+        if k not in self._keys:
+            self._keys[k] = map_key(self[k])
+        return self._keys[k]
+
+    def prepared(self, k: int) -> Prepared:
+        """Plans, for registration."""
+        if k not in self._prepared:
+            self._prepared[k] = replace(prepare(self[k]), surface=lambda: self.surface(k))
+        return self._prepared[k]
+
+    def surface(self, k: int) -> Surface:
+        """Points and normals, for the fine registration."""
+        return _recent(self._surfaces, k, SURFACES, lambda: surface(self[k].grid))
+
+    def area(self, k: int) -> float:
+        """Floor area, m2, of what is known from above."""
+        return float(sum(v.plan.known.sum() * v.plan.cell**2 for v in self.prepared(k).views))
+
+    def rows(self, k: int) -> Array:
+        """(R, D) descriptors of the rooms."""
+        if k not in self._rows:
+            self._rows[k] = np.asarray(self._describe(self[k]), np.float64)
+        return self._rows[k]
+
+
+def _recent(kept: OrderedDict[int, T], k: int, most: int, make: Callable[[], T]) -> T:
+    """The kth thing, from those that were used last."""
+    if k not in kept:
+        kept[k] = make()
+        while len(kept) > most:
+            kept.popitem(last=False)
+    kept.move_to_end(k)
+    return kept[k]
+
+
+def map_key(map: TopometricMap) -> str:
+    """16 hexadecimal digits of a hash of cells, rooms and free space."""
+    digest = hashlib.sha256()
+    for grid in (map.grid, map.navigable, map.free):
+        if grid is not None:
+            digest.update(np.ascontiguousarray(grid.cells).tobytes() + grid.origin.tobytes() + np.float64(grid.edge).tobytes())
+    digest.update(map.room.tobytes() + map.navigable_room.tobytes() + map.rooms.tobytes())
+    return digest.hexdigest()[:16]
