@@ -8,7 +8,7 @@ from topomerge.kernels.columns import first_occupied
 from topomerge.types import STOREY_DTYPE, Array, VoxelGrid
 
 LEAST_AREA = 3.0  # m2
-LEAST_SHARE = 0.04  # of the largest storey
+LEAST_SHARE = 0.01  # of the largest storey: a landing upstairs is one
 HIGHEST_CEILING = 30.0  # m
 LEAST_HEIGHT = 1.9  # m between floors: nobody stands upright in less
 
