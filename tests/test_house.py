@@ -30,9 +30,11 @@ RANKS = {
     "evaluation": 10,
     "console": 11,
     "completion": 11,
-    "commands": 12,
-    "cli": 13,
-    "__main__": 14,
+    "command": 11,
+    "export_commands": 12,
+    "commands": 13,
+    "cli": 14,
+    "__main__": 15,
 }
 HEAVY = ("torch", "torch_geometric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell", "trimesh", "lightning")
 

@@ -15,7 +15,8 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from topomerge import __version__
-from topomerge.commands import COMMANDS, Command
+from topomerge.command import Command
+from topomerge.commands import COMMANDS
 
 EXIT_STATUSES = """\
 exit status:

@@ -7,42 +7,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import topomerge
+from topomerge.command import Command, count, option
 from topomerge.console import Bars, check_outputs, warn, write_all
 from topomerge.errors import InputError
+from topomerge.export_commands import EXPORT, VIEW
 
-Argument = tuple[tuple[str, ...], dict[str, Any]]
 FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
-
-
-@dataclass(frozen=True)
-class Command:
-    """One command: its function, its words for the help and its arguments."""
-
-    name: str
-    run: Callable[[argparse.Namespace], int]
-    summary: str
-    example: str
-    arguments: tuple[Argument, ...]
-    paths: tuple[str, ...] = ()  # arguments that name files, the input first: errors are told under its name
-    description: str = ""
-
-
-def option(*flags: str, **settings: Any) -> Argument:
-    """One argument, as argparse's `add_argument` takes it.
-
-    An option without `default` is absent from the namespace unless it was given: its default has one home, the function
-    that takes it.
-    """
-    if flags[0].startswith("-"):
-        settings.setdefault("default", argparse.SUPPRESS)
-    return flags, settings
 
 
 def _above_zero(text: str) -> float:
@@ -63,12 +38,6 @@ def _share(text: str) -> float:
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"must be a number from 0 to 1, not {text!r}")
     return value
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"must be a whole number, not {text!r}")
-    return int(text)
 
 
 def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -275,7 +244,7 @@ def _map_from(path: str, args: argparse.Namespace) -> Any:
 
 MAPS = (
     option("--descriptor", choices=("engineered", "shapedna", "feather"), default="engineered", help="default engineered"),
-    option("--k", type=_count, default=0, metavar="K", help="steps of context around each room (default 0)"),
+    option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)"),
     option("--voxel-size", type=_above_zero, metavar="E", help="edge length of a cell where a cloud is given, m (default 0.1)"),
     *(o for o in READING if o[0][0] in ("--up", "--unit")),
 )
@@ -387,13 +356,13 @@ COMMANDS = (
         "topomerge simulate --building office --seed 7 --sensors tls,depth --overlap 0.4 -o pair/",
         (
             option("--building", required=True, metavar="KIND", default=None, help="office, hotel, house, school, ..."),
-            option("--seed", type=_count, metavar="N", help="another number, another building (default 7)"),
-            option("--storeys", type=_count, metavar="N", help="1 to 8 (default 1)"),
+            option("--seed", type=count, metavar="N", help="another number, another building (default 7)"),
+            option("--storeys", type=count, metavar="N", help="1 to 8 (default 1)"),
             option(
                 "--sensors", metavar="A,B", help="tls lidar depth mono laser2d tablet; one gives one cloud (default tls,depth)"
             ),
             option("--overlap", type=float, metavar="S", help="share of the rooms that both maps visit (default 0.4)"),
-            option("--rooms", type=_count, metavar="N", help="of each map, at most (default 15; all, of a single cloud)"),
+            option("--rooms", type=count, metavar="N", help="of each map, at most (default 15; all, of a single cloud)"),
             option("--scale", choices=("free", "known"), default="known", help="free: the scale of b is unknown"),
             option("--hard", choices=("other-building", "other-storey", "twin-wing"), help="b is of a place that looks like a's"),
             option(
@@ -413,4 +382,6 @@ COMMANDS = (
         description="Print a script with which the Tab key completes commands, options and their values: for bash to go into "
         "~/.bashrc, for zsh into ~/.zshrc, for fish into ~/.config/fish/completions/topomerge.fish.",
     ),
+    EXPORT,
+    VIEW,
 )

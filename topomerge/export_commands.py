@@ -1,0 +1,218 @@
+"""The commands `export` and `view`: maps for other tools, and reports for eyes."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from topomerge.command import Command, count, option
+from topomerge.console import check_outputs, warn, write_all
+from topomerge.errors import InputError
+
+PAGES = (".html", ".htm")
+
+
+def export_command(args: argparse.Namespace) -> int:
+    """`topomerge export`: a map in the formats of other tools."""
+    from topomerge.io.exports import formats, outputs
+    from topomerge.io.maps import load_map
+
+    names = formats(args.to)
+    options = _export_options(args, names)
+    source = _map_file(args.input)
+    path, folder = _place(args, names, source)
+    found = load_map(source)
+    warn(found.warnings)
+    made = _make_folders(path.parent)
+    try:
+        files = [file for name in names for file in outputs(found, name, path, folder, **options)]
+        check_outputs([file for file, _ in files], [source])
+        write_all(files)
+    finally:
+        for empty in made:
+            with suppress(OSError):
+                empty.rmdir()  # only where nothing was written
+    if not args.quiet:
+        print(f"{len(found.rooms)} rooms, {len(found.edges)} doors and stairs -> {' '.join(str(file) for file, _ in files)}")
+    return 0
+
+
+def _export_options(args: argparse.Namespace, names: list[str]) -> dict[str, Any]:
+    """The options that only some formats know.
+
+    Raises:
+        InputError: one was given that none of the formats knows.
+    """
+    from topomerge.io.exports import FORMATS
+
+    options = {key: getattr(args, key) for key in ("origin", "storey") if hasattr(args, key)}
+    for key in options:
+        able = [name for name, form in FORMATS.items() if key in form.options]
+        if not set(able) & set(names):
+            raise InputError(f"--{key}: means nothing for {', '.join(names)}; it is for {' and '.join(able)}")
+    if "origin" in options:
+        from topomerge.io.exports.geojson import parse_origin
+
+        options["origin"] = parse_origin(options["origin"])
+    return options
+
+
+def _map_file(given: str) -> Path:
+    """The .tmap that a user means, who may have named the folder of a merge."""
+    path = Path(given)
+    if path.is_dir():
+        if not (path / "map.tmap").is_file():
+            refused = " (its merge was refused: merge again with --force)" if (path / "merge.json").is_file() else ""
+            raise InputError(f"{path}: holds no map.tmap{refused}; give a .tmap or the folder of a merge")
+        return path / "map.tmap"
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    if path.suffix.lower() != ".tmap":
+        raise InputError(f"{path}: is no map; make one with `topomerge extract {path.name} -o {path.stem}.tmap`")
+    return path
+
+
+def _place(args: argparse.Namespace, names: list[str], source: Path) -> tuple[Path, bool]:
+    """Where to write: a file, the folder of a single format of several files, or (True) a folder with the stem of the names in it."""
+    from topomerge.io.exports import FORMATS
+
+    several = len(names) > 1 or FORMATS[names[0]].folder
+    stem = source.parent.resolve().name if source.name == "map.tmap" and Path(args.input).is_dir() else source.stem
+    if args.output is None:
+        return source.parent / stem, True
+    path = Path(args.output)
+    if several and path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file; {args.to} writes several, give the name of a folder")
+    if several or path.is_dir() or args.output.endswith(("/", "\\")):
+        return path / stem, True
+    return path, False
+
+
+def _make_folders(folder: Path) -> list[Path]:
+    """Make a folder and those above it; which had to be made, the innermost first."""
+    missing = [p for p in (folder, *folder.parents) if not p.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be made ({error.strerror or error}); give another folder") from error
+    return missing
+
+
+def view_command(args: argparse.Namespace) -> int:
+    """`topomerge view`: a report in the browser."""
+    with tempfile.TemporaryDirectory(prefix="topomerge-") if args.serve is not None else suppress() as scratch:
+        page = _page(args, scratch)
+        if args.serve is not None:
+            from topomerge.viz.serve import serve
+
+            serve(page, args.serve, _show if args.open else print)
+            return 0
+        if args.open:
+            _show(page.resolve().as_uri(), str(page))
+        else:
+            print(page)
+    return 0
+
+
+def _page(args: argparse.Namespace, scratch: str | None) -> Path:
+    """The report to show; that of a map is made first."""
+    path = Path(args.input)
+    if path.is_dir():
+        page = path / "report.html"
+        if page.is_file() and args.output is None:
+            return page
+        if not (path / "map.tmap").is_file():
+            raise InputError(f"{path}: holds neither report.html nor map.tmap; give a folder of `topomerge merge`, a .tmap or an .html")
+        path = path / "map.tmap"
+    elif not path.exists():
+        raise InputError(f"{path}: no such file")
+    if path.suffix.lower() in PAGES:
+        if args.output is not None:
+            raise InputError(f"{args.output}: -o is for the report of a .tmap, and {path} is a page already; leave it out")
+        return path
+    if path.suffix.lower() != ".tmap":
+        raise InputError(f"{path}: can't be shown; give a .tmap, the folder of a merge or an .html; a cloud goes through `topomerge extract`")
+    place = Path(args.output) if args.output is not None else Path(scratch or tempfile.mkdtemp(prefix="topomerge-")) / f"{path.stem}.html"
+    check_outputs([place], [path])
+    from topomerge.io.maps import load_map
+    from topomerge.viz.report import save_report
+
+    write_all([(place, lambda beside: save_report(load_map(path), beside))])
+    return place
+
+
+def _show(address: str, name: str = "") -> None:
+    """Open an address in the browser, and say where it is for those who have none."""
+    import webbrowser
+
+    print(name or address, flush=True)
+    try:
+        opened = webbrowser.open(address)
+    except (webbrowser.Error, OSError):
+        opened = False
+    if not opened:
+        print("topomerge: no browser could be opened here; open this in one", file=sys.stderr)
+
+
+def _port(text: str) -> int:
+    number = count(text)
+    if number > 65535:
+        raise argparse.ArgumentTypeError(f"must be a port from 0 to 65535, not {text}")
+    return number
+
+
+EXPORT = Command(
+    "export",
+    export_command,
+    "write a map for other tools: GIS, BIM, robots, graphs",
+    "topomerge export merged/ --to geojson,indoorgml,ros -o exported/",
+    (
+        option("input", metavar="MAP", help="a .tmap, or the folder of a merge"),
+        option(
+            "--to",
+            required=True,
+            metavar="FORMAT[,FORMAT]",
+            default=None,
+            help="graphml, geojson, indoorgml, dsg (Spark-DSG), ros (map_server grids, Nav2 routes), ply, las, ifc",
+        ),
+        option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            default=None,
+            help="file, or folder for several formats and for ros (default: beside the map, named after it)",
+        ),
+        option("--origin", metavar="LAT,LON[,HEADING]", help="geojson: degrees; (0, 0) of the map, and its y axis clockwise from north"),
+        option("--storey", type=count, metavar="N", help="geojson, ros: only this storey"),
+        option("-q", "--quiet", action="store_true", default=False, help="print nothing"),
+    ),
+    paths=("input", "output"),
+    description="Write a map in the formats of other tools: rooms as polygons, doors, storeys, their graph, grids to drive by.",
+)
+
+VIEW = Command(
+    "view",
+    view_command,
+    "show a report in the browser",
+    "topomerge view merged/",
+    (
+        option("input", metavar="PATH", help="folder of a merge, a .tmap (its report is made) or an .html"),
+        option("-o", "--output", metavar="A.html", default=None, help="of a .tmap: keep the report here"),
+        option("--no-open", dest="open", action="store_false", default=True, help="only print where it is"),
+        option(
+            "--serve",
+            nargs="?",
+            const=0,
+            default=None,
+            type=_port,
+            metavar="PORT",
+            help="serve it to this machine only, until Ctrl-C (default: any free port)",
+        ),
+    ),
+    paths=("input", "output"),
+    description="Show the report of a merge or of a map in the browser.",
+)

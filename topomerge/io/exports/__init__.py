@@ -1,0 +1,95 @@
+"""Maps written for other tools: a file for each format, all of them reached through `outputs`.
+
+Nothing is imported until a format is written. To add one, write a module with a function (map, path) and enter it here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from topomerge.errors import InputError
+
+if TYPE_CHECKING:
+    from topomerge.types import TopometricMap
+
+Save = Callable[[Path], None]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format: its files' suffixes, the first one its own, and the function `module.save` (map, path, **options)."""
+
+    suffixes: tuple[str, ...]
+    module: str
+    folder: bool = False  # several files, named by `module.files`
+    options: tuple[str, ...] = ()
+    needs: tuple[str, str] | None = None  # Python package, extra
+
+
+FORMATS = {
+    "graphml": Format((".graphml",), "graphml"),
+    "geojson": Format((".geojson", ".json"), "geojson", options=("origin", "storey")),
+    "indoorgml": Format((".gml", ".indoorgml", ".xml"), "indoorgml"),
+    "dsg": Format((".dsg.json", ".json"), "dsg"),
+    "ros": Format((), "ros", folder=True, options=("storey",)),
+    "ply": Format((".ply",), "ply"),
+    "las": Format((".las", ".laz"), "las", needs=("laspy", "las")),
+    "ifc": Format((".ifc",), "ifc", needs=("ifcopenshell", "ifc")),
+}
+
+
+def formats(text: str) -> list[str]:
+    """The formats in "a,b".
+
+    Raises:
+        InputError: none, an unknown one, or one twice.
+    """
+    names = [name.strip().lower() for name in text.split(",") if name.strip()]
+    known = ", ".join(FORMATS)
+    for name in names:
+        if name not in FORMATS:
+            raise InputError(f"--to {name}: is no format that can be written; choose from {known}")
+        if names.count(name) > 1:
+            raise InputError(f"--to {text}: names {name} twice; once is enough")
+    if not names:
+        raise InputError(f"--to {text!r}: names no format; choose from {known}")
+    return names
+
+
+def outputs(map: TopometricMap, name: str, path: Path, folder: bool, **options: Any) -> list[tuple[Path, Save]]:
+    """What writing a map in one format takes: paths, and for each the function that writes it there.
+
+    Args:
+        map: any map.
+        name: a key of `FORMATS`.
+        path: of the file; or the folder and the stem of the file names in it.
+        folder: is it the second?
+        options: what the user asked for; those that the format knows are used.
+
+    Raises:
+        InputError: a package that the format needs is missing, or the map can't be written in it.
+    """
+    form = FORMATS[name]
+    _check_package(name, form)
+    module = import_module(f"topomerge.io.exports.{form.module}")
+    given = {key: value for key, value in options.items() if key in form.options}
+    if form.folder:
+        place, stem = (path.parent, path.name + "_") if folder else (path, "")
+        files: list[tuple[Path, Save]] = module.files(map, place, stem, **given)
+        return files
+    return [(path.with_name(path.name + form.suffixes[0]) if folder else path, partial(module.save, map, **given))]
+
+
+def _check_package(name: str, form: Format) -> None:
+    if form.needs is None:
+        return
+    package, extra = form.needs
+    try:
+        import_module(package)
+    except ImportError as error:
+        raise InputError(f"--to {name}: needs the Python package {package}: pip install 'topomerge[{extra}]'") from error

@@ -1,0 +1,172 @@
+"""A 3D scene graph as JSON of Spark-DSG, which Hydra and its tools read: buildings, rooms and places.
+
+The layers of that library are 3 places, 4 rooms, 5 buildings. There is one building; the storey of a room stands in its metadata.
+Places are the areas of rooms (`p0`, …) and the doors, stairs and so on between them; they are joined as one can walk. Written as
+spark-dsg 1.1.3 writes: https://github.com/MIT-SPARK/Spark-DSG.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from topomerge.io.atomic import replacing
+from topomerge.io.exports.floors import floor_polygons, inside
+from topomerge.io.palette import room_colours
+from topomerge.types import Array, TopometricMap
+
+VERSION = {"major": 1, "minor": 1, "patch": 3}
+PLACES, ROOMS, BUILDINGS = 3, 4, 5
+LAYERS = {"AGENTS": 2, "OBJECTS": 2, "PLACES": PLACES, "ROOMS": ROOMS, "BUILDINGS": BUILDINGS}
+NO_LABEL = 2**32 - 1
+UPRIGHT = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+GREY = (128, 128, 128)
+Json = dict[str, Any]
+
+
+def save(map: TopometricMap, path: Path) -> None:
+    """Write a scene graph that `spark_dsg.DynamicSceneGraph.load` reads; the name of the file should end in .json.
+
+    Raises:
+        InputError: the path can't be written.
+    """
+    nodes, edges = [*_building(map), *_rooms(map)], list(_room_edges(map))
+    for node, its_edges in _places(map):
+        nodes.append(node)
+        edges += its_edges
+    graph = {
+        "SPARK_DSG_header": {"project_name": "main", "version": VERSION},
+        "directed": False,
+        "multigraph": False,
+        "layer_keys": [{"layer": k, "partition": 0} for k in (2, PLACES, ROOMS, BUILDINGS)],
+        "layer_names": {name: {"layer": k, "partition": 0} for name, k in LAYERS.items()},
+        "metadata": {"source": map.source, "voxel_size": float(map.grid.edge), "unit": "m", "written_by": "topomerge"},
+        "nodes": nodes,
+        "edges": edges,
+    }
+    with replacing(path) as beside:
+        beside.write_text(json.dumps(graph, allow_nan=False, indent=1), encoding="utf-8")
+
+
+def symbol(letter: str, number: int) -> int:
+    """The id of a node: its letter in the highest of eight bytes."""
+    return (ord(letter) << 56) | number
+
+
+def _node(layer: int, id: int, kind: str, name: str, at: Array, colour: Any = GREY, **more: Any) -> Json:
+    attributes = {
+        "type": kind,
+        "position": np.asarray(at, np.float64).tolist(),
+        "last_update_time_ns": 0,
+        "is_active": False,
+        "is_predicted": False,
+        "metadata": {},
+        "name": name,
+        "color": dict(zip("rgba", (*(int(c) for c in colour), 255), strict=True)),
+        "semantic_label": NO_LABEL,
+        "semantic_feature": {"rows": 0, "cols": 0, "data": None},
+        "bounding_box": _box(),
+        **more,
+    }
+    return {"id": id, "layer": layer, "partition": 0, "attributes": attributes}
+
+
+def _box(low: Any = None, high: Any = None) -> Json:
+    none = low is None
+    middle, size = (np.zeros(3), np.zeros(3)) if none else ((low + high) / 2, high - low)
+    place = {"world_P_center": middle.tolist(), "world_R_center": UPRIGHT}
+    return {"type": "INVALID" if none else "AABB", "dimensions": size.tolist(), **place}
+
+
+def _edge(a: int, b: int, metadata: Json | None = None, weight: float | None = None) -> Json:
+    known = {"weighted": weight is not None, "weight": 1.0 if weight is None else float(weight)}
+    return {"source": a, "target": b, "info": {"type": "EdgeAttributes", "metadata": metadata or {}, **known}}
+
+
+def _building(map: TopometricMap) -> Iterator[Json]:
+    if len(map.rooms):
+        low, high = map.rooms["lo"].min(axis=0), map.rooms["hi"].max(axis=0)
+        box = _box(low, high)
+        yield _node(BUILDINGS, symbol("B", 0), "SemanticNodeAttributes", "building", (low + high) / 2, bounding_box=box)
+
+
+def _rooms(map: TopometricMap) -> Iterator[Json]:
+    for r, (room, colour) in enumerate(zip(map.rooms, room_colours(map), strict=True)):
+        known = {name: room[name].tolist() for name in ("storey", "area", "height", "volume", "completeness", "glimpsed")}
+        more = {"metadata": known, "bounding_box": _box(room["lo"], room["hi"]), "semantic_class_probabilities": {}}
+        yield _node(ROOMS, symbol("R", r), "RoomNodeAttributes", f"room {r}", room["centroid"], colour, **more)
+
+
+def _room_edges(map: TopometricMap) -> Iterator[Json]:
+    """Rooms to their building, and to each other: one edge a pair, since the graph knows no second one, with its widest way."""
+    for r in range(len(map.rooms)):
+        yield _edge(symbol("B", 0), symbol("R", r))
+    ways: dict[tuple[int, int], list[Any]] = {}
+    for edge in map.edges:
+        a, b = sorted(edge["rooms"].tolist())
+        ways.setdefault((a, b), []).append(edge)
+    for (a, b), edges in sorted(ways.items()):
+        best = max(edges, key=lambda e: e["width"])
+        metadata = {"kind": str(best["kind"]), "width": float(best["width"]), "doors": len(edges)}
+        yield _edge(symbol("R", a), symbol("R", b), metadata)
+
+
+def _places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
+    """Each place with the edges that lead to it: areas first, then the ways between rooms."""
+    colours, floors = room_colours(map), floor_polygons(map)
+    owner, centres = _areas(map, floors)
+    narrows: dict[int, list[Json]] = {}
+    for narrow in map.narrows:
+        a, b = sorted(narrow["rooms"].tolist())
+        far = float(np.linalg.norm(centres[a] - centres[b]))
+        narrows.setdefault(b, []).append(_edge(symbol("p", a), symbol("p", b), {"kind": "narrow"}, far))
+    for i, (r, at) in enumerate(zip(owner.tolist(), centres, strict=True)):
+        clear = 0.0 if floors[r].is_empty else floors[r].boundary.distance(shapely.Point(at[:2]))
+        place = _place(i, f"area {i}", at, clear, colours[r], {"room": r, "storey": int(map.rooms["storey"][r])})
+        yield place, [_edge(symbol("R", r), symbol("p", i)), *narrows.get(i, [])]
+    for number, way in enumerate(map.edges, start=len(owner)):
+        ends, kind = way["rooms"].tolist(), str(way["kind"])
+        metadata = {"kind": kind, "open": bool(way["open"]), "confidence": float(way["confidence"])}
+        place = _place(number, kind, way["centre"], way["width"] / 2, GREY, {**metadata, "rooms": ends})
+        edges = [_edge(symbol("R", ends[0]), symbol("p", number))]  # a node has one parent
+        for r in ends:
+            own = np.flatnonzero(owner == r)
+            apart = np.linalg.norm(centres[own] - way["centre"], axis=1)
+            near = int(own[apart.argmin()])
+            edges.append(_edge(symbol("p", near), symbol("p", number), metadata, float(apart.min())))
+        yield place, edges
+
+
+def _areas(map: TopometricMap, floors: list[Any]) -> tuple[Array, Array]:
+    """(A,) room and (A, 3) a point well inside of each area; a room without areas counts as one."""
+    bare = np.setdiff1d(np.arange(len(map.rooms)), map.areas["room"])
+    owner = np.concatenate([map.areas["room"], bare]).astype(np.int64)
+    centres = np.concatenate([map.areas["centroid"], map.rooms["centroid"][bare]])
+    for i, r in enumerate(owner):
+        centres[i, :2] = inside(floors[r], centres[i])
+    return owner, centres
+
+
+def _place(number: int, name: str, at: Any, clear: float, colour: Any, metadata: Json) -> Json:
+    more = {
+        "distance": float(clear),
+        "num_basis_points": 0,
+        "real_place": True,
+        "need_cleanup": False,
+        "active_frontier": False,
+        "anti_frontier": False,
+        "num_frontier_voxels": 0,
+        "frontier_scale": [0.0, 0.0, 0.0],
+        "orientation": UPRIGHT,
+        "pcl_mesh_connections": [],
+        "voxblox_mesh_connections": [],
+        "deformation_connections": [],
+        "mesh_vertex_labels": [],
+        "metadata": metadata,
+    }
+    return _node(PLACES, symbol("p", number), "PlaceNodeAttributes", name, at, colour, **more)

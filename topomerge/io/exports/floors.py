@@ -1,0 +1,227 @@
+"""Rooms as polygons: what the exports for plans and models share.
+
+The floor of a room is its navigable cells seen from above. Their outline is made of steps as long as a cell; straight walls are
+fitted to it, so that a room that stands askew has straight walls, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from scipy import ndimage
+
+from topomerge.types import Array, TopometricMap
+
+GAP = 0.1  # m: gaps in a floor up to twice this are closed: scan lines
+HOLE = 1.0  # m2: smaller holes in a floor are furniture, shadows or columns
+STEP = 1.6  # cells: smaller jogs of an outline are steps of its cells
+REACH = 4.0  # cells: so far from the end of a wall it may meet the next
+GROWTH = 0.3  # m: a floor is grown to its wall by at most this
+SPECK = 0.05  # m2: smaller pieces of a floor are left out
+HEIGHT = 2.5  # m: of a room whose ceiling nobody saw
+
+
+def floor_polygons(map: TopometricMap) -> list[shapely.MultiPolygon]:
+    """The floor of each room in the input's frame, m, exteriors counter-clockwise; rooms of a storey do not overlap.
+
+    Navigable cells end short of the walls. All outlines are moved outwards by the distance at which their areas are those in the
+    table of rooms, in the median. A room without navigable cells has its bounding box; it is empty where that is flat.
+    """
+    edge, origin = map.navigable.edge, map.navigable.origin[:2]
+    plans = [_plan(map.navigable.cells[rows, :2], edge) for rows in _by_room(map.navigable_room, len(map.rooms))]
+    cells = [None if plan is None else _straight(_polygon(plan.cells, plan.low)) for plan in plans]
+    growth = _growth(map, plans, cells)
+    found: list[shapely.MultiPolygon] = []
+    for r, shape in enumerate(cells):
+        if shape is None:
+            floor = shapely.box(*map.rooms["lo"][r, :2], *map.rooms["hi"][r, :2])
+        else:
+            grown = shape.buffer(growth / edge, join_style="mitre", mitre_limit=1.5)
+            floor = shapely.affinity.affine_transform(grown, [edge, 0, 0, edge, *origin])
+        beside = [f for s, f in zip(map.rooms["storey"], found, strict=False) if s == map.rooms["storey"][r] and f.intersects(floor)]
+        found.append(_parts(floor.difference(shapely.union_all(beside)) if beside else floor, SPECK))
+    return found
+
+
+def room_levels(map: TopometricMap) -> tuple[Array, Array]:
+    """(R, 2) floor and ceiling of each room, m; (R,) bool: was a ceiling seen?
+
+    A room without one reaches to that of its storey, or is 2.5 m high.
+    """
+    z = map.navigable.centroids()[:, 2]
+    levels = np.zeros((len(map.rooms), 2))
+    for r, rows in enumerate(_by_room(map.navigable_room, len(map.rooms))):
+        room, storey = map.rooms[r], map.storeys[map.rooms["storey"][r]]
+        floor = _median_floor(map.navigable.cells[rows], z[rows]) if len(rows) else float(room["lo"][2])
+        height = float(room["height"]) or float(storey["ceiling"]) - floor
+        levels[r] = floor, floor + (height if np.isfinite(height) and height > 0 else HEIGHT)
+    return levels, map.rooms["height"] > 0
+
+
+def jambs(edge: Any) -> Array:
+    """(2, 3) the two sides of a door (a row of `edges`) on its floor, m."""
+    along = np.array([-np.sin(edge["direction"]), np.cos(edge["direction"]), 0.0]) * float(edge["width"]) / 2
+    return np.stack([edge["centre"] - along, edge["centre"] + along])
+
+
+def is_flight(edge: Any) -> bool:
+    """Does an edge lead from storey to storey, with a lower and an upper end?"""
+    return str(edge["kind"]) in ("stairs", "ramp")
+
+
+def inside(floor: shapely.MultiPolygon, wanted: Array) -> Array:
+    """(2,) `wanted`, where that lies inside the floor, else a point that does, m."""
+    point = shapely.Point(*wanted[:2])
+    if floor.is_empty or floor.contains(point):
+        return np.asarray(wanted[:2], np.float64)
+    return np.asarray(max(floor.geoms, key=lambda part: part.area).representative_point().coords[0])
+
+
+def cell_polygons(cells: Array, low: Array, edge: float, least: float) -> shapely.MultiPolygon:
+    """(nx, ny) bool cells as polygons, m, without those smaller than `least` m2.
+
+    Args:
+        cells: bool; cell (i, j) covers x from low[0] + i * edge.
+        low: (2,) m.
+        edge: m.
+    """
+    shape = shapely.simplify(_polygon(cells, np.zeros(2)), 0.0)
+    large = [p for p in shapely.get_parts(shape) if p.area * edge**2 >= least]
+    return shapely.affinity.affine_transform(_parts(shapely.MultiPolygon(large)), [edge, 0, 0, edge, *low])
+
+
+def _by_room(label: Array, count: int) -> list[Array]:
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.searchsorted(label[order], np.arange(count + 1)))[1:-1]
+
+
+def _median_floor(cells: Array, z: Array) -> float:
+    """Median height of the lowest cell of each column: what lies above is its dilation upwards, or a gallery."""
+    order = np.lexsort((z, cells[:, 1], cells[:, 0]))
+    column = cells[order, :2]
+    first = np.ones(len(order), bool)
+    first[1:] = (column[1:] != column[:-1]).any(axis=1)
+    return float(np.median(z[order][first]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """A floor from above: cell (i, j) of `cells` is column low + (i, j) of the grid."""
+
+    cells: Array  # (nx, ny) bool, with small gaps and holes filled
+    low: Array  # (2,)
+    filled: int  # how many cells that were
+
+
+def _plan(columns: Array, edge: float) -> _Plan | None:
+    """The floor over columns (n, 2) of a grid."""
+    if not len(columns):
+        return None
+    reach = max(round(GAP / edge), 1)
+    low = columns.min(axis=0) - reach - 1
+    plan = np.zeros(columns.max(axis=0) - low + reach + 2, bool)
+    plan[tuple((columns - low).T)] = True
+    closed = ndimage.binary_closing(plan, ndimage.generate_binary_structure(2, 1), iterations=reach) | plan
+    holes, _ = ndimage.label(ndimage.binary_fill_holes(closed) & ~closed)
+    small = np.bincount(holes.ravel()) * edge**2 <= HOLE
+    small[0] = False
+    whole = closed | small[holes]
+    return _Plan(whole, low, int(whole.sum() - plan.sum()))
+
+
+def _polygon(cells: Array, low: Array) -> shapely.MultiPolygon:
+    """The filled cells as polygons, in cells: the union of their runs along y."""
+    change = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    x, start = np.nonzero(change == 1)
+    stop = np.nonzero(change == -1)[1]
+    runs = shapely.union_all(shapely.box(x, start, x + 1, stop))
+    return _parts(shapely.affinity.translate(runs, *low.tolist()))
+
+
+def _growth(map: TopometricMap, plans: list[_Plan | None], cells: list[Any]) -> float:
+    """m, between the cells of floors and the walls around them."""
+    edge = map.navigable.edge
+    missing = [
+        (float(map.rooms["area"][r]) / edge**2 + plan.filled - shape.area) / shape.length * edge
+        for r, (plan, shape) in enumerate(zip(plans, cells, strict=True))
+        if plan is not None
+    ]
+    return float(np.clip(np.median(missing), 0.0, GROWTH)) if missing else 0.0
+
+
+def _straight(cells: shapely.MultiPolygon) -> shapely.MultiPolygon:
+    """Straight walls in place of the steps of cells."""
+    parts = []
+    for part in cells.geoms:
+        rings = [_straight_ring(np.asarray(ring.coords)[:-1]) for ring in (part.exterior, *part.interiors)]
+        found = _parts(shapely.make_valid(shapely.Polygon(rings[0], [ring for ring in rings[1:] if len(ring) > 2])), 4.0)
+        # Fitted walls of a very narrow place can cross each other: there the cells say it better.
+        parts.append(found if abs(found.area - part.area) < 0.1 * part.area + 2 else part)
+    return _parts(shapely.union_all(parts))
+
+
+def _straight_ring(corners: Array) -> Array:
+    """(k, 2) corners of a ring around cells -> (j, 2) corners of one with straight walls, all in cells.
+
+    The middles of the cells' sides lie nearer to the wall than their corners do. Walls are found among them (Douglas and Peucker
+    1973) and fitted by least squares.
+    """
+    ring = shapely.segmentize(shapely.LinearRing(corners), 1.0)
+    middle = np.asarray(ring.coords)
+    middle = (middle[1:] + middle[:-1]) / 2
+    far = int(((middle - middle.mean(axis=0)) ** 2).sum(axis=1).argmax())  # begins at a corner of the room, not amid a wall
+    middle = np.roll(middle, -far, axis=0)
+    middle = np.concatenate([middle, middle[:1]])
+    number = {tuple(point): i for i, point in reversed(list(enumerate(middle.tolist())))}
+    kept = shapely.simplify(shapely.LineString(middle), STEP, preserve_topology=False).coords
+    cuts = [number[point] for point in kept[:-1]] + [len(middle) - 1]
+    walls = [middle[a : b + 1] for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+    long = [wall for wall in walls if len(wall) > 3] if len(walls) > 4 else walls
+    return _corners(long) if len(long) > 2 else corners
+
+
+def _corners(walls: list[Array]) -> Array:
+    """(j, 2) where walls, given by points (n, 2) along them, meet; two for walls side by side."""
+    lines = [_line(points) for points in walls]
+    corners: list[Array] = []
+    for k in range(len(walls)):
+        before, after = lines[k - 1], lines[k]
+        end, start = walls[k - 1][-1], walls[k][0]
+        met = _meet(before, after)
+        if met is not None and np.hypot(*(met - (end + start) / 2)) <= REACH:
+            corners.append(met)
+        else:
+            corners += [m + d * float((p - m) @ d) for (m, d), p in ((before, end), (after, start))]
+    return np.array(corners)
+
+
+def _line(points: Array) -> tuple[Array, Array]:
+    """A point and the direction of the line through most of the points (n, 2): niches of a cell, as at doors, do not turn it."""
+    points = points[2:-2] if len(points) > 8 else points  # cut across the corners
+    weight = np.ones(len(points))
+    for _ in range(5):
+        middle = weight @ points / weight.sum()
+        along = np.linalg.svd((points - middle) * np.sqrt(weight)[:, None], full_matrices=False)[2][0]
+        off = np.abs((points - middle) @ (-along[1], along[0]))
+        weight = 1 / np.maximum(off, 0.3)
+    return middle, along
+
+
+def _meet(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array | None:
+    """(2,) where two lines meet; None where they are too nearly parallel to say."""
+    cross = a[1][0] * b[1][1] - a[1][1] * b[1][0]
+    if abs(cross) < 0.2:
+        return None
+    apart = b[0] - a[0]
+    met: Array = a[0] + a[1] * (apart[0] * b[1][1] - apart[1] * b[1][0]) / cross
+    return met
+
+
+def _parts(shape: Any, least: float = 0.0) -> shapely.MultiPolygon:
+    """The polygons in any shape, counter-clockwise; those smaller than `least` only where there are no others."""
+    parts = [p for p in shapely.get_parts(shape) if p.geom_type == "Polygon" and p.area > 0]
+    large = [p for p in parts if p.area >= least] or parts
+    return shapely.MultiPolygon([shapely.geometry.polygon.orient(p) for p in large])

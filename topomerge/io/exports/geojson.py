@@ -1,0 +1,171 @@
+"""Floors as polygons and doors as lines: GeoJSON (RFC 7946), for QGIS, web maps and shapely.
+
+With an origin, coordinates are longitude and latitude of WGS84. Without one they are metres in the frame of the map; `crs` is null
+then, which tells readers of the older GeoJSON that there are no degrees, and the member `topomerge` says so in words.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+from topomerge.io.exports.floors import floor_polygons, is_flight, jambs, room_levels
+from topomerge.types import Array, TopometricMap
+
+SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563  # m; the ellipsoid of WGS84
+ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
+FAR = 50e3  # m from the origin: beyond, a map stands in a grid of its country, not in a frame of its own
+DIGITS_M, DIGITS_DEGREES = 4, 9  # a tenth of a millimetre either way
+Place = Callable[[Array], list[list[float]]]  # (n, 3) points of the map -> positions
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where (0, 0) of the map's frame lies on the earth, and where its y axis points: degrees clockwise from north."""
+
+    latitude: float
+    longitude: float
+    heading: float = 0.0
+
+
+def parse_origin(text: str) -> Origin:
+    """The origin in "latitude,longitude" or "latitude,longitude,heading", in degrees.
+
+    Raises:
+        InputError: something else, or a place that is not on earth.
+    """
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
+        raise InputError(f"--origin {text}: is latitude,longitude or latitude,longitude,heading in degrees, as 52.52,13.37,0")
+    if abs(numbers[0]) > 89.9 or abs(numbers[1]) > 180:
+        raise InputError(f"--origin {text}: latitude is from -89.9 to 89.9 degrees, longitude from -180 to 180; latitude goes first")
+    return Origin(*numbers)
+
+
+def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: int | None = None) -> None:
+    """Write one FeatureCollection: a feature for each room, then for each door, opening and flight of stairs.
+
+    Args:
+        map: any map.
+        path: where.
+        origin: of the map's frame; None: coordinates stay metres.
+        storey: only what lies on this storey, or begins or ends there; None: all.
+
+    Raises:
+        InputError: the path can't be written, there is no such storey, or the map is too far from its own origin for `origin`.
+    """
+    if storey is not None and not 0 <= storey < len(map.storeys):
+        there = f"0 to {len(map.storeys) - 1}" if len(map.storeys) else "none"
+        raise InputError(f"--storey {storey}: the map has no such storey ({there})")
+    if origin is not None:
+        _check_near(map)
+    place = _metres if origin is None else _on_earth(origin)
+    features = [*_rooms(map, place, storey), *_doors(map, place, storey)]
+    listing: dict[str, Any] = {"type": "FeatureCollection"}
+    if origin is None:
+        listing |= {"crs": None, "topomerge": _about(map, "metres in the frame of the map, z up; not longitude and latitude")}
+    else:
+        listing["topomerge"] = _about(map, "WGS84 longitude and latitude in degrees; third number: metres in the frame of the map")
+        listing["topomerge"]["origin"] = vars(origin)
+    with replacing(path) as beside:
+        beside.write_text(_text(listing, features), encoding="utf-8", errors="replace")
+
+
+def _about(map: TopometricMap, coordinates: str) -> dict[str, Any]:
+    return {"coordinates": coordinates, "source": map.source, "voxel_size": float(map.grid.edge)}
+
+
+def _text(listing: dict[str, Any], features: list[dict[str, Any]]) -> str:
+    """A line for each feature, so that files can be compared."""
+    head = json.dumps(listing, ensure_ascii=False, allow_nan=False)[:-1]
+    lines = ",\n".join(json.dumps(f, ensure_ascii=False, allow_nan=False) for f in features)
+    return f'{head}, "features": [\n{lines}\n]}}\n'
+
+
+def _rooms(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    levels, seen = room_levels(map)
+    for r, (room, floor) in enumerate(zip(map.rooms, floor_polygons(map), strict=True)):
+        if storey not in (None, int(room["storey"])):
+            continue
+        properties = {"kind": "room", "room": r, "storey": int(room["storey"]), "area": round(float(room["area"]), 3)}
+        properties["height"] = round(float(room["height"]), 3) if seen[r] else None
+        properties |= {"floor": round(float(levels[r, 0]), 3), "completeness": round(float(room["completeness"]), 3)}
+        properties["glimpsed"] = bool(room["glimpsed"])
+        yield _feature(f"room {r}", _polygons(floor, float(levels[r, 0]), place), properties)
+
+
+def _doors(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    for i, edge in enumerate(map.edges):
+        ends = edge["rooms"].tolist()
+        storeys = sorted({int(s) for s in map.rooms["storey"][ends]})
+        if storey is not None and storey not in storeys:
+            continue
+        line = np.stack([edge["lower"], edge["upper"]]) if is_flight(edge) else jambs(edge)
+        properties = {"kind": str(edge["kind"]), "rooms": ends, "storey": storeys[0], "storeys": storeys}
+        properties |= {name: round(float(edge[name]), 3) for name in ("width", "confidence")}
+        properties |= {"height": round(float(edge["height"]), 3) or None, "open": bool(edge["open"])}
+        yield _feature(f"edge {i}", {"type": "LineString", "coordinates": place(line)}, properties)
+
+
+def _feature(name: str, geometry: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "id": name, "geometry": geometry, "properties": properties}
+
+
+def _polygons(floor: shapely.MultiPolygon, z: float, place: Place) -> dict[str, Any] | None:
+    """The geometry of a floor; null, as RFC 7946 has it, where there is none."""
+    parts = [
+        [place(np.column_stack([ring.coords, np.full(len(ring.coords), z)])) for ring in (part.exterior, *part.interiors)]
+        for part in floor.geoms
+    ]
+    if not parts:
+        return None
+    return {"type": "Polygon", "coordinates": parts[0]} if len(parts) == 1 else {"type": "MultiPolygon", "coordinates": parts}
+
+
+def _metres(points: Array) -> list[list[float]]:
+    rounded: list[list[float]] = np.round(np.asarray(points, np.float64), DIGITS_M).tolist()
+    return rounded
+
+
+def _check_near(map: TopometricMap) -> None:
+    corners = np.abs(np.concatenate([map.rooms["lo"][:, :2], map.rooms["hi"][:, :2]])).max(initial=0.0)
+    if corners > FAR:
+        far = f"{corners / 1000:.0f} km from (0, 0) of its frame, as in a national grid"
+        raise InputError(f"--origin: the map lies {far}; leave --origin out and name that grid in your GIS")
+
+
+def _on_earth(origin: Origin) -> Place:
+    """Positions (longitude, latitude, height above (0, 0, 0)) of points: from the plane that touches the ellipsoid at the origin."""
+    lat, lon, heading = (math.radians(v) for v in (origin.latitude, origin.longitude, origin.heading))
+    up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
+    east = np.array([-math.sin(lon), math.cos(lon), 0.0])
+    north = np.cross(up, east)
+    normal = SEMI_MAJOR / math.sqrt(1 - ECCENTRICITY2 * math.sin(lat) ** 2)
+    start = normal * up * (1, 1, 1 - ECCENTRICITY2)
+    right, ahead = math.cos(heading) * east - math.sin(heading) * north, math.sin(heading) * east + math.cos(heading) * north
+
+    def place(points: Array) -> list[list[float]]:
+        points = np.asarray(points, np.float64)
+        x, y, z = (start + points[:, :1] * right + points[:, 1:2] * ahead).T
+        across = np.hypot(x, y)
+        reduced = np.arctan2(z, across * (1 - FLATTENING))  # Bowring 1976: exact to nanometres this near the ellipsoid
+        latitude = np.arctan2(
+            z + ECCENTRICITY2 / (1 - ECCENTRICITY2) * SEMI_MAJOR * (1 - FLATTENING) * np.sin(reduced) ** 3,
+            across - ECCENTRICITY2 * SEMI_MAJOR * np.cos(reduced) ** 3,
+        )
+        degrees = np.round(np.degrees([np.arctan2(y, x), latitude]), DIGITS_DEGREES)
+        return [[*position, round(float(h), 3)] for position, h in zip(degrees.T.tolist(), points[:, 2], strict=True)]
+
+    return place

@@ -1,0 +1,97 @@
+"""The graph of storeys, rooms and areas as GraphML, for networkx, igraph, Gephi, yEd and Neo4j.
+
+Nodes `s0`, `r0`, `a0` are storeys, rooms and areas; `kind` tells which. Edges between rooms are doors, openings, stairs and ramps;
+between areas narrowings; and `contains` leads from a storey to its rooms and from a room to its areas.
+Source: http://graphml.graphdrawing.org/specification.html (schema 1.1).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as xml
+
+from topomerge.io.exports.markup import text, write_xml
+from topomerge.types import TopometricMap
+
+SPACE = "http://graphml.graphdrawing.org/xmlns"
+Item = tuple[tuple[str, ...], dict[str, Any]]  # the id of a node or the two of an edge, attributes
+TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
+
+
+def save(map: TopometricMap, path: Path) -> None:
+    """Write one undirected graph; two doors between the same rooms are two edges.
+
+    Raises:
+        InputError: the path can't be written.
+    """
+    root = xml.Element("graphml", xmlns=SPACE)
+    nodes, edges = list(_nodes(map)), list(_edges(map))
+    keys = {
+        where: {name: _type([a[name] for _, a in items if name in a]) for name in sorted({n for _, a in items for n in a})}
+        for where, items in (("node", nodes), ("edge", edges))
+    }
+    about = {"source": text(map.source), "voxel_size": float(map.grid.edge), "unit": "m"}
+    keys["graph"] = {name: _type([value]) for name, value in about.items()}
+    for where, names in keys.items():
+        for name, kind in names.items():
+            xml.SubElement(root, "key", {"id": f"{where}_{name}", "for": where, "attr.name": name, "attr.type": kind})
+    graph = xml.SubElement(root, "graph", id="map", edgedefault="undirected")
+    _data(graph, "graph", about)
+    for (name,), values in nodes:
+        _data(xml.SubElement(graph, "node", id=name), "node", values)
+    for number, (ends, values) in enumerate(edges):
+        _data(xml.SubElement(graph, "edge", id=f"e{number}", source=ends[0], target=ends[1]), "edge", values)
+    write_xml(root, path)
+
+
+def _type(values: list[Any]) -> str:
+    return TYPES[type(values[0])]
+
+
+def _data(parent: Any, where: str, values: dict[str, Any]) -> None:
+    for name, value in values.items():
+        said = str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, float) else str(value)
+        xml.SubElement(parent, "data", key=f"{where}_{name}").text = said
+
+
+def _values(row: Any, *left_out: str) -> dict[str, Any]:
+    """The columns of a table's row; points as three numbers, what is not known (nan) left out."""
+    found: dict[str, Any] = {}
+    for name in row.dtype.names:
+        value = row[name].tolist()
+        if name in left_out:
+            continue
+        if isinstance(value, list):
+            found |= {f"{name}_{axis}": number for axis, number in zip("xyz", value, strict=True)}
+        elif not (isinstance(value, float) and math.isnan(value)):
+            found[name] = value
+    return found
+
+
+def _place(values: dict[str, Any], name: str) -> dict[str, Any]:
+    """The point `name_x` … as x, y and z, which programs take as a position."""
+    return {key.removeprefix(f"{name}_"): value for key, value in values.items()}
+
+
+def _nodes(map: TopometricMap) -> Iterator[Item]:
+    for i, storey in enumerate(map.storeys):
+        yield (f"s{i}",), {"kind": "storey", "label": f"storey {i}", **_values(storey)}
+    for i, room in enumerate(map.rooms):
+        yield (f"r{i}",), {"kind": "room", "label": f"room {i}", **_place(_values(room), "centroid")}
+    for i, area in enumerate(map.areas):
+        yield (f"a{i}",), {"kind": "area", "label": f"area {i}", **_place(_values(area), "centroid")}
+
+
+def _edges(map: TopometricMap) -> Iterator[Item]:
+    for table, letter, named in ((map.edges, "r", ""), (map.narrows, "a", "narrow")):
+        for edge in table:
+            a, b = edge["rooms"].tolist()
+            values = _place(_values(edge, "rooms", "kind"), "centre")
+            yield (f"{letter}{a}", f"{letter}{b}"), {"kind": named or str(edge["kind"]), **values}
+    for i, room in enumerate(map.rooms):
+        yield (f"s{room['storey']}", f"r{i}"), {"kind": "contains"}
+    for i, area in enumerate(map.areas):
+        yield (f"r{area['room']}", f"a{i}"), {"kind": "contains"}

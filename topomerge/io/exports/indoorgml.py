@@ -1,0 +1,168 @@
+"""IndoorGML 1.0.3, core module: rooms as cells, doors as their boundaries, and the graph of how one walks between them.
+
+Each room is a CellSpace, whose solid is its floor drawn up to its ceiling, and a State; each door or opening a CellSpaceBoundary and a
+Transition; each flight of stairs or ramp a Transition. Source: OGC 19-011r4 and its schema indoorgmlcore.xsd.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as xml
+
+import numpy as np
+import shapely
+
+from topomerge.io.exports.floors import floor_polygons, inside, is_flight, jambs, room_levels
+from topomerge.io.exports.markup import text, write_xml
+from topomerge.types import Array, TopometricMap
+
+CORE, GML = "http://www.opengis.net/indoorgml/1.0/core", "http://www.opengis.net/gml/3.2"
+LINK, SCHEMA = "http://www.w3.org/1999/xlink", "http://www.w3.org/2001/XMLSchema-instance"
+XSD = "http://schemas.opengis.net/indoorgml/1.0/indoorgmlcore.xsd"
+LINTEL = 2.0  # m: of a door over which nothing was seen
+
+
+def save(map: TopometricMap, path: Path) -> None:
+    """Write one document, in metres in the input's frame.
+
+    A room in several pieces has the solid of the largest, because a solid is of one piece.
+
+    Raises:
+        InputError: the path can't be written.
+    """
+    for prefix, space in (("core", CORE), ("gml", GML), ("xlink", LINK), ("xsi", SCHEMA)):
+        xml.register_namespace(prefix, space)
+    floors, (levels, _) = floor_polygons(map), room_levels(map)
+    root = xml.Element(_core("IndoorFeatures"), {_gml("id"): "topomerge", f"{{{SCHEMA}}}schemaLocation": f"{CORE} {XSD}"})
+    _head(root, map.source or "map")
+    _bounds(root, map)
+    place = _new(_new(root, "primalSpaceFeatures"), "PrimalSpaceFeatures", "PS")
+    for r, floor in enumerate(floors):
+        _cell(_new(place, "cellSpaceMember"), map, r, floor, levels[r])
+    for i, edge in enumerate(map.edges):
+        if not is_flight(edge):
+            _boundary(_new(place, "cellSpaceBoundaryMember"), i, edge)
+    if len(map.rooms):  # a layer without states is none
+        points = [np.append(inside(f, room["centroid"]), low) for f, room, (low, _) in zip(floors, map.rooms, levels, strict=True)]
+        _graph(root, map, points)
+    write_xml(root, path)
+
+
+def _core(name: str) -> str:
+    return f"{{{CORE}}}{name}"
+
+
+def _gml(name: str) -> str:
+    return f"{{{GML}}}{name}"
+
+
+def _new(parent: Any, name: str, id: str = "", space: str = CORE) -> Any:
+    return xml.SubElement(parent, f"{{{space}}}{name}", {_gml("id"): id} if id else {})
+
+
+def _link(parent: Any, name: str, id: str) -> None:
+    xml.SubElement(parent, _core(name), {f"{{{LINK}}}href": f"#{id}"})
+
+
+def _head(parent: Any, name: str, **facts: Any) -> None:
+    """Description and name. Viewers read the first as key="value" pairs."""
+    if facts:
+        _new(parent, "description", space=GML).text = ":".join(f'{key}="{value}"' for key, value in facts.items())
+    _new(parent, "name", space=GML).text = text(name)
+
+
+def _bounds(root: Any, map: TopometricMap) -> None:
+    if len(map.rooms):
+        envelope = _new(_new(root, "boundedBy", space=GML), "Envelope", space=GML)
+        envelope.set("srsDimension", "3")
+        for name, corner in (("lowerCorner", map.rooms["lo"].min(axis=0)), ("upperCorner", map.rooms["hi"].max(axis=0))):
+            _new(envelope, name, space=GML).text = _numbers(corner)
+
+
+def _numbers(point: Any) -> str:
+    return " ".join(f"{value:.4f}" for value in np.asarray(point).tolist())
+
+
+def _cell(member: Any, map: TopometricMap, r: int, floor: shapely.MultiPolygon, level: Array) -> None:
+    room = map.rooms[r]
+    cell = _new(member, "CellSpace", f"C{r}")
+    facts = {"storey": int(room["storey"]), "area": f"{room['area']:.2f}", "height": f"{room['height']:.2f}"}
+    _head(cell, f"room {r}", **facts)
+    if not floor.is_empty:
+        shape = _new(_new(cell, "cellSpaceGeometry"), "Geometry3D")
+        shell = _new(_new(_new(shape, "Solid", f"C{r}-solid", GML), "exterior", space=GML), "Shell", space=GML)
+        for k, faces in enumerate(_faces(max(floor.geoms, key=lambda part: part.area), *level.tolist())):
+            _polygon(_new(shell, "surfaceMember", space=GML), f"C{r}-face{k}", faces)
+    _link(cell, "duality", f"S{r}")
+    for i in np.flatnonzero((map.edges["rooms"] == r).any(axis=1)):
+        if not is_flight(map.edges[i]):
+            _link(cell, "partialboundedBy", f"B{i}")
+
+
+def _faces(floor: shapely.Polygon, low: float, high: float) -> Iterator[list[Array]]:
+    """The faces of a prism, each a list of closed rings (k, 3), seen counter-clockwise from outside."""
+    rings = [np.asarray(ring.coords)[:, :2] for ring in (floor.exterior, *floor.interiors)]  # the inner ones run clockwise
+    yield [_at(ring[::-1], low) for ring in rings]
+    yield [_at(ring, high) for ring in rings]
+    for ring in rings:
+        for a, b in zip(ring[:-1], ring[1:], strict=True):
+            yield [np.array([(*a, low), (*b, low), (*b, high), (*a, high), (*a, low)])]
+
+
+def _at(ring: Array, z: float) -> Array:
+    return np.column_stack([ring, np.full(len(ring), z)])
+
+
+def _polygon(parent: Any, id: str, rings: list[Array]) -> None:
+    polygon = _new(parent, "Polygon", id, GML)
+    for k, ring in enumerate(rings):
+        line = _new(_new(polygon, "interior" if k else "exterior", space=GML), "LinearRing", space=GML)
+        for point in ring:
+            _new(line, "pos", space=GML).text = _numbers(point)
+
+
+def _boundary(member: Any, i: int, edge: Any) -> None:
+    boundary = _new(member, "CellSpaceBoundary", f"B{i}")
+    _head(boundary, f"{edge['kind']} {i}", kind=str(edge["kind"]), width=f"{edge['width']:.2f}", open=str(bool(edge["open"])).lower())
+    _link(boundary, "duality", f"T{i}")
+    a, b = jambs(edge)
+    up = np.array([0.0, 0.0, float(edge["height"]) or LINTEL])
+    shape = _new(_new(boundary, "cellSpaceBoundaryGeometry"), "geometry3D")
+    _polygon(shape, f"B{i}-face", [np.array([a, b, b + up, a + up, a])])
+
+
+def _graph(root: Any, map: TopometricMap, points: list[Array]) -> None:
+    graph = _new(_new(root, "multiLayeredGraph"), "MultiLayeredGraph", "MG")
+    layer = _new(_new(_new(graph, "spaceLayers", "SL"), "spaceLayerMember"), "SpaceLayer", "L0")
+    _head(layer, "rooms")
+    nodes = _new(layer, "nodes", "N")
+    for r, point in enumerate(points):
+        state = _new(_new(nodes, "stateMember"), "State", f"S{r}")
+        _head(state, f"room {r}")
+        _link(state, "duality", f"C{r}")
+        for i in np.flatnonzero((map.edges["rooms"] == r).any(axis=1)):
+            _link(state, "connects", f"T{i}")
+        _new(_new(_new(state, "geometry"), "Point", f"S{r}-point", GML), "pos", space=GML).text = _numbers(point)
+    if len(map.edges):
+        edges = _new(layer, "edges", "E")
+        for i, edge in enumerate(map.edges):
+            _transition(_new(edges, "transitionMember"), i, edge, points)
+
+
+def _transition(member: Any, i: int, edge: Any, points: list[Array]) -> None:
+    """The way from room to room through the middle of a door or along a flight; its weight is its length, m."""
+    a, b = edge["rooms"].tolist()
+    flight = [edge["lower"], edge["upper"]] if points[a][2] <= points[b][2] else [edge["upper"], edge["lower"]]
+    way = np.array([points[a], *(flight if is_flight(edge) else [edge["centre"]]), points[b]])
+    transition = _new(member, "Transition", f"T{i}")
+    _head(transition, f"{edge['kind']} {i}")
+    _new(transition, "weight").text = f"{np.linalg.norm(np.diff(way, axis=0), axis=1).sum():.4f}"
+    for r in (a, b):
+        _link(transition, "connects", f"S{r}")
+    if not is_flight(edge):
+        _link(transition, "duality", f"B{i}")
+    line = _new(_new(transition, "geometry"), "LineString", f"T{i}-line", GML)
+    for point in way:
+        _new(line, "pos", space=GML).text = _numbers(point)

@@ -1,0 +1,28 @@
+"""XML that is whole, the same every time, and safe from odd file names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as xml
+
+from topomerge.io.atomic import replacing
+
+FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def text(value: str) -> str:
+    """A text without the characters that XML cannot hold."""
+    return FORBIDDEN.sub("\ufffd", value)
+
+
+def write_xml(root: Any, path: Path) -> None:
+    """Write a document, indented, in UTF-8.
+
+    Raises:
+        InputError: the path can't be written.
+    """
+    xml.indent(root)
+    with replacing(path) as beside:
+        xml.ElementTree(root).write(beside, encoding="UTF-8", xml_declaration=True)

@@ -1,0 +1,85 @@
+"""For robots: a map_server grid of each storey (image and yaml) and a route graph for Nav2.
+
+In the image 254 is free, 0 occupied and 205 unknown. Sources: http://wiki.ros.org/map_server; the graphs that nav2_route's
+GeoJsonGraphFileLoader reads.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+from topomerge.io.exports.occupancy import Occupancy, storey_occupancy
+from topomerge.io.exports.route import Route, storey_route
+from topomerge.types import TopometricMap
+
+FREE, OCCUPIED, UNKNOWN = 254, 0, 205
+
+
+def files(map: TopometricMap, folder: Path, stem: str, storey: int | None = None) -> list[tuple[Path, partial[None]]]:
+    """What stands in the folder: for each storey `storey_0.pgm` and `.yaml`, and `storey_0_route.geojson` where there are routes.
+
+    Numbers of nodes and edges are unique over all storeys. Where stairs begin or end, a node says in its metadata which node of
+    which storey they lead to.
+
+    Raises:
+        InputError: there is no such storey, or none at all.
+    """
+    count = len(map.storeys)
+    if storey is not None and not 0 <= storey < count:
+        raise InputError(f"--storey {storey}: the map has no such storey (it has {count})")
+    if not count:
+        raise InputError("the map has no storeys, so that there is nothing to draw for a robot; extract it from a denser cloud")
+    found: list[tuple[Path, partial[None]]] = []
+    first = 0
+    for s in range(count):
+        grid = storey_occupancy(map, s)
+        route, first = storey_route(map, grid, s, first)
+        if storey not in (None, s):
+            continue
+        name = f"{stem}storey_{s}"
+        found.append((folder / f"{name}.pgm", partial(_save_image, grid)))
+        found.append((folder / f"{name}.yaml", partial(_save_yaml, grid, f"{name}.pgm")))
+        if route.edges:
+            found.append((folder / f"{name}_route.geojson", partial(_save_route, route, name)))
+    return found
+
+
+def _save_image(grid: Occupancy, path: Path) -> None:
+    image = np.full(grid.free.shape, UNKNOWN, np.uint8)
+    image[grid.free] = FREE
+    image[grid.occupied] = OCCUPIED
+    image = np.ascontiguousarray(image.T[::-1])  # rows from the top, y up
+    height, width = image.shape
+    with replacing(path) as beside, beside.open("wb") as file:
+        file.write(f"P5\n# topomerge: {grid.size:g} m a pixel\n{width} {height}\n255\n".encode("ascii"))
+        file.write(image.tobytes())
+
+
+def _save_yaml(grid: Occupancy, image: str, path: Path) -> None:
+    x, y = grid.low.tolist()
+    lines = [f"image: {json.dumps(image)}", "mode: trinary", f"resolution: {grid.size!r}", f"origin: [{x!r}, {y!r}, 0.0]"]
+    lines += ["negate: 0", "occupied_thresh: 0.65", "free_thresh: 0.196"]
+    with replacing(path) as beside:
+        beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _save_route(route: Route, name: str, path: Path) -> None:
+    place = {node.id: [round(v, 4) for v in node.point] for node in route.nodes}
+    features = []
+    for node in route.nodes:
+        properties = {"id": node.id, "frame": "map", "metadata": node.metadata}
+        features.append({"type": "Feature", "properties": properties, "geometry": {"type": "Point", "coordinates": place[node.id]}})
+    for edge in route.edges:
+        line = {"type": "MultiLineString", "coordinates": [[place[edge.start], place[edge.end]]]}
+        properties = {"id": edge.id, "startid": edge.start, "endid": edge.end, "cost": round(edge.length, 4), "overridable": True}
+        features.append({"type": "Feature", "properties": properties, "geometry": line})
+    head = json.dumps({"type": "FeatureCollection", "name": name, "crs": None})[:-1]
+    lines = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
+    with replacing(path) as beside:
+        beside.write_text(f'{head}, "features": [\n{lines}\n]}}\n', encoding="utf-8")
