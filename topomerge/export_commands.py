@@ -77,7 +77,7 @@ def _map_file(given: str) -> Path:
 
 
 def _place(args: argparse.Namespace, names: list[str], source: Path) -> tuple[Path, bool]:
-    """Where to write: a file, the folder of a single format of several files, or (True) a folder with the stem of the names in it."""
+    """Where to write: a file, or (True) a folder with the stem of the names in it."""
     from topomerge.io.exports import FORMATS
 
     several = len(names) > 1 or FORMATS[names[0]].folder
@@ -104,21 +104,25 @@ def _make_folders(folder: Path) -> list[Path]:
 
 def view_command(args: argparse.Namespace) -> int:
     """`topomerge view`: a report in the browser."""
-    with tempfile.TemporaryDirectory(prefix="topomerge-") if args.serve is not None else suppress() as scratch:
-        page = _page(args, scratch)
-        if args.serve is not None:
-            from topomerge.viz.serve import serve
-
-            serve(page, args.serve, _show if args.open else print)
-            return 0
+    if args.serve is None:
+        page = _page(args)
         if args.open:
             _show(page.resolve().as_uri(), str(page))
         else:
             print(page)
+        return 0
+    from topomerge.viz.serve import serve
+
+    with tempfile.TemporaryDirectory(prefix="topomerge-") as scratch:
+        serve(_page(args, scratch), args.serve, _show if args.open else _tell)
     return 0
 
 
-def _page(args: argparse.Namespace, scratch: str | None) -> Path:
+def _tell(address: str) -> None:
+    print(address, flush=True)
+
+
+def _page(args: argparse.Namespace, scratch: str | None = None) -> Path:
     """The report to show; that of a map is made first."""
     path = Path(args.input)
     if path.is_dir():
@@ -126,7 +130,7 @@ def _page(args: argparse.Namespace, scratch: str | None) -> Path:
         if page.is_file() and args.output is None:
             return page
         if not (path / "map.tmap").is_file():
-            raise InputError(f"{path}: holds neither report.html nor map.tmap; give a folder of `topomerge merge`, a .tmap or an .html")
+            raise InputError(f"{path}: holds neither report.html nor map.tmap; give the folder of a merge, a .tmap or an .html")
         path = path / "map.tmap"
     elif not path.exists():
         raise InputError(f"{path}: no such file")
@@ -135,8 +139,11 @@ def _page(args: argparse.Namespace, scratch: str | None) -> Path:
             raise InputError(f"{args.output}: -o is for the report of a .tmap, and {path} is a page already; leave it out")
         return path
     if path.suffix.lower() != ".tmap":
-        raise InputError(f"{path}: can't be shown; give a .tmap, the folder of a merge or an .html; a cloud goes through `topomerge extract`")
-    place = Path(args.output) if args.output is not None else Path(scratch or tempfile.mkdtemp(prefix="topomerge-")) / f"{path.stem}.html"
+        raise InputError(f"{path}: can't be shown; give a .tmap (of `topomerge extract`), the folder of a merge or an .html")
+    if args.output is not None:
+        place = Path(args.output)
+    else:  # a browser reads it after this program has ended: only what is served is deleted
+        place = Path(scratch or tempfile.mkdtemp(prefix="topomerge-")) / f"{path.stem}.html"
     check_outputs([place], [path])
     from topomerge.io.maps import load_map
     from topomerge.viz.report import save_report
@@ -149,7 +156,7 @@ def _show(address: str, name: str = "") -> None:
     """Open an address in the browser, and say where it is for those who have none."""
     import webbrowser
 
-    print(name or address, flush=True)
+    _tell(name or address)
     try:
         opened = webbrowser.open(address)
     except (webbrowser.Error, OSError):
@@ -186,7 +193,11 @@ EXPORT = Command(
             default=None,
             help="file, or folder for several formats and for ros (default: beside the map, named after it)",
         ),
-        option("--origin", metavar="LAT,LON[,HEADING]", help="geojson: degrees; (0, 0) of the map, and its y axis clockwise from north"),
+        option(
+            "--origin",
+            metavar="LAT,LON[,HEADING]",
+            help="geojson: where (0, 0) of the map lies, and how far its y axis is turned clockwise from north, degrees",
+        ),
         option("--storey", type=count, metavar="N", help="geojson, ros: only this storey"),
         option("-q", "--quiet", action="store_true", default=False, help="print nothing"),
     ),

@@ -57,7 +57,8 @@ def serve(page: Path, port: int, tell: Callable[[str], object]) -> None:
     try:
         server = ThreadingHTTPServer((HOME, port), handler)
     except OSError as error:
-        raise InputError(f"--serve {port}: the port can't be used ({error.strerror or error}); leave it out for a free one") from error
+        reason = error.strerror or str(error)
+        raise InputError(f"--serve {port}: the port can't be used ({reason}); leave it out for a free one") from error
     with server:
         tell(f"http://{HOME}:{server.server_port}/{quote(page.name)}")
         try:

@@ -7,6 +7,7 @@ fitted to it, so that a room that stands askew has straight walls, too.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ def floor_polygons(map: TopometricMap) -> list[shapely.MultiPolygon]:
     Navigable cells end short of the walls. All outlines are moved outwards by the distance at which their areas are those in the
     table of rooms, in the median. A room without navigable cells has its bounding box; it is empty where that is flat.
     """
-    edge, origin = map.navigable.edge, map.navigable.origin[:2]
+    edge, origin, storey = map.navigable.edge, map.navigable.origin[:2], map.rooms["storey"]
     plans = [_plan(map.navigable.cells[rows, :2], edge) for rows in _by_room(map.navigable_room, len(map.rooms))]
     cells = [None if plan is None else _straight(_polygon(plan.cells, plan.low)) for plan in plans]
     growth = _growth(map, plans, cells)
@@ -41,8 +42,8 @@ def floor_polygons(map: TopometricMap) -> list[shapely.MultiPolygon]:
         else:
             grown = shape.buffer(growth / edge, join_style="mitre", mitre_limit=1.5)
             floor = shapely.affinity.affine_transform(grown, [edge, 0, 0, edge, *origin])
-        beside = [f for s, f in zip(map.rooms["storey"], found, strict=False) if s == map.rooms["storey"][r] and f.intersects(floor)]
-        found.append(_parts(floor.difference(shapely.union_all(beside)) if beside else floor, SPECK))
+        taken = [f for s, f in zip(storey, found, strict=False) if s == storey[r] and f.intersects(floor)]
+        found.append(_parts(floor.difference(shapely.union_all(taken)) if taken else floor, SPECK))
     return found
 
 
@@ -178,7 +179,7 @@ def _straight_ring(corners: Array) -> Array:
     number = {tuple(point): i for i, point in reversed(list(enumerate(middle.tolist())))}
     kept = shapely.simplify(shapely.LineString(middle), STEP, preserve_topology=False).coords
     cuts = [number[point] for point in kept[:-1]] + [len(middle) - 1]
-    walls = [middle[a : b + 1] for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+    walls = [middle[a : b + 1] for a, b in pairwise(cuts)]
     long = [wall for wall in walls if len(wall) > 3] if len(walls) > 4 else walls
     return _corners(long) if len(long) > 2 else corners
 

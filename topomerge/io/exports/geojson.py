@@ -1,7 +1,7 @@
 """Floors as polygons and doors as lines: GeoJSON (RFC 7946), for QGIS, web maps and shapely.
 
-With an origin, coordinates are longitude and latitude of WGS84. Without one they are metres in the frame of the map; `crs` is null
-then, which tells readers of the older GeoJSON that there are no degrees, and the member `topomerge` says so in words.
+With an origin, coordinates are longitude and latitude of WGS84. Without, they are metres in the frame of the map; then `crs` is
+null, which tells readers of the older GeoJSON that there are no degrees, and the member `topomerge` says so in words.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def parse_origin(text: str) -> Origin:
     if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
         raise InputError(f"--origin {text}: is latitude,longitude or latitude,longitude,heading in degrees, as 52.52,13.37,0")
     if abs(numbers[0]) > 89.9 or abs(numbers[1]) > 180:
-        raise InputError(f"--origin {text}: latitude is from -89.9 to 89.9 degrees, longitude from -180 to 180; latitude goes first")
+        raise InputError(f"--origin {text}: latitude is -89.9 to 89.9 degrees, longitude -180 to 180; latitude goes first")
     return Origin(*numbers)
 
 
@@ -77,7 +77,7 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
     if origin is None:
         listing |= {"crs": None, "topomerge": _about(map, "metres in the frame of the map, z up; not longitude and latitude")}
     else:
-        listing["topomerge"] = _about(map, "WGS84 longitude and latitude in degrees; third number: metres in the frame of the map")
+        listing["topomerge"] = _about(map, "WGS84 longitude and latitude in degrees; then metres in the frame of the map")
         listing["topomerge"]["origin"] = vars(origin)
     with replacing(path) as beside:
         beside.write_text(_text(listing, features), encoding="utf-8", errors="replace")
@@ -147,7 +147,7 @@ def _check_near(map: TopometricMap) -> None:
 
 
 def _on_earth(origin: Origin) -> Place:
-    """Positions (longitude, latitude, height above (0, 0, 0)) of points: from the plane that touches the ellipsoid at the origin."""
+    """Longitude and latitude of points in the plane that touches the ellipsoid at the origin; their z stays."""
     lat, lon, heading = (math.radians(v) for v in (origin.latitude, origin.longitude, origin.heading))
     up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
     east = np.array([-math.sin(lon), math.cos(lon), 0.0])

@@ -1,7 +1,7 @@
 """The graph of storeys, rooms and areas as GraphML, for networkx, igraph, Gephi, yEd and Neo4j.
 
-Nodes `s0`, `r0`, `a0` are storeys, rooms and areas; `kind` tells which. Edges between rooms are doors, openings, stairs and ramps;
-between areas narrowings; and `contains` leads from a storey to its rooms and from a room to its areas.
+Nodes `s0`, `r0`, `a0` are storeys, rooms and areas; `kind` tells which. Edges between rooms are doors, openings, stairs and
+ramps; between areas narrowings; and `contains` leads from a storey to its rooms and from a room to its areas.
 Source: http://graphml.graphdrawing.org/specification.html (schema 1.1).
 """
 

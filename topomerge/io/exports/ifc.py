@@ -1,8 +1,8 @@
 """A building model, IFC4: project, site, building, storeys, spaces, doors, stairs, and walls and floors as far as they were seen.
 
-Spaces, floors and walls are extruded polygons; a door is a box of its clear opening, an opening without a door an IfcVirtualElement,
-stairs and ramps an axis from their lower to their upper end. IfcRelSpaceBoundary says which spaces a door joins. The site is placed
-where the map lies, so that everything else has small coordinates. Source: ISO 16739-1, IFC4 ADD2 TC1.
+Spaces, floors and walls are extruded polygons; a door is a box of its clear opening, an opening without a door an
+IfcVirtualElement, stairs and ramps an axis from their lower to their upper end. IfcRelSpaceBoundary says which spaces a door
+joins. The site is placed where the map lies, so that all else has small coordinates. Source: ISO 16739-1, IFC4 ADD2 TC1.
 """
 
 from __future__ import annotations
@@ -81,8 +81,9 @@ class _Model:
         return self.new(kind, GlobalId=id, **({} if kind.startswith("IfcRel") else {"Name": name}), **values)
 
     def _context(self) -> None:
-        units = [("LENGTHUNIT", "METRE"), ("AREAUNIT", "SQUARE_METRE"), ("VOLUMEUNIT", "CUBIC_METRE"), ("PLANEANGLEUNIT", "RADIAN")]
-        self.units = self.new("IfcUnitAssignment", Units=[self.new("IfcSIUnit", UnitType=u, Name=n) for u, n in units])
+        units = {"LENGTHUNIT": "METRE", "AREAUNIT": "SQUARE_METRE", "VOLUMEUNIT": "CUBIC_METRE", "PLANEANGLEUNIT": "RADIAN"}
+        made = [self.new("IfcSIUnit", UnitType=unit, Name=name) for unit, name in units.items()]
+        self.units = self.new("IfcUnitAssignment", Units=made)
         world = self.new("IfcAxis2Placement3D", Location=self.point(0, 0, 0))
         whole = {"ContextType": "Model", "CoordinateSpaceDimension": 3, "Precision": 1e-5, "WorldCoordinateSystem": world}
         self.context = self.new("IfcGeometricRepresentationContext", **whole)
@@ -154,7 +155,8 @@ class _Model:
             holes = {"InnerCurves": inner} if inner else {}
             profile = self.new(kind, ProfileType="AREA", OuterCurve=outer, **holes)
             at = self.new("IfcAxis2Placement3D", Location=self.point(0, 0, low))
-            items.append(self.new("IfcExtrudedAreaSolid", SweptArea=profile, Position=at, ExtrudedDirection=up, Depth=float(height)))
+            swept = {"SweptArea": profile, "Position": at, "ExtrudedDirection": up, "Depth": float(height)}
+            items.append(self.new("IfcExtrudedAreaSolid", **swept))
         return self.shape("Body", "SweptSolid", items)
 
     def _ring(self, ring: Array) -> Any:
@@ -172,9 +174,11 @@ class _Model:
         room = self.map.rooms[r]
         storey = storeys[room["storey"]]
         low, high = (level - storey.Elevation).tolist()
-        values = {"CompositionType": "ELEMENT", "PredefinedType": "INTERNAL", "Representation": self.prisms(floor, low, high - low)}
-        at = self.place(storey.ObjectPlacement, 0, 0, 0)
-        space = self.root("IfcSpace", f"room {r}", ObjectPlacement=at, LongName=f"room {r}", **values)
+        body = {
+            "ObjectPlacement": self.place(storey.ObjectPlacement, 0, 0, 0),
+            "Representation": self.prisms(floor, low, high - low),
+        }
+        space = self.root("IfcSpace", f"room {r}", CompositionType="ELEMENT", PredefinedType="INTERNAL", **body)
         quantities = [self.new("IfcQuantityArea", Name="GrossFloorArea", AreaValue=float(room["area"]))]
         if seen:
             quantities.append(self.new("IfcQuantityLength", Name="Height", LengthValue=float(room["height"])))
@@ -211,9 +215,9 @@ class _Model:
         pieces = cell_polygons(plan.wall, plan.low, plan.size, LEAST_WALL)
         found = []
         for k, piece in enumerate(pieces.geoms):
-            body = self.prisms(shapely.MultiPolygon([piece]), 0.0, height)
+            body = {"Representation": self.prisms(shapely.MultiPolygon([piece]), 0.0, height), "PredefinedType": "NOTDEFINED"}
             at = self.place(storey.ObjectPlacement, 0, 0, 0)
-            found.append(self.root("IfcWall", f"wall {s}.{k}", ObjectPlacement=at, Representation=body, PredefinedType="NOTDEFINED"))
+            found.append(self.root("IfcWall", f"wall {s}.{k}", ObjectPlacement=at, **body))
         return found
 
     def door(self, i: int, edge: Any, storey: Any) -> Any:

@@ -1,12 +1,13 @@
 """IndoorGML 1.0.3, core module: rooms as cells, doors as their boundaries, and the graph of how one walks between them.
 
-Each room is a CellSpace, whose solid is its floor drawn up to its ceiling, and a State; each door or opening a CellSpaceBoundary and a
-Transition; each flight of stairs or ramp a Transition. Source: OGC 19-011r4 and its schema indoorgmlcore.xsd.
+Each room is a CellSpace, whose solid is its floor drawn up to its ceiling, and a State; each door or opening a CellSpaceBoundary
+and a Transition; each flight of stairs or ramp a Transition. Source: OGC 19-011r4 and its schema indoorgmlcore.xsd.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as xml
@@ -45,7 +46,8 @@ def save(map: TopometricMap, path: Path) -> None:
         if not is_flight(edge):
             _boundary(_new(place, "cellSpaceBoundaryMember"), i, edge)
     if len(map.rooms):  # a layer without states is none
-        points = [np.append(inside(f, room["centroid"]), low) for f, room, (low, _) in zip(floors, map.rooms, levels, strict=True)]
+        places = zip(floors, map.rooms["centroid"], levels[:, 0], strict=True)
+        points = [np.append(inside(floor, middle), low) for floor, middle, low in places]
         _graph(root, map, points)
     write_xml(root, path)
 
@@ -107,7 +109,7 @@ def _faces(floor: shapely.Polygon, low: float, high: float) -> Iterator[list[Arr
     yield [_at(ring[::-1], low) for ring in rings]
     yield [_at(ring, high) for ring in rings]
     for ring in rings:
-        for a, b in zip(ring[:-1], ring[1:], strict=True):
+        for a, b in pairwise(ring):
             yield [np.array([(*a, low), (*b, low), (*b, high), (*a, high), (*a, low)])]
 
 
@@ -125,7 +127,8 @@ def _polygon(parent: Any, id: str, rings: list[Array]) -> None:
 
 def _boundary(member: Any, i: int, edge: Any) -> None:
     boundary = _new(member, "CellSpaceBoundary", f"B{i}")
-    _head(boundary, f"{edge['kind']} {i}", kind=str(edge["kind"]), width=f"{edge['width']:.2f}", open=str(bool(edge["open"])).lower())
+    kind = str(edge["kind"])
+    _head(boundary, f"{kind} {i}", kind=kind, width=f"{edge['width']:.2f}", open=str(bool(edge["open"])).lower())
     _link(boundary, "duality", f"T{i}")
     a, b = jambs(edge)
     up = np.array([0.0, 0.0, float(edge["height"]) or LINTEL])
@@ -142,8 +145,8 @@ def _graph(root: Any, map: TopometricMap, points: list[Array]) -> None:
         state = _new(_new(nodes, "stateMember"), "State", f"S{r}")
         _head(state, f"room {r}")
         _link(state, "duality", f"C{r}")
-        for i in np.flatnonzero((map.edges["rooms"] == r).any(axis=1)):
-            _link(state, "connects", f"T{i}")
+        for t in np.flatnonzero((map.edges["rooms"] == r).any(axis=1)):
+            _link(state, "connects", f"T{t}")
         _new(_new(_new(state, "geometry"), "Point", f"S{r}-point", GML), "pos", space=GML).text = _numbers(point)
     if len(map.edges):
         edges = _new(layer, "edges", "E")

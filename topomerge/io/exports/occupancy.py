@@ -75,7 +75,7 @@ def _floor_rows(map: TopometricMap, storey: int) -> Array:
 
 
 def _cells_near(map: TopometricMap, rows: Array) -> Array:
-    """(n, 3) int64 occupied cells between the lowest piece of floor and a person's height over the highest, in the floor's lattice."""
+    """(n, 3) int64 occupied cells from the lowest floor to a person's height over the highest, in the floor's lattice."""
     if not len(rows):
         return np.empty((0, 3), np.int64)
     points, z = map.grid.centroids(), map.navigable.centroids()[rows, 2]
@@ -109,4 +109,5 @@ def _steep(level: Array, walked: Array, edge: float) -> Array:
     wide = 2 * max(round(STEEP[0] / edge) // 2, 1) + 1
     level = ndimage.median_filter(level, 3)  # a cell too high is noise
     rise = ndimage.maximum_filter(level, wide) - ndimage.minimum_filter(level, wide)
-    return np.asarray(rise * edge >= STEEP[1] - 1e-6)
+    steep = np.pad(rise * edge >= STEEP[1] - 1e-6, wide)
+    return np.asarray(ndimage.binary_closing(steep, np.ones((wide, wide)))[wide:-wide, wide:-wide])  # treads, too

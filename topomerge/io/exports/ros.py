@@ -24,8 +24,8 @@ FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 def files(map: TopometricMap, folder: Path, stem: str, storey: int | None = None) -> list[tuple[Path, partial[None]]]:
     """What stands in the folder: for each storey `storey_0.pgm` and `.yaml`, and `storey_0_route.geojson` where there are routes.
 
-    Numbers of nodes and edges are unique over all storeys. Where stairs begin or end, a node says in its metadata which node of
-    which storey they lead to.
+    Numbers of nodes and edges are unique over all storeys. Where stairs begin or end, a node says in its metadata to which room of
+    which storey they lead.
 
     Raises:
         InputError: there is no such storey, or none at all.
@@ -62,7 +62,7 @@ def _save_image(grid: Occupancy, path: Path) -> None:
 
 
 def _save_yaml(grid: Occupancy, image: str, path: Path) -> None:
-    x, y = grid.low.tolist()
+    x, y = float(grid.low[0]), float(grid.low[1])
     lines = [f"image: {json.dumps(image)}", "mode: trinary", f"resolution: {grid.size!r}", f"origin: [{x!r}, {y!r}, 0.0]"]
     lines += ["negate: 0", "occupied_thresh: 0.65", "free_thresh: 0.196"]
     with replacing(path) as beside:
@@ -74,7 +74,8 @@ def _save_route(route: Route, name: str, path: Path) -> None:
     features = []
     for node in route.nodes:
         properties = {"id": node.id, "frame": "map", "metadata": node.metadata}
-        features.append({"type": "Feature", "properties": properties, "geometry": {"type": "Point", "coordinates": place[node.id]}})
+        point = {"type": "Point", "coordinates": place[node.id]}
+        features.append({"type": "Feature", "properties": properties, "geometry": point})
     for edge in route.edges:
         line = {"type": "MultiLineString", "coordinates": [[place[edge.start], place[edge.end]]]}
         properties = {"id": edge.id, "startid": edge.start, "endid": edge.end, "cost": round(edge.length, 4), "overridable": True}

@@ -1,12 +1,13 @@
 """Routes of a robot through a storey: from the middle of each room to its doors and stairs, away from walls.
 
-In each room, shortest ways (Dijkstra 1959) from its middle to all its doors make a tree; where a pixel is dearer the nearer a wall is,
-the ways run along the middle and join. Between forks they are made straight where nothing is in between.
+In each room, shortest ways (Dijkstra 1959) from its middle to all its doors make a tree. Pixels are dearer the nearer a wall is,
+so that the ways keep to the middle and join. Between forks they are made straight where nothing is in between.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ NEAR = 0.6  # m around the middle of a door through which its ways may lead
 FAR = 2.0  # m: the end of a flight of stairs is looked for this far
 AWAY = 0.5  # m from walls at which ways are not dearer for being near
 Point = tuple[float, float]
+Pixel = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Route:
 
     first: int = 0
     nodes: list[Node] = field(default_factory=list)
-    ways: list[tuple[int, int]] = field(default_factory=list)
+    ways: list[Pixel] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
 
     def add(self, point: Any, **metadata: Any) -> int:
@@ -80,19 +82,22 @@ def storey_route(map: TopometricMap, grid: Occupancy, storey: int, first: int = 
 def _add_room(route: Route, map: TopometricMap, grid: Occupancy, clear: Array, r: int, doors: dict[int, int]) -> None:
     """The middle of a room, its doors and the ways between them."""
     edges = [(int(i), map.edges[i]) for i in np.flatnonzero((map.edges["rooms"] == r).any(axis=1))]
-    targets = [(i, _end(map, edge, r)) for i, edge in edges]
     inside = grid.free & (grid.room == r)
     if not inside.any():
         return
     mask = inside.copy()
-    for (_, edge), (_, point) in zip(edges, targets, strict=True):
+    for _, edge in edges:
         if not is_flight(edge):
-            mask |= grid.free & _disc(grid, point, NEAR)
+            mask |= grid.free & _disc(grid, edge["centre"][:2], NEAR)
     root = _middle(inside, clear)
-    middle = route.add(grid.centre(root), kind="room", room=r, storey=int(map.rooms["storey"][r]))
-    leaves: dict[tuple[int, int], int] = {}
-    for (i, edge), (_, point) in zip(edges, targets, strict=True):
-        leaf = _nearest(mask, grid, point, FAR if is_flight(edge) else NEAR)
+    parent = _ways(mask, clear, grid.size, root)
+    reached = np.zeros_like(mask)
+    reached[tuple(np.array([root, *parent]).T)] = True
+    middle = route.add(grid.centre(np.array(root)), kind="room", room=r, storey=int(map.rooms["storey"][r]))
+    leaves: dict[Pixel, int] = {}
+    for i, edge in edges:
+        point, out = _end(map, edge, r)
+        leaf = _leaf(reached, grid, point, out)
         if leaf is None:
             continue
         if i not in doors or is_flight(edge):
@@ -100,23 +105,37 @@ def _add_room(route: Route, map: TopometricMap, grid: Occupancy, clear: Array, r
             known = {"kind": str(edge["kind"]), "edge": i, "width": round(float(edge["width"]), 3), "open": bool(edge["open"])}
             if is_flight(edge):
                 known |= {"to_room": other, "to_storey": int(map.rooms["storey"][other])}
-            doors[i] = route.add(grid.centre(leaf) if is_flight(edge) else point, **known)
+            doors[i] = route.add(grid.centre(np.array(leaf)) if is_flight(edge) else point, **known)
         leaves[leaf] = doors[i] if leaf not in leaves else leaves[leaf]
         if leaves[leaf] != doors[i]:
             route.ways.append((leaves[leaf], doors[i]))
-    _tree(route, grid, mask, clear, root, middle, leaves)
+    _tree(route, grid, mask, clear, parent, leaves, root, middle)
 
 
-def _end(map: TopometricMap, edge: Any, r: int) -> Array:
-    """(2,) where one leaves room r: the middle of a door, the nearer end of a flight."""
+def _end(map: TopometricMap, edge: Any, r: int) -> tuple[Array, Array]:
+    """(2,) where one leaves room r: the middle of a door, the nearer end of a flight; and (2,) the way on out of a flight."""
     if not is_flight(edge):
-        return np.asarray(edge["centre"][:2])
+        return np.asarray(edge["centre"][:2]), np.zeros(2)
     z = map.rooms["centroid"][r, 2]
-    lower = abs(edge["lower"][2] - z) <= abs(edge["upper"][2] - z)
-    return np.asarray(edge["lower" if lower else "upper"][:2])
+    near, other = edge["lower"], edge["upper"]
+    if abs(near[2] - z) > abs(other[2] - z):
+        near, other = other, near
+    out = (near - other)[:2]
+    return np.asarray(near[:2]), out / max(float(np.hypot(*out)), 1e-9)
 
 
-def _middle(inside: Array, clear: Array) -> tuple[int, int]:
+def _leaf(reached: Array, grid: Occupancy, point: Array, out: Array) -> Pixel | None:
+    """The pixel from which one goes through a door, or onto a flight: straight on from its end, else beside it."""
+    if not out.any():
+        return _nearest(reached, grid, point, NEAR)
+    ahead = point + np.arange(0.0, FAR, grid.size / 2)[:, None] * out
+    at = np.floor((ahead - grid.low) / grid.size).astype(int)
+    at = at[((at >= 0) & (at < reached.shape)).all(axis=1)]
+    hits = at[reached[tuple(at.T)]]
+    return (int(hits[0, 0]), int(hits[0, 1])) if len(hits) else _nearest(reached, grid, point, FAR)
+
+
+def _middle(inside: Array, clear: Array) -> Pixel:
     """Of the pixels with most space around them the nearest to the middle of the room."""
     space = np.where(inside, clear, -1.0)
     options = np.argwhere(space >= 0.85 * space.max())
@@ -132,7 +151,7 @@ def _disc(grid: Occupancy, point: Array, radius: float) -> Array:
     return near
 
 
-def _nearest(mask: Array, grid: Occupancy, point: Array, radius: float) -> tuple[int, int] | None:
+def _nearest(mask: Array, grid: Occupancy, point: Array, radius: float) -> Pixel | None:
     """The pixel of the mask nearest to a point."""
     options = np.argwhere(mask & _disc(grid, point, radius))
     if not len(options):
@@ -142,43 +161,45 @@ def _nearest(mask: Array, grid: Occupancy, point: Array, radius: float) -> tuple
 
 
 def _tree(
-    route: Route, grid: Occupancy, mask: Array, clear: Array, root: tuple[int, int], middle: int, leaves: dict[tuple[int, int], int]
+    route: Route,
+    grid: Occupancy,
+    mask: Array,
+    clear: Array,
+    parent: dict[Pixel, Pixel],
+    leaves: dict[Pixel, int],
+    root: Pixel,
+    middle: int,
 ) -> None:
     """Ways from the root to all leaves (pixel -> node), with a node at every fork and bend."""
-    parent = _ways(mask, clear, grid.size, root)
-    nodes = {**leaves, root: middle} if root not in leaves else dict(leaves)
     if root in leaves:
         route.ways.append((middle, leaves[root]))
-        nodes[root] = middle
-    used: dict[tuple[int, int], int] = {}  # pixel -> how many ways come into it from further out
-    reached = [leaf for leaf in leaves if leaf in parent and leaf != root]
-    for leaf in reached:
-        at = leaf
+    nodes = {**leaves, root: middle}
+    used: dict[Pixel, int] = {}  # pixel -> how many ways come into it from further out
+    far = [leaf for leaf in leaves if leaf != root]
+    for at in far:
         while at != root:
             at = parent[at]
             used[at] = used.get(at, 0) + 1
             if used[at] > 1:
                 break
-    for at in [*(p for p, n in used.items() if n > 1), *reached]:
-        chain = [at]
+    for start in [*(pixel for pixel, ways in used.items() if ways > 1), *far]:
+        chain = [start]
         while chain[-1] != root and (len(chain) == 1 or (used.get(chain[-1], 0) < 2 and chain[-1] not in nodes)):
             chain.append(parent[chain[-1]])
         if len(chain) > 1:
             _add_chain(route, grid, mask, clear, chain, nodes)
 
 
-def _add_chain(
-    route: Route, grid: Occupancy, mask: Array, clear: Array, chain: list[tuple[int, int]], nodes: dict[tuple[int, int], int]
-) -> None:
+def _add_chain(route: Route, grid: Occupancy, mask: Array, clear: Array, chain: list[Pixel], nodes: dict[Pixel, int]) -> None:
     kept = _pulled(np.array(chain), mask, clear, 1.5 * grid.size)
     for i in kept:
         if chain[i] not in nodes:
             nodes[chain[i]] = route.add(grid.centre(np.array(chain[i])), kind="way")
     names = [nodes[chain[i]] for i in kept]
-    route.ways += [(a, b) for a, b in zip(names[:-1], names[1:], strict=True) if a != b]
+    route.ways += [(a, b) for a, b in pairwise(names) if a != b]
 
 
-def _ways(mask: Array, clear: Array, size: float, root: tuple[int, int]) -> dict[tuple[int, int], tuple[int, int]]:
+def _ways(mask: Array, clear: Array, size: float, root: Pixel) -> dict[Pixel, Pixel]:
     """Pixel -> the next one on the way to the root, for all pixels of the mask that are joined to it."""
     number = np.full(np.add(mask.shape, 2), -1)
     pixels = np.argwhere(mask)
@@ -195,7 +216,7 @@ def _ways(mask: Array, clear: Array, size: float, root: tuple[int, int]) -> dict
     graph = sparse.csr_matrix((np.concatenate(costs), (np.concatenate(starts), np.concatenate(ends))), shape)
     source = int(number[root[0] + 1, root[1] + 1])
     _, before = csgraph.dijkstra(graph, directed=False, indices=source, return_predecessors=True)
-    rows = [tuple(p) for p in pixels.tolist()]
+    rows: list[Pixel] = [(i, j) for i, j in pixels.tolist()]
     return {rows[k]: rows[b] for k, b in enumerate(before.tolist()) if b >= 0}
 
 
