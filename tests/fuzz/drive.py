@@ -12,14 +12,15 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from tests.fuzz.corpus import write_corpus
 
 ROOT = Path(__file__).parent.parent.parent
-PATIENCE = 20.0  # s for one input
-SLOW = 8.0  # s that are a fault
+PATIENCE = 60.0  # s for one input, by the clock: others may want the processor, too
+SLOW = 6.0  # s of the processor that are a fault
 
 
 class Worker:
@@ -47,10 +48,10 @@ class Worker:
         line = self.process.stdout.readline()
         return json.loads(line) if line else None
 
-    def ask(self, name: str, seed: int) -> tuple[str, str]:
-        """(read | refused | fault, message)."""
+    def ask(self, *case: str | int) -> tuple[str, str]:
+        """(read | refused | fault, message) of a mutant (name, seed) or of a file (path)."""
         assert self.process.stdin is not None
-        self.process.stdin.write(f"{name} {seed}\n")
+        self.process.stdin.write(json.dumps(case) + "\n")
         self.process.stdin.flush()
         answer = self._answer(PATIENCE)
         if answer is None:
@@ -58,7 +59,7 @@ class Worker:
             self.stop()
             self.start()
             return "fault", f"the process died with {died}" if died is not None else f"took more than {PATIENCE:g} s"
-        _, _, state, message, seconds = answer
+        state, message, seconds = answer
         return ("fault", f"took {seconds:.1f} s ({state}: {message})") if seconds > SLOW else (state, message)
 
     def _ended(self) -> int | None:
@@ -73,20 +74,28 @@ class Worker:
         self.process.communicate()
 
 
-def run(folder: Path, seeds: range, only: list[str] | None = None) -> Iterator[tuple[str, int, str, str]]:
-    """(name, seed, state, message) of a mutant of every file, or of those named, for every seed."""
+@contextmanager
+def started(folder: Path, only: Sequence[str] = ()) -> Iterator[tuple[Worker, list[str]]]:
+    """A worker that has read the valid files, or those named; and their names."""
     corpus, place = folder / "corpus", folder / "mutants"
     corpus.mkdir(parents=True)
     place.mkdir()
     files = {name: str(path) for name, path in write_corpus(corpus).items()}
-    (corpus / "names.json").write_text(json.dumps({"files": files, "tried": only or list(files)}))
+    names = list(only or files)
+    (corpus / "names.json").write_text(json.dumps({"files": files, "tried": names}))
     worker = Worker(corpus, place)
     try:
-        for name in only or files:
-            for seed in seeds:
-                yield (name, seed, *worker.ask(name, seed))
+        yield worker, names
     finally:
         worker.stop()
+
+
+def run(folder: Path, seeds: range, only: Sequence[str] = ()) -> Iterator[tuple[str, int, str, str]]:
+    """(name, seed, state, message) of a mutant of every file, or of those named, for every seed."""
+    with started(folder, only) as (worker, names):
+        for name in names:
+            for seed in seeds:
+                yield (name, seed, *worker.ask(name, seed))
 
 
 def main() -> None:
@@ -94,7 +103,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--each", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--only", action="append")
+    parser.add_argument("--only", action="append", default=[])
     args = parser.parse_args()
     seeds = range(args.first, args.first + args.each)
     counts: Counter[tuple[str, str]] = Counter()

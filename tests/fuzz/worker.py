@@ -1,4 +1,6 @@
-"""A process that reads mutants within limits, driven by lines "name seed" on stdin; it answers each with one line of JSON.
+"""A process that reads files within limits, driven by lines of JSON on stdin; it answers each with one.
+
+["plan.yaml", 7] is mutant 7 of that file of the corpus, ["/a/b.ply"] a file as it is.
 
 It may die: of a fault in a native library, or by the hand of the driver, which waits only so long.
 """
@@ -25,9 +27,8 @@ def _size() -> int:
     return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def attempt(path: Path, data: bytes) -> tuple[str, str]:
-    """(read | refused | fault, message) of reading a mutant."""
-    path.write_bytes(data)
+def attempt(path: Path) -> tuple[str, str]:
+    """(read | refused | fault, message) of reading a file."""
     try:
         return "read", str(reader(path)(path))
     except InputError as error:
@@ -47,8 +48,7 @@ def main(corpus: Path, folder: Path) -> None:
     told = json.loads((corpus / "names.json").read_text())
     data = {name: Path(path).read_bytes() for name, path in told["files"].items()}
     for name in told["tried"]:
-        beside(name, corpus, folder)
-        state = attempt(folder / name, data[name])
+        state = attempt(Path(told["files"][name]))
         assert state[0] == "read", (name, state)
     limit = _size() + ROOM
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -57,11 +57,14 @@ def main(corpus: Path, folder: Path) -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print is no answer
     for line in sys.stdin:
-        name, seed = line.split()
-        beside(name, corpus, folder)
-        before = time.monotonic()
-        state, message = attempt(folder / name, mutant(name, data, int(seed)))
-        print(json.dumps([name, int(seed), state, message, time.monotonic() - before]), file=answers, flush=True)
+        name, *seed = json.loads(line)
+        path = folder / name
+        if seed:
+            beside(name, corpus, folder)
+            path.write_bytes(mutant(name, data, seed[0]))
+        before = time.process_time()
+        state, message = attempt(path)
+        print(json.dumps([state, message, time.process_time() - before]), file=answers, flush=True)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from topomerge.types import Array
 DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can tell
 MAX_BYTES = 4 << 30  # of all arrays together; a map of 100 million cells needs 2 GB
 MAX_RATIO = 1100  # deflate can't shrink by more than 1032; a file that claims more is damaged or hostile
+USUAL_RATIO, MODEST = 100, 1 << 28  # of a whole file: maps shrink by 12 to 17; small ones may claim more
 HEADER = 4096  # longest header of an array, bytes
 
 
@@ -81,8 +82,9 @@ def _read(file: io.BufferedReader, size: int) -> dict[str, Array]:
         for entry in entries:
             if entry.compress_size > size or entry.file_size > MAX_RATIO * (entry.compress_size + 16):
                 raise ValueError(f"{entry.filename} claims {entry.file_size} bytes, more than it can hold")
-        if sum(entry.file_size for entry in entries) > MAX_BYTES:
-            raise ValueError(f"claims more than {MAX_BYTES >> 30} GB")
+        total = sum(entry.file_size for entry in entries)
+        if total > MAX_BYTES or total > max(MODEST, USUAL_RATIO * size):
+            raise ValueError(f"claims {total:,} bytes in {size:,}")
         return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
 
 

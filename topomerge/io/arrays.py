@@ -19,7 +19,7 @@ from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
 from topomerge.types import Array
 
 LARGEST = 64 << 30  # bytes a packed array may become
-RATIO, MODEST = 200, 1 << 30  # packed arrays above the second size that shrank more than the first are refused
+RATIO, MODEST = 200, 1 << 28  # packed arrays above the second size that shrank more than the first are refused
 POINTS, COLORS, LABELS = ("points", "xyz", "pts", "positions"), ("colors", "rgb", "colours"), ("labels",)
 
 

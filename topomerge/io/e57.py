@@ -15,7 +15,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.pcd import pose
-from topomerge.io.piece import BLOCK, Options, Piece, bytes8, damaged
+from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
 from topomerge.kernels.codecs import crc32c
 from topomerge.types import Array
 
@@ -82,6 +82,8 @@ def _scan(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | N
             yield (xyz if axes is CARTESIAN else _cartesian(xyz)), colors, count
     finally:
         reader.close()
+    if left > 0:
+        raise cut_short(path, header.point_count - left, header.point_count)
 
 
 def _cartesian(spherical: Array) -> Array:

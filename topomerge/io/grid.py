@@ -9,6 +9,7 @@ Source: http://wiki.ros.org/map_server (values, thresholds and modes).
 from __future__ import annotations
 
 import math
+import reprlib
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from topomerge.errors import InputError
 from topomerge.io.piece import BLOCK, LIMIT, Options, Piece, damaged, too_many
 from topomerge.types import Array
 
-PIXELS = 200_000_000  # more is refused
+PIXELS = 100_000_000  # more is refused
 LARGEST_YAML = 1 << 20  # bytes
 IMAGES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 MODES = ("trinary", "scale", "raw")
@@ -76,16 +77,19 @@ def read_yaml(path: Path) -> Plan:
         raise damaged(path, "a map_server file", getattr(error, "problem", None) or error) from error
     if not isinstance(values, dict) or "image" not in values or "resolution" not in values:
         raise InputError(f"{path}: is not a map_server file (no image and resolution); give the yaml that names the image")
-    image, said = _find_image(path, str(values["image"]).strip())
+    if not isinstance(values["image"], str) or not isinstance(values.get("mode", ""), str):
+        shown = f"{_shown(values['image'])}, {_shown(values.get('mode'))}"
+        raise InputError(f"{path}: image and mode are names, not {shown}; mend it")
+    image, said = _find_image(path, values["image"].strip())
     resolution = _number(path, values, "resolution", None)
     origin = values.get("origin", [0.0, 0.0, 0.0])
     if not isinstance(origin, list) or len(origin) < 2:
-        raise InputError(f"{path}: origin is {origin!r}; it is a list of x, y and yaw")
+        raise InputError(f"{path}: origin is {_shown(origin)}; it is a list of x, y and yaw")
     x, y, yaw = (_number(path, {"origin": v}, "origin", None) for v in [*origin, 0.0][:3])
-    mode = str(values.get("mode", "trinary")).lower()
+    mode = values.get("mode", "trinary").lower()
     negate = values.get("negate", 0)
     if mode not in MODES or negate not in (0, 1) or not resolution > 0:
-        wrong = f"mode {mode!r}, negate {negate!r} or resolution {resolution:g}"
+        wrong = f"mode {_shown(mode)}, negate {_shown(negate)} or resolution {resolution:g}"
         raise InputError(f"{path}: {wrong} can't be used; mode is one of {', '.join(MODES)}, negate 0 or 1, resolution above 0")
     occupied, free = _number(path, values, "occupied_thresh", 0.65), _number(path, values, "free_thresh", 0.196)
     return Plan(image, resolution, (x, y, yaw), bool(negate), occupied, free, mode, said)
@@ -97,8 +101,15 @@ def _number(path: Path, values: dict[str, Any], key: str, default: float | None)
     except (TypeError, ValueError):
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{path}: {key} is {values.get(key)!r} instead of a number; mend it")
+        raise InputError(f"{path}: {key} is {_shown(values.get(key))} instead of a number; mend it")
     return value
+
+
+def _shown(value: object) -> str:
+    """What stands in a file, not longer than fits into a message: aliases can make a list of a few bytes endless."""
+    short = reprlib.Repr()
+    short.maxlevel = short.maxlist = short.maxdict = 2
+    return short.repr(value)[:60]
 
 
 def _find_image(path: Path, name: str) -> tuple[Path, tuple[str, ...]]:
@@ -112,7 +123,7 @@ def _find_image(path: Path, name: str) -> tuple[Path, tuple[str, ...]]:
             if candidate == exact:
                 return candidate, ()
             return candidate, (f"{path.name} names the image {name}; {candidate.name} beside it was read",)
-    raise InputError(f"{path}: its image {name} does not exist; put it beside the yaml")
+    raise InputError(f"{path}: its image {name[:200]} does not exist; put it beside the yaml")
 
 
 def read_image(path: Path) -> tuple[Array, Array]:
@@ -132,16 +143,19 @@ def read_image(path: Path) -> tuple[Array, Array]:
                     limit = f"the limit is {PIXELS // 10**6} megapixels"
                     raise InputError(f"{path}: has {width} x {height} pixels and {limit}; crop it or make it smaller")
                 if image.mode.startswith(("I", "F")):
-                    values = np.asarray(image, np.float64)
-                    top = 65535.0 if image.mode.startswith("I") else max(float(np.nanmax(values)), 1.0)
-                    return values / top, np.zeros(values.shape, bool)
-                rgba = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+                    values = np.array(image, np.float32)
+                    values /= 65535.0 if image.mode.startswith("I") else max(float(np.nanmax(values)), 1.0)
+                    return values, np.zeros(values.shape, bool)
+                kind = "RGBA" if image.has_transparency_data else "L" if image.mode in ("1", "L") else "RGB"
+                rgba = np.asarray(image if image.mode == kind else image.convert(kind))
     except Image.DecompressionBombError as error:
         raise InputError(f"{path}: has far too many pixels; crop it or make it smaller") from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise damaged(path, "an image", error if str(error) else "cut short") from error
-    clear = rgba[..., 3] == 0 if rgba.shape[2] == 4 else np.zeros(rgba.shape[:2], bool)
-    return rgba[..., :3].mean(axis=2, dtype=np.float64) / 255.0, clear
+    clear = rgba[..., 3] == 0 if kind == "RGBA" else np.zeros(rgba.shape[:2], bool)
+    bright = rgba.astype(np.float32) if kind == "L" else rgba[..., :3].mean(axis=2, dtype=np.float32)
+    bright /= 255.0
+    return bright, clear
 
 
 def classify(image: tuple[Array, Array], plan: Plan) -> tuple[Array, Array]:
@@ -167,23 +181,30 @@ def _extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: Opti
     total = parts**2 * (walls * float(len(levels)) + floor * (1 + options.ceiling))
     if total > LIMIT:
         raise too_many(path, total, spacing * options.factor)
-    layers = [(free, 0.0)] + [(occupied, z) for z in levels] + ([(free, height)] if options.ceiling else [])
-    for number, (mask, z) in enumerate(layers):
-        for points in _layer(mask, plan, parts):
+    ground, high = _pixels(free), _pixels(occupied)
+    layers = [(ground, 0.0)] + [(high, z) for z in levels] + ([(ground, height)] if options.ceiling else [])
+    for number, (pixels, z) in enumerate(layers):
+        for points in _layer(pixels, free.shape, plan, parts):
             flat = np.column_stack([points, np.full(len(points), z)])
             yield Piece(flat, done=0.1 + 0.9 * (number + 1) / len(layers))
 
 
-def _layer(mask: Array, plan: Plan, parts: int) -> Iterator[Array]:
-    """Blocks (n, 2) of metric points of the masked pixels, parts² a pixel, at the centres of its parts."""
-    rows, columns = np.nonzero(mask)
+def _pixels(mask: Array) -> Array:
+    """(n,) int32 numbers of the masked pixels, row after row."""
+    step = max(1, BLOCK // mask.shape[1])  # rows at a time: NumPy's numbers take 8 bytes each
+    starts = range(0, len(mask), step)
+    return np.concatenate([(np.flatnonzero(mask[i : i + step]) + i * mask.shape[1]).astype(np.int32) for i in starts])
+
+
+def _layer(pixels: Array, shape: tuple[int, ...], plan: Plan, parts: int) -> Iterator[Array]:
+    """Blocks (n, 2) of metric points of pixels, parts² a pixel, at the centres of its parts."""
     inner = (np.arange(parts) + 0.5) / parts
     dx, dy = (d.ravel() for d in np.meshgrid(inner, inner))
     x0, y0, yaw = plan.origin
     cos, sin = math.cos(yaw), math.sin(yaw)
     step = max(1, BLOCK // parts**2)
-    for start in range(0, len(rows), step):
-        cut = slice(start, start + step)
-        x = (columns[cut, None] + dx).ravel() * plan.resolution
-        y = (mask.shape[0] - 1 - rows[cut, None] + dy).ravel() * plan.resolution
+    for start in range(0, len(pixels), step):
+        rows, columns = np.divmod(pixels[start : start + step], shape[1])
+        x = (columns[:, None] + dx).ravel() * plan.resolution
+        y = (shape[0] - 1 - rows[:, None] + dy).ravel() * plan.resolution
         yield np.column_stack([x0 + cos * x - sin * y, y0 + sin * x + cos * y])

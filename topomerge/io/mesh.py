@@ -20,15 +20,20 @@ from topomerge.types import Array
 
 SPACING = 0.05  # m between points sampled on surfaces
 LONGEST = 10_000.0  # m, edge of a triangle beyond any building
+MOST_SHARED = 4  # times that the bytes of a scene may be shown by its views
 
 
 def read(path: Path, options: Options) -> Iterator[Piece]:
     """Vertices of every part of a scene, then points sampled on its faces. Materials and textures are not loaded."""
     found = 0
     for vertices, faces in _parts(path):
-        found += len(vertices)
         yield Piece(vertices, done=0.3)
-        yield from sample(path, vertices, faces, options)
+        found += len(vertices)
+        for piece in sample(path, vertices, faces, options):
+            yield piece
+            found += len(piece.points)
+            if found > LIMIT:  # one part can stand in a scene a thousand times
+                raise too_many(path, found, options.spacing or SPACING)
     if not found:
         raise InputError(f"{path}: holds no vertices; export it again")
 
@@ -131,21 +136,40 @@ def _check_start(path: Path, kind: str) -> None:
             raise damaged(path, "a glTF file", f"{size:,} of {max(length, 20 + text):,} bytes")
         with path.open("rb") as stream:
             stream.seek(20)
-            _check_gltf(path, stream.read(text))
+            _check_gltf(path, stream.read(text), size)
     if kind == "gltf":
-        _check_gltf(path, path.read_bytes())
+        _check_gltf(path, path.read_bytes(), size)
 
 
-def _check_gltf(path: Path, text: bytes) -> None:
-    """Refuse a scene that is compressed, or promises more numbers than any building has."""
+def _check_gltf(path: Path, text: bytes, size: int) -> None:
+    """Refuse a scene that is compressed, names files of other folders, or would take more memory than its bytes explain."""
     try:
         tree = json.loads(text)
         needed = set(tree.get("extensionsRequired", ()))
-        largest = max((int(a["count"]) for a in tree.get("accessors", ())), default=0)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        uris = [str(b["uri"]) for b in tree.get("buffers", ()) if "uri" in b]
+        have = size + sum(_beside(path, uri) for uri in uris)
+        accessors, views = tree.get("accessors", ()), tree.get("bufferViews", ())
+        largest = max((int(a["count"]) for a in accessors), default=0)
+        blank = sum(int(a["count"]) for a in accessors if "bufferView" not in a)  # zeros, made without any data
+        shared = sum(int(v["byteLength"]) for v in views)  # views are copied, and many can show the same bytes
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise damaged(path, "a glTF file", error) from error
     packed = [name for name in needed if "compression" in name]
     if packed:
         raise InputError(f"{path}: is compressed with {packed[0]}, which is not read; export it without")
-    if largest > LIMIT:
-        raise damaged(path, "a glTF file", f"{largest:,} values promised")
+    if max(largest, blank) > have or shared > MOST_SHARED * have:
+        raise damaged(path, "a glTF file", f"{max(largest, blank, shared):,} values promised in {have:,} bytes")
+
+
+def _beside(path: Path, uri: str) -> int:
+    """Bytes of a file that a scene names; 0 of data within the scene itself, and of a file that does not exist."""
+    if uri.startswith("data:"):
+        return 0
+    file = (path.parent / uri).resolve()
+    if not file.is_relative_to(path.parent.resolve()):
+        raise InputError(f"{path}: names {uri[:200]!r}, which is not in its folder; export it as one glb")
+    if file.exists() and not file.is_file():
+        raise InputError(f"{path}: names {uri[:200]!r}, which is no file; export it as one glb")
+    return file.stat().st_size if file.exists() else 0

@@ -21,6 +21,7 @@ from topomerge.types import Array, VoxelGrid
 MAGIC = b"# Octomap OcTree binary file"
 CENTRE = 1 << (LEAF_LEVEL - 1)  # the cell whose lower corner is the origin of coordinates
 MOST = 30_000_000  # smallest cells that leaves may be cut into
+FEW, USUAL = 1 << 20, 100  # beyond so many cells, at most so many a byte: a real map has 7
 
 
 def read(path: Path, options: Options) -> Iterator[Piece]:
@@ -33,16 +34,16 @@ def read(path: Path, options: Options) -> Iterator[Piece]:
         raise damaged(path, "an OctoMap", f"its tree does not end where the file ends, after {len(data):,} bytes")
     keys, depths, states = leaves
     occupied, free = states == OCCUPIED, states == FREE
-    cells = _smallest(keys[occupied], depths[occupied])
+    most = min(MOST, max(FEW, USUAL * len(data)))
+    cells = _smallest(keys[occupied], depths[occupied], most)
     if cells is None:
-        raise InputError(f"{path}: has more than {MOST:,} occupied cells; store it at a coarser resolution")
-    space = _smallest(keys[free], depths[free])
-    said = () if space is not None else (f"more than {MOST:,} free cells: free space is left out",)
+        raise InputError(f"{path}: has more than {most:,} occupied cells; store it at a coarser resolution")
+    space = _smallest(keys[free], depths[free], most)
+    said = () if space is not None else (f"more than {most:,} free cells: free space is left out",)
     grid = None if space is None else _grid(space, resolution)
-    points = (cells - CENTRE + 0.5) * resolution
-    yield Piece(points[:BLOCK], free=grid, warnings=said, done=0.8)
-    for start in range(BLOCK, len(points), BLOCK):
-        yield Piece(points[start : start + BLOCK], done=0.9)
+    yield Piece(np.empty((0, 3)), free=grid, warnings=said, done=0.8)
+    for start in range(0, len(cells), BLOCK):
+        yield Piece((cells[start : start + BLOCK] - CENTRE + 0.5) * resolution, done=0.9)
 
 
 def _split(path: Path, data: bytes) -> tuple[float, Array]:
@@ -58,16 +59,16 @@ def _split(path: Path, data: bytes) -> tuple[float, Array]:
     except (KeyError, ValueError) as error:
         raise damaged(path, "an OctoMap", "its header has no id or no res") from error
     if kind != b"OcTree":
-        raise InputError(f"{path}: holds a tree of the kind {kind.decode('latin-1')}; only OcTree is read")
+        raise InputError(f"{path}: holds a tree of the kind {kind[:40].decode('latin-1')}; only OcTree is read")
     if not (math.isfinite(resolution) and resolution > 0):
         raise damaged(path, "an OctoMap", f"res {resolution}")
     return resolution, np.frombuffer(data, np.uint8, offset=header.end())
 
 
-def _smallest(keys: Array, depths: Array) -> Array | None:
+def _smallest(keys: Array, depths: Array, most: int) -> Array | None:
     """(n, 3) int32 smallest cells of leaves; None where they are too many."""
     sides = 1 << (LEAF_LEVEL - depths.astype(np.int64))
-    if (sides**3).sum() > MOST:
+    if (sides**3).sum() > most:
         return None
     parts = []
     for side in np.unique(sides):

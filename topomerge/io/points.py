@@ -159,6 +159,8 @@ def _format_of(path: Path) -> Format:
     else:
         known = " ".join(s[1:] for s in suffixes())
         raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; known are {known}")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is no regular file (a pipe or a device); give the name of a file")
     try:
         with path.open("rb") as stream:
             first = stream.read(1)
