@@ -15,7 +15,7 @@ LEAST = 8  # cells: fewer have no shape
 
 
 def shapedna(
-    laplacian: str = "surface", values: int = 32, normalise: str = "weyl", spacing: float = 0.25, largest: int = 20_000
+    laplacian: str = "surface", values: int = 32, normalise: str = "weyl", spacing: float = 0.25, largest: int = 5000
 ) -> Descriptor:
     """The descriptor: (R, values) float64, ascending in each row.
 
@@ -26,7 +26,8 @@ def shapedna(
         normalise: ``"weyl"``: by the slope of value over number, so that size falls out; ``"first"``: by the first one;
             ``"none"``: 1/m2 of the surface, no unit of the graph.
         spacing: m; the surface is described by one point in each cube of this size, so that walls two cells thick are one.
-        largest: cells; a graph of more is taken from coarser cells.
+        largest: cells of the graph, or points of the surface; of more, coarser ones are taken: the time grows faster than they do,
+            and the smallest eigenvalues hardly change.
 
     Raises:
         InputError: an option is unknown, or below its least value.
@@ -55,7 +56,11 @@ def spectrum(cells: Array, edge: float, laplacian: str, values: int, spacing: fl
             cells = np.unique(cells // 2, axis=0)
         found = smallest_eigenvalues(graph_laplacian(cells), values)
     else:
-        found = smallest_eigenvalues(surface_laplacian(thinned((cells + 0.5) * edge, spacing)), values)
+        points = thinned((cells + 0.5) * edge, spacing)
+        while len(points) > largest:
+            spacing *= max(float(np.sqrt(len(points) / largest)), 1.05)
+            points = thinned((cells + 0.5) * edge, spacing)
+        found = smallest_eigenvalues(surface_laplacian(points), values)
     if not len(found):
         return np.zeros(values)
     number = np.arange(1, values + 1)

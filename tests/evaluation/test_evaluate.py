@@ -1,0 +1,154 @@
+"""The evaluation as a whole: settings, folders, predictions on disk, tables and figures."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from topomerge.datasets.degrade import degraded
+from topomerge.datasets.kept import load_kept
+from topomerge.datasets.pairs import Pair
+from topomerge.datasets.recipe import check as check_recipe
+
+from topomerge.config import compose
+from topomerge.errors import InputError
+from topomerge.evaluation import predict as predicting
+from topomerge.evaluation.evaluate import claim, evaluate
+from topomerge.evaluation.settings import Evaluation, Pairs, check, difference, folder_of, told, variants
+from topomerge.evaluation.tables import Table, write_section
+from topomerge.types import PointCloud, Sim3
+
+SETS = ("heldout", "heldout_small", "real", "robustness")
+SMALL = Pairs(
+    name="two",
+    pairs=2,
+    seed=4,
+    split="test",
+    sources={"procedural": 1.0},
+    kinds={"house": 1.0},
+    overlaps=[0.5],
+    sensors={"depth": 1.0},
+    rooms=[3, 4],
+    points_per_room=16,
+    voxel_size=0.15,
+    maps=True,
+)
+
+
+@pytest.mark.parametrize("data", SETS)
+def test_every_set_composes(data: str) -> None:
+    settings = compose("evaluate", Evaluation, [f"data={data}"])
+    check(settings)
+    if not settings.data.real:
+        check_recipe(settings.data)
+        assert settings.data.maps and settings.data.split == "test"
+    assert len(list(variants(settings))) == 4 * 5
+
+
+def test_a_wrong_key_is_named() -> None:
+    with pytest.raises(InputError, match="slow_kk"):
+        compose("evaluate", Evaluation, ["slow_kk=3"])
+    for words, said in (
+        (["methods=[guess]"], "methods: unknown 'guess'"),
+        (["context=[max]"], "context: unknown"),
+        (["descriptors.engineered.name=deep"], "descriptors.engineered.name 'deep'"),
+        (["run=[runs/nowhere]"], "runs/nowhere"),
+        (["mergers=[x]"], "mergers: 'x'"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check(compose("evaluate", Evaluation, words))
+
+
+def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
+    settings = Evaluation(SMALL, folder=str(tmp_path), descriptors={"engineered": {"name": "engineered"}})
+    folder = folder_of(settings)
+    assert folder == tmp_path / "two"
+    claim(folder, told(settings))
+    claim(folder, told(settings))  # the same again
+    with pytest.raises(InputError, match=r"k: \[0\] there, \[0, 1\] now.*another folder"):
+        claim(folder, told(replace(settings, k=[0, 1])))
+    with pytest.raises(InputError, match=r"data\.seed: 4 there, 5 now"):
+        claim(folder, told(replace(settings, data=replace(SMALL, seed=5))))
+    claim(folder, told(replace(settings, rounds=10, write="x.md")))  # how it is told changes no prediction
+    (folder / "evaluation.json").write_text("{")
+    with pytest.raises(InputError, match="damaged"):
+        claim(folder, told(settings))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "photo.png").touch()
+    with pytest.raises(InputError, match="something else"):
+        claim(tmp_path / "other", told(settings))
+
+
+def test_the_first_difference_is_told() -> None:
+    assert difference({"a": {"b": 1}}, {"a": {"b": 1}}) == ""
+    assert difference({"a": {"b": 1}}, {"a": {"b": 2}}) == "a.b: 1 there, 2 now"
+    assert difference({}, {"c": None, "d": 1}) == "d: null there, 1 now"
+
+
+def test_marks_are_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "results.md"
+    path.write_text("# Results\n\n## Rooms\n\nkept\n")
+    write_section(path, "rooms-matched", "first")
+    write_section(path, "rooms-matched", "second")
+    text = path.read_text()
+    assert "kept" in text and "second" in text and "first" not in text and text.count("rooms-matched:begin") == 1
+
+
+def test_a_table_as_latex() -> None:
+    text = Table("50 % of m²", ["a_b", "x"], [["one", "0.5 [0.4, 0.6]"]]).latex()
+    assert r"a\_b & x \\" in text and r"50 \% of m$^2$" in text and r"\begin{tabular}{lr}" in text
+
+
+def cloud(n: int = 4000) -> PointCloud:
+    points = np.random.default_rng(0).uniform(0, 10, (n, 3)).astype(np.float32)
+    return PointCloud(points, labels=np.arange(n, dtype=np.int32) % 3)
+
+
+def test_clouds_are_degraded_as_asked() -> None:
+    pair = Pair("p", cloud(), cloud(), Sim3(0.5, (1.0, 0.0, 0.0)), (), 0.5, ("tls", "tls"), "x", "y")
+    thin = degraded(pair, ("density", 0.25), 1)
+    assert abs(len(thin.a) / 4000 - 0.25) < 0.03 and thin.a.labels is not None and len(thin.a.labels) == len(thin.a)
+    noisy = degraded(pair, ("noise", 0.1), 1)
+    assert np.std(noisy.b.points - pair.b.points) == pytest.approx(0.1, rel=0.05)
+    holed = degraded(pair, ("missing", 0.3), 1)
+    assert 0.6 < len(holed.a) / 4000 <= 0.7
+    scaled = degraded(pair, ("scale", 2.0), 1)
+    assert scaled.truth is not None and pair.truth is not None
+    assert scaled.truth.apply(scaled.b.points) == pytest.approx(pair.truth.apply(pair.b.points), abs=1e-4)
+    assert degraded(pair, ("", 0.0), 1) is pair
+    with pytest.raises(InputError, match="vary: unknown 'rain'"):
+        check_recipe(replace(SMALL, vary={"rain": [1.0]}))
+    with pytest.raises(InputError, match=r"vary\.density must be"):
+        check_recipe(replace(SMALL, vary={"density": [2.0]}))
+
+
+@pytest.mark.slow
+def test_two_simulated_pairs_from_beginning_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    descriptors = {"engineered": {"name": "engineered"}, "shape": {"name": "shapedna", "values": 8, "spacing": 0.5}}
+    settings = Evaluation(
+        SMALL, folder=str(tmp_path / "eval"), cache=str(tmp_path / "cache"), descriptors=descriptors, k=[0, 1], rounds=50
+    )
+    first = evaluate(settings, command="python evaluate.py")
+    assert first.ranks and first.matches and first.merges and "recall@1" in first.summary
+    files = {p.name for p in first.folder.iterdir()}
+    assert {"report.md", "tables.tex", "scores.csv", "matches.csv", "ranks.csv", "merges.csv", "pr.png"} <= files
+    row = first.ranks[0]
+    pair = load_kept(tmp_path / "cache" / "pairs" / f"{row['pair']}.npz")
+    assert row["queries"] == sum(len(np.unique(pair.matches[:, s])) for s in (0, 1))
+    assert len(pair.maps()[0].rooms) == len(pair.true[0]) == len(pair.twin[0])
+    table = list(csv.DictReader((first.folder / "scores.csv").open()))
+    assert {"variant", "method", "by", "group", "metric", "value", "low", "high"} <= set(table[0])
+
+    def never(*_: object) -> None:
+        raise AssertionError("predictions that are there are not made again")
+
+    monkeypatch.setattr(predicting, "described", never)
+    again = evaluate(replace(settings, write=str(tmp_path / "results.md")))
+    assert json.dumps(again.ranks) == json.dumps(first.ranks)
+    assert "<!-- evaluation:begin -->" in (tmp_path / "results.md").read_text()
+    with pytest.raises(InputError, match="other settings"):
+        evaluate(replace(settings, k=[0]))

@@ -1,0 +1,165 @@
+"""Counts, ratios, intervals and calibration against examples worked out by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from topomerge.datasets.kept import KeptPair, twins
+
+from topomerge.evaluation.groups import calibration, draws, gain, value
+from topomerge.evaluation.score import match_counts, merge_counts, overlap_bin, pose_error, rank_counts, ranks_of, within
+from topomerge.types import Sim3, TrueRoom
+
+
+def kept(**changes: Any) -> KeptPair:
+    """Map a has five rooms: true 0, 1, 1 (in two pieces), 2, none; map b four: true 1, 0, 2, 3. Room 2 of a has a twin."""
+    known = {
+        "name": "x",
+        "folder": Path(),
+        "matches": np.array([(0, 1), (1, 0), (2, 0), (3, 2)]),
+        "true": (np.array([0, 1, 1, 2, -1]), np.array([1, 0, 2, 3])),
+        "one": (np.array([True, True, False, True, False]), np.ones(4, bool)),
+        "twin": (np.array([False, False, False, True, False]), np.zeros(4, bool)),
+        "transform": Sim3(0.3, (1.0, 2.0, 0.0)),
+        "anchor": np.array([5.0, 0.0, 0.0]),
+        "about": {"kind": "overlap", "common": 100.0, "sensors": ["tls", "depth"], "rooms": "labelled"},
+    }
+    return KeptPair(**(known | changes))
+
+
+def test_matches_are_counted_by_hand() -> None:
+    rooms = np.array([(0, 1), (1, 0), (2, 0), (3, 3), (4, 2)])  # right, right, right piece of the same room, wrong, wrong
+    found = match_counts(kept(), rooms)
+    assert (found["predicted"], found["right"], found["units"], found["found"]) == (5, 3, 3, 2)
+    assert (found["predicted_twin"], found["right_twin"], found["units_twin"], found["found_twin"]) == (1, 0, 1, 0)
+    assert (found["predicted_single"], found["right_single"], found["units_single"], found["found_single"]) == (4, 3, 2, 2)
+    assert (found["strict_right"], found["strict_units"]) == (2, 3)
+
+
+def test_no_match_at_all() -> None:
+    found = match_counts(kept(), np.zeros((0, 2), int))
+    assert (found["predicted"], found["right"], found["units"], found["found"]) == (0, 0, 3, 0)
+    nothing = kept(matches=np.zeros((0, 2), int))
+    assert match_counts(nothing, np.array([(0, 0)])) | {"pairs": 1} == match_counts(nothing, np.array([(0, 0)]))
+    assert match_counts(nothing, np.array([(0, 0)]))["units"] == 0
+
+
+def test_ranks_by_hand() -> None:
+    cost = np.array([[0.5, 0.1, 0.3], [0.2, 0.2, 0.9]])
+    rooms, rank = ranks_of(cost, np.array([(0, 2), (1, 0)]))
+    assert rooms.tolist() == [0, 1]
+    assert rank.tolist() == [2, 2]  # 0.1 is cheaper than 0.3; the other 0.2 costs as much, and counts before
+    assert ranks_of(cost, np.array([(0, 2), (0, 1)]))[1].tolist() == [
+        1
+    ]  # the better of two partners
+
+
+def test_rank_counts_of_both_directions() -> None:
+    cost = np.ones((5, 4))
+    cost[[0, 1, 2], [1, 0, 0]] = 0.0  # right and cheap
+    cost[3, 2] = 2.0  # right but dear
+    found = rank_counts(kept(), cost)
+    assert found["queries"] == 4 + 3
+    assert found["first"] == 3 + 2  # rooms 0, 1 and 2 of a; rooms 0 and 1 of b
+    assert found["five"] == 7
+    assert found["reciprocal"] == pytest.approx(3 + 2 + 1 / 4 + 1 / 5)
+    assert found["queries_twin"] == 1 and found["first_twin"] == 0
+
+
+def test_poses() -> None:
+    truth = Sim3(0.3, (1.0, 2.0, 0.0))
+    off = Sim3(0.3, (1.3, 2.4, 0.6))
+    assert pose_error(off, truth, np.array([5.0, 0.0, 0.0])) == pytest.approx((0.5, 0.6, 0.0))
+    assert pose_error(Sim3(0.3 - 2 * np.pi + 0.1), Sim3(0.3), np.zeros(3))[2] == pytest.approx(np.degrees(0.1))
+    assert within((0.3, 0.3, 4.9), False, (0.5, 5.0))
+    assert not within((0.3, 0.45, 1.0), False, (0.5, 5.0)) and within((0.3, 0.45, 1.0), True, (0.5, 5.0))
+    assert not within((0.1, 0.0, 5.1), False, (0.5, 5.0))
+
+
+def said(pose: Sim3 | None, believed: bool) -> dict[str, Any]:
+    matrix = None if pose is None else pose.matrix.tolist()
+    return {"pose": matrix, "believed": believed, "probability": 0.9, "seconds": 1.0, "rooms": [[0, 1]], "chance": [0.8]}
+
+
+@pytest.mark.parametrize(
+    ("pose", "believed", "expected"),
+    [
+        (Sim3(0.3, (1.0, 2.0, 0.0)), True, {"near": 1, "fine": 1, "merged": 1, "false": 0, "refused": 0}),
+        (Sim3(0.3, (1.3, 2.0, 0.0)), False, {"near": 1, "fine": 0, "merged": 0, "false": 0, "refused": 1}),
+        (Sim3(1.3, (1.0, 2.0, 0.0)), True, {"near": 0, "fine": 0, "merged": 0, "false": 1, "refused": 0}),
+        (None, False, {"near": 0, "fine": 0, "merged": 0, "false": 0, "refused": 0}),
+    ],
+)
+def test_merges(pose: Sim3 | None, believed: bool, expected: dict[str, int]) -> None:
+    found = merge_counts(kept(), said(pose, believed))
+    assert {k: found[k] for k in expected} == expected and found["mergeable"] == 1
+    assert found["good"] == [True]
+
+
+def test_whatever_is_believed_of_two_places_is_false() -> None:
+    hard = kept(about={"kind": "other-storey", "common": 0.0, "sensors": ["tls", "tls"], "rooms": "labelled"})
+    found = merge_counts(hard, said(Sim3(0.3, (1.0, 2.0, 0.0)), True))
+    assert (found["mergeable"], found["near"], found["false"]) == (0, 0, 1)
+
+
+def test_bins() -> None:
+    assert [overlap_bin(v) for v in (0.0, 0.1, 0.3, 0.5, 1.0)] == ["0", "0.1", "0.25", "0.5", "0.75"]
+    assert overlap_bin(0.0, "twin-wing") == "twin-wing"
+
+
+ROWS = [
+    {"building": "a", "pair": "1", "right": 3, "predicted": 4, "found": 3, "units": 6, "first": 1, "queries": 2},
+    {"building": "a", "pair": "2", "right": 1, "predicted": 4, "found": 1, "units": 2, "first": 1, "queries": 2},
+    {"building": "b", "pair": "3", "right": 0, "predicted": 0, "found": 0, "units": 4, "first": 0, "queries": 4},
+]
+
+
+def test_ratios_are_of_sums() -> None:
+    assert value(ROWS, "precision").value == 4 / 8
+    assert value(ROWS, "recall").value == 4 / 12
+    assert value(ROWS, "F1").value == pytest.approx(2 * (1 / 2) * (1 / 3) / (1 / 2 + 1 / 3))
+    assert value(ROWS, "recall@1").value == 2 / 8
+    assert (value(ROWS, "recall").pairs, value(ROWS, "recall").buildings) == (3, 2)
+    assert np.isnan(value(ROWS[2:], "precision").value) and np.isnan(value([], "F1").value)
+
+
+def test_the_interval_draws_whole_buildings() -> None:
+    found = value(ROWS, "recall@1", 4000)
+    assert (found.low, found.high) == (0.0, 0.5)  # only building b, only building a
+    one = value(ROWS[:2], "recall@1", 100)
+    assert one.low == one.high == one.value
+    assert draws(3, 50).sum(axis=1).tolist() == [3] * 50
+    many = [{"building": str(i), "pair": str(i), "first": i % 2, "queries": 1} for i in range(400)]
+    wide = value(many, "recall@1", 2000)
+    assert wide.high - wide.low == pytest.approx(2 * 1.96 * np.sqrt(0.25 / 400), rel=0.1)
+
+
+def test_a_gain_is_paired() -> None:
+    better = [{**r, "first": r["first"] + 1} for r in ROWS]
+    found = gain(better, ROWS, "recall@1", 500)
+    assert found.value == 3 / 8 and 0 < found.low <= found.high
+    assert gain(ROWS, ROWS, "recall@1", 500).high == 0
+
+
+def test_calibration_by_hand() -> None:
+    told = [0.05, 0.05, 0.95, 0.95, 0.95, 1.0]
+    right = [False, True, True, True, False, True]
+    found = calibration(told, right)
+    assert found.count.tolist() == [2, 4]
+    assert found.told == pytest.approx([0.05, (3 * 0.95 + 1) / 4]) and found.right == pytest.approx([0.5, 0.75])
+    assert found.error == pytest.approx((2 * 0.45 + 4 * abs(0.9625 - 0.75)) / 6)
+    exact = np.random.default_rng(0).random(20_000)
+    assert calibration(exact, np.random.default_rng(1).random(20_000) < exact).error < 0.02
+
+
+def test_twins() -> None:
+    def room(x: float, wide: float, deep: float) -> TrueRoom:
+        return TrueRoom("", np.array([(x, 0), (x + wide, 0), (x + wide, deep), (x, deep)]), 0.0, 2.5)
+
+    rooms = (room(0, 3, 4), room(5, 4, 3.02), room(10, 3, 5))  # the second is the first, turned
+    assert twins(np.array([0, 1, 2, -1]), np.array([0, 1, 2]), rooms, rooms).tolist() == [True, True, False, False]
+    assert twins(np.array([0, 2]), np.array([0, 2]), rooms, rooms).tolist() == [False, False]  # b does not hold room 1
+    assert twins(np.array([0]), np.array([0]), rooms, rooms, same=False).tolist() == [True]  # another building

@@ -1,0 +1,152 @@
+"""An evaluation from beginning to end: pairs, predictions, scores, tables, figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from topomerge.datasets.build import Build, build
+from topomerge.datasets.real_maps import keep_real
+from topomerge.datasets.recipe import Recipe
+from topomerge.errors import InputError
+from topomerge.evaluation.figures import save_figures
+from topomerge.evaluation.predict import predict_all
+from topomerge.evaluation.score import Row, score_all
+from topomerge.evaluation.settings import Evaluation, check, difference, folder_of, told
+from topomerge.evaluation.tables import (
+    BY,
+    Table,
+    curves,
+    grouped,
+    long_rows,
+    matching,
+    merging,
+    ranking,
+    reliability,
+    write_csv,
+    write_section,
+)
+from topomerge.io.atomic import replacing
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What an evaluation found: rows of counts, a short report, and where everything lies."""
+
+    matches: list[Row]
+    ranks: list[Row]
+    merges: list[Row]
+    summary: str
+    folder: Path
+
+
+def evaluate(settings: Evaluation, say: Say = lambda text: None, command: str = "") -> Scores:
+    """Make the pairs and the predictions that are missing, score them, and write tables and figures.
+
+    Args:
+        say: is told the progress.
+        command: that led here, for the report.
+
+    Raises:
+        InputError: settings that nothing can be made of, or a folder that was made with others.
+    """
+    check(settings)
+    folder = folder_of(settings)
+    claim(folder, told(settings))
+    pairs = pairs_of(settings, say)
+    if not pairs:
+        raise InputError(f"{settings.data.name}: no pair could be made; see the reasons above")
+    files = predict_all(pairs, folder / "predictions", settings, say)
+    matches, ranks, merges = score_all(pairs, files, settings)
+    parts = report(matches, ranks, merges, settings)
+    figures = save_figures(ranks, matches, merges, folder)
+    head = _about(ranks, merges, settings, command)
+    images = "\n".join(f"![]({name})" for name in figures)
+    _write(folder / "report.md", "\n\n".join([f"# {folder.name}", head, *(t.markdown() for t in parts), images]))
+    _write(folder / "tables.tex", "\n\n".join(t.latex() for t in parts))
+    write_csv(list(long_rows(ranks, matches, merges, settings)), folder / "scores.csv")
+    for name, rows in (("matches", matches), ("ranks", ranks), ("merges", merges)):
+        write_csv(rows, folder / f"{name}.csv")
+    summary = "\n\n".join([head, *(t.markdown() for t in short(matches, ranks, merges, settings))])
+    if settings.write:
+        write_section(Path(settings.write), settings.section, summary)
+    return Scores(matches, ranks, merges, summary, folder)
+
+
+def _write(path: Path, text: str) -> None:
+    with replacing(path) as beside:
+        beside.write_text(text + "\n", encoding="utf-8")
+
+
+def claim(folder: Path, known: dict[str, Any]) -> None:
+    """Take a folder for an evaluation: a new one, or one that was made with the same settings.
+
+    Raises:
+        InputError: it was made with others; the first key that differs is named.
+    """
+    path = folder / "evaluation.json"
+    if path.exists():
+        try:
+            before = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise InputError(f"{path}: damaged ({error}); take another folder with name=...") from error
+        if found := difference(before, known):
+            raise InputError(f"{folder}: was made with other settings ({found}); take another folder with name=..., or delete it")
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise InputError(f"{folder}: holds something else than an evaluation; take another folder with name=...")
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(path, json.dumps(known, indent=1, sort_keys=True))
+
+
+def pairs_of(settings: Evaluation, say: Say) -> list[Path]:
+    """Files of the kept pairs, made where they are missing."""
+    data = settings.data
+    if data.real:
+        found = keep_real(data.folder, Path(settings.cache), data.real, data.voxel_size, say)
+        return found[: settings.limit or None]
+    if not data.maps:
+        raise InputError(f"{data.name}: its maps are not kept; set data.maps=true")
+    pairs = min(settings.limit, data.pairs) if settings.limit else data.pairs
+    recipe = Recipe(**{f.name: getattr(replace(data, pairs=pairs), f.name) for f in fields(Recipe)})
+    manifest = build(Build(recipe, settings.cache, settings.jobs), say).manifest
+    rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
+    return [manifest.parent / "pairs" / row["file"] for row in rows]
+
+
+def report(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Evaluation) -> list[Table]:
+    """All tables."""
+    tables = [ranking(ranks, settings), matching(matches, settings)] if ranks else []
+    tables += [grouped(ranks, matches, key, settings) for key in BY if ranks]
+    if merges:
+        tables += [merging(merges, "", settings), *(merging(merges, key, settings) for key in BY)]
+    if any(m["change"] for m in matches):
+        tables.append(curves(ranks, matches, merges, settings))
+    return [*tables, reliability(matches, merges)]
+
+
+def short(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Evaluation) -> list[Table]:
+    """The tables that go into the documentation."""
+    if any(m["change"] for m in matches):
+        return [curves(ranks, matches, merges, settings)]
+    tables = [ranking(ranks, settings), matching(matches, settings), grouped(ranks, matches, "seen", settings)] if ranks else []
+    return [*tables, *([merging(merges, "area", settings)] if merges else [])]
+
+
+def _about(ranks: list[Row], merges: list[Row], settings: Evaluation, command: str) -> str:
+    rows = ranks or merges
+    pairs, buildings = len({r["pair"] for r in rows}), len({r["building"] for r in rows})
+    first = next(iter({r["variant"]: None for r in ranks}), "")
+    queries = [sum(r[f"queries{g}"] for r in ranks if r["variant"] == first) for g in ("", "_twin")]
+    text = (
+        f"{pairs} pairs of maps, {buildings} buildings"
+        + (f", {queries[0]} rooms with a partner, {queries[1]} of them with a twin" if ranks else "")
+        + ". In brackets 95 % intervals: whole buildings drawn again. A match is right when both rooms are the same true room; "
+        "what should be found are true rooms that both maps have. Twin: a near-identical other room in the other map."
+    )
+    return "\n\n".join(([f"`{command}`"] if command else []) + [text])

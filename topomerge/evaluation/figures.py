@@ -1,0 +1,165 @@
+"""Figures of an evaluation: reliability, recall by overlap, precision against recall, curves of robustness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.evaluation.groups import calibration, value
+from topomerge.evaluation.score import OVERLAPS, Row
+from topomerge.io.atomic import replacing
+
+ROUNDS = 500
+
+
+def save_figures(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], folder: Path) -> list[str]:
+    """Draw what there is something to draw of; names of the files."""
+    done = []
+    for name, draw in (
+        ("reliability", _reliability),
+        ("overlap", _overlap),
+        ("pr", _precision_recall),
+        ("robustness", _robustness),
+    ):
+        figure = draw(ranks, matches, merges)
+        if figure is not None:
+            with replacing(folder / f"{name}.png") as beside:
+                figure.savefig(beside, dpi=120, bbox_inches="tight", format="png")
+            done.append(f"{name}.png")
+    return done
+
+
+def _figure(columns: int) -> tuple[Any, Any]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.4 * columns, 3.6))
+    return figure, figure.subplots(1, columns, squeeze=False)[0]
+
+
+def _of(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
+    out: dict[str, list[Row]] = {}
+    for row in rows:
+        out.setdefault(row[key], []).append(row)
+    return out
+
+
+def _all(rows: Sequence[Row], key: str) -> list[Any]:
+    return [value for row in rows for value in row[key]]
+
+
+def _reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
+    """Share that was right against the probability that was told, with the number in each bin."""
+    sets = [("merges", {n: ([r["probability"] for r in s], [r["near"] for r in s]) for n, s in _of(merges, "variant").items()})]
+    told = [m for m in matches if m["k"] == 0 and m["method"] in ("consistent", "mutual")]
+    named = _of([{**m, "title": f"{m['variant']} {m['method']}"} for m in told], "title")
+    sets.append(("matches of rooms", {n: (_all(s, "chance"), _all(s, "good")) for n, s in named.items()}))
+    sets = [(title, some) for title, some in sets if any(len(p) for p, _ in some.values())]
+    if not sets:
+        return None
+    figure, axes = _figure(len(sets))
+    for ax, (title, some) in zip(axes, sets, strict=True):
+        ax.plot([0, 1], [0, 1], color="0.7", lw=1)
+        for name, (p, y) in some.items():
+            if len(p):
+                c = calibration(p, y)
+                line = ax.plot(c.told, c.right, "o-", ms=4, label=f"{name} ({len(p)}; ECE {c.error:.2f})")[0]
+                if len(some) == 1:
+                    for x, r, n in zip(c.told, c.right, c.count, strict=True):
+                        ax.annotate(
+                            str(n), (x, r), fontsize=7, color=line.get_color(), xytext=(3, -9), textcoords="offset points"
+                        )
+        ax.set(title=title, xlabel="probability told", ylabel="share right", xlim=(0, 1), ylim=(0, 1.02))
+        ax.legend(fontsize=7)
+    return figure
+
+
+def _overlap(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
+    """Recall of rooms and merges by the share of rooms in common."""
+    bins = [name for _, name in OVERLAPS]
+    if not any(r["overlap"] in bins for r in ranks):
+        return None
+    panels = [("recall@1 of rooms", "recall@1", {n: s for n, s in _of(ranks, "variant").items() if s[0]["k"] == 0})]
+    own = [
+        {**m, "title": f"{m['variant']}, {m['method']}"}
+        for m in matches
+        if m["k"] == 0 and m["method"] in ("growing", "consistent")
+    ]
+    panels.append(("F1 of matches", "F1", _of(own, "title")))
+    if merges:
+        panels.append(("pairs merged right", "merged", _of(merges, "variant")))
+    figure, axes = _figure(len(panels))
+    for ax, (title, metric, some) in zip(axes, panels, strict=True):
+        for shift, (name, rows) in enumerate(some.items()):
+            values = [value([r for r in rows if r["overlap"] == b], metric, ROUNDS) for b in bins]
+            x = np.arange(len(bins)) + 0.05 * (shift - len(some) / 2)
+            mid = np.array([v.value for v in values])
+            ends = np.array([[max(v.value - v.low, 0), max(v.high - v.value, 0)] for v in values]).T
+            ax.errorbar(x, mid, yerr=np.nan_to_num(ends), fmt="o-", ms=4, lw=1, capsize=2, label=name)
+        ax.set(title=title, xlabel="share of rooms in common", xticks=range(len(bins)), xticklabels=bins, ylim=(0, 1.02))
+        ax.legend(fontsize=7)
+    return figure
+
+
+def _precision_recall(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
+    """Precision against recall of matches, as the least probability that is taken falls; dots: methods that tell none."""
+    if not matches:
+        return None
+    figure, (ax,) = _figure(1)
+    for name, some in _of(matches, "variant").items():
+        if some[0]["k"]:
+            continue
+        color = None
+        for method, these in _of(some, "method").items():
+            units = sum(r["units"] for r in these)
+            p, good = np.concatenate([r["chance"] for r in these]), np.concatenate([r["good"] for r in these]).astype(float)
+            if not len(p) or not units:
+                continue
+            if method in ("consistent", "mutual"):
+                order = np.argsort(-p, kind="stable")
+                right = good[order].cumsum()
+                share = sum(r["found"] for r in these) / max(good.sum(), 1)  # pieces of a room found twice count once
+                line = ax.plot(
+                    right * share / units, right / np.arange(1, len(p) + 1), lw=1.2, color=color, label=f"{name}, {method}"
+                )
+                color = line[0].get_color()
+            else:
+                v = [value(these, m, 1).value for m in ("recall", "precision")]
+                mark = {"full": "s", "assignment": "o", "growing": "^"}.get(method, "x")
+                dot = ax.plot(*v, mark, ms=5, color=color, label=f"{name}, {method}")
+                color = dot[0].get_color()
+    ax.set(xlabel="recall of rooms in common", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
+    ax.legend(fontsize=6, ncols=2)
+    return figure
+
+
+def _robustness(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
+    """F1 against what was changed, one panel a change."""
+    changes = sorted({m["change"] for m in matches if m["change"]})
+    if not changes:
+        return None
+    figure, axes = _figure(len(changes))
+    for ax, change in zip(axes, changes, strict=True):
+        some = [
+            m for m in matches if m["change"] == change and m["k"] == 0 and m["method"] in ("assignment", "consistent", "mutual")
+        ]
+        values = sorted({m["value"] for m in some})
+        for name, rows in _of([{**m, "title": f"{m['variant']}, {m['method']}"} for m in some], "title").items():
+            ax.plot(values, [value([r for r in rows if r["value"] == v], "F1", 1).value for v in values], "o-", ms=4, label=name)
+        joined = [m for m in merges if m["change"] == change]
+        if joined:
+            right = [value([r for r in joined if r["value"] == v], "merged", 1).value for v in values]
+            ax.plot(values, right, "k--", lw=1, label="merged right")
+        ax.set(title=change, xlabel=LABELS[change], ylabel="F1", ylim=(0, 1.02))
+        if change == "density":
+            ax.set_xscale("log")
+        ax.legend(fontsize=6)
+    return figure
+
+
+LABELS = {
+    "density": "share of the points", "noise": "m of noise", "missing": "share of the surface missing",
+    "scale": "scale of the second map", "time": "share of the furniture moved or gone",
+}  # fmt: skip

@@ -1,0 +1,203 @@
+"""One row of counts for each pair, variant and method: what is right, what is wrong, what was missed.
+
+Counts are kept, not ratios, so that any group of pairs can be summed (`groups`). A match is right when both rooms are the same
+true room; of a room that came out in pieces every piece may be matched (method, section 4). What should be found are the true
+rooms that both maps have: one right match finds one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.datasets.kept import KeptPair, load_kept
+from topomerge.evaluation.settings import Evaluation, variants
+from topomerge.io import archive
+from topomerge.types import Array, Sim3
+
+Row = dict[str, Any]
+NEAR, FINE = (0.5, 5.0), (0.1, 1.0)  # m, degrees
+SHARED = 80.0  # m2 in common, from which on maps should be merged
+AREAS = (("<40", 40.0), ("40-80", 80.0), ("80-200", 200.0), (">200", np.inf))  # m2
+OVERLAPS = ((0.0, "0"), (0.175, "0.1"), (0.375, "0.25"), (0.625, "0.5"), (1.0, "0.75"))  # share: up to, name
+GROUPS = ("", "_twin", "_single")  # rooms that have a near-identical one in the other map, and those that have none
+
+
+def score_all(pairs: Sequence[Path], predictions: Sequence[Path], settings: Evaluation) -> tuple[list[Row], list[Row], list[Row]]:
+    """Rows of matches, of the ranking of rooms, and of merges."""
+    matches: list[Row] = []
+    ranks: list[Row] = []
+    merges: list[Row] = []
+    some = list(variants(settings))
+    for path, file in zip(pairs, predictions, strict=True):
+        kept, data = load_kept(path), archive.read(file, "predictions")
+        told = json.loads(data["told"].tobytes())
+        about = group_of(kept, settings)
+        known = kept.about["rooms"] != "laid" or bool(len(kept.matches))
+        for v in some if known else ():
+            head = {**about, "variant": v.name, "descriptor": v.descriptor, "k": v.k, "context": v.context if v.k else "-"}
+            ranks.append({**head, "seconds": told["seconds"][v.name], **rank_counts(kept, data[f"{v.name}/cost"])})
+            for method in v.methods:
+                rooms, chance = data[f"{v.name}/{method}/rooms"], data[f"{v.name}/{method}/probability"]
+                seconds = float(data[f"{v.name}/{method}/seconds"])
+                row = {**head, "method": method, "seconds": seconds, **match_counts(kept, rooms)}
+                matches.append({**row, "chance": chance.tolist(), "good": right_matches(kept, rooms).tolist()})
+        merges += [{**about, "variant": name, **merge_counts(kept, said)} for name, said in told["merge"].items()]
+    return matches, ranks, merges
+
+
+def group_of(kept: KeptPair, settings: Evaluation) -> Row:
+    """What a pair is counted under."""
+    about = kept.about
+    source, common, kind = about["source"], float(about["common"]), about["kind"]
+    size = next(name for name, limit in AREAS if common < limit) if kind == "overlap" and common >= 1 else "none"
+    change = about.get("change") or ("", 0.0)
+    return {
+        "pair": kept.name,
+        "building": f"{source}/{about['building']}",
+        "source": source,
+        "seen": "trained" if source in settings.data.trained else "unseen",
+        "sensors": "-".join(sorted(about["sensors"])),
+        "kind": kind,
+        "overlap": overlap_bin(float(about["overlap"]), kind),
+        "common": common,
+        "area": size,
+        "large": common >= SHARED and kind == "overlap",
+        "truth": about["rooms"],
+        "change": change[0],
+        "value": float(change[1]),
+    }
+
+
+def overlap_bin(share: float, kind: str = "overlap") -> str:
+    """Name of the bin that a share of rooms in common falls in; of hard negatives their kind."""
+    return kind if kind != "overlap" else next(name for limit, name in OVERLAPS if share <= limit)
+
+
+def right_matches(kept: KeptPair, rooms: Array) -> Array:
+    """(M,) bool: are both rooms of each match one true room?"""
+    true = {tuple(m) for m in kept.matches.tolist()}
+    return np.array([tuple(m) in true for m in rooms.tolist()], bool)
+
+
+def match_counts(kept: KeptPair, rooms: Array) -> Row:
+    """Counts of matches (M, 2).
+
+    `predicted`, `right`: matches; `units`, `found`: true rooms that both maps have, and those that a right match found; each also
+    of rooms with (`_twin`) and without (`_single`) a near-identical one in the other map. `strict_right`: right ones between the
+    rooms that are assigned to the true room one to one; `strict_units`: true rooms for which both maps have one.
+    """
+    good = right_matches(kept, rooms)
+    i, j = rooms.T if len(rooms) else (np.zeros(0, int), np.zeros(0, int))
+    twin = kept.twin[0][i] | kept.twin[1][j]
+    units = _units(kept)
+    hit = {_unit(kept, *m) for m in rooms[good].tolist()}
+    of_twins = {u for u, some in units.items() if any(kept.twin[0][a] or kept.twin[1][b] for a, b in some)}
+    strict = {u for u, some in units.items() if any(kept.one[0][a] and kept.one[1][b] for a, b in some)}
+    both = kept.one[0][i] & kept.one[1][j] & good
+    out: Row = {"strict_right": int(both.sum()), "strict_units": len(strict), "pairs": 1}
+    for name, some, these in zip(GROUPS, (twin | True, twin, ~twin), (set(units), of_twins, set(units) - of_twins), strict=True):
+        out |= {f"predicted{name}": int(some.sum()), f"right{name}": int((good & some).sum())}
+        out |= {f"units{name}": len(these), f"found{name}": len(these & hit)}
+    return out
+
+
+def _unit(kept: KeptPair, i: int, j: int) -> tuple[int, int]:
+    return int(kept.true[0][i]), int(kept.true[1][j])
+
+
+def _units(kept: KeptPair) -> dict[tuple[int, int], list[tuple[int, int]]]:
+    """True rooms that both maps have -> matches of their pieces."""
+    out: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j in kept.matches.tolist():
+        out.setdefault(_unit(kept, i, j), []).append((i, j))
+    return out
+
+
+def ranks_of(cost: Array, matches: Array) -> tuple[Array, Array]:
+    """(Q,) rows that have a partner, and (Q,) rank of its best partner, from 1: columns that are no partner and cost as much
+    count before it.
+
+    Args:
+        cost: (R_a, R_b).
+        matches: (M, 2) true ones.
+    """
+    rooms = np.unique(matches[:, 0])
+    rank = np.zeros(len(rooms), int)
+    for q, i in enumerate(rooms.tolist()):
+        partner = np.zeros(cost.shape[1], bool)
+        partner[matches[matches[:, 0] == i, 1]] = True
+        rank[q] = 1 + int((cost[i, ~partner] <= cost[i, partner].min()).sum())
+    return rooms, rank
+
+
+def rank_counts(kept: KeptPair, cost: Array) -> Row:
+    """`queries`: rooms of either map with a true partner in the other; `first`, `five`: whose partner ranks first, within five;
+    `reciprocal`: sum of 1 / rank; each also with and without a twin."""
+    rank, twin = [], []
+    for side, c, m in ((0, cost, kept.matches), (1, cost.T, kept.matches[:, ::-1])):
+        rooms, found = ranks_of(c, m)
+        rank.append(found)
+        twin.append(kept.twin[side][rooms])
+    r, t = np.concatenate(rank), np.concatenate(twin).astype(bool)
+    out: Row = {"pairs": 1}
+    for name, some in zip(GROUPS, (t | True, t, ~t), strict=True):
+        out[f"queries{name}"] = int(some.sum())
+        out[f"first{name}"] = int((r[some] == 1).sum())
+        out[f"five{name}"] = int((r[some] <= 5).sum())
+        out[f"reciprocal{name}"] = float((1 / r[some]).sum())
+    return out
+
+
+def pose_error(pose: Sim3, truth: Sim3, anchor: Array) -> tuple[float, float, float]:
+    """Error at a point of b: horizontal and vertical, m, and of the yaw, degrees."""
+    off = (pose.apply(anchor[None]) - truth.apply(anchor[None]))[0]
+    turned = abs((pose.yaw - truth.yaw + np.pi) % (2 * np.pi) - np.pi)
+    return float(np.hypot(*off[:2])), float(abs(off[2])), float(np.degrees(turned))
+
+
+def within(error: tuple[float, float, float], flat: bool, limits: tuple[float, float]) -> bool:
+    """Is a pose right? A slice says nothing of its height."""
+    far = error[0] if flat else float(np.hypot(error[0], error[1]))
+    return far < limits[0] and error[2] < limits[1]
+
+
+def merge_counts(kept: KeptPair, said: Mapping[str, Any]) -> Row:
+    """`near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed and
+    near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common."""
+    mergeable = kept.transform is not None and kept.about["kind"] == "overlap" and kept.about["common"] >= 1
+    near = fine = False
+    error: tuple[float, float, float] | None = None
+    if mergeable and said["pose"] is not None:
+        assert kept.transform is not None
+        m = np.array(said["pose"])
+        pose = Sim3(float(np.arctan2(m[1, 0], m[0, 0])), tuple(m[:3, 3].tolist()), float(m[2, 2]))  # type: ignore[arg-type]
+        error = pose_error(pose, kept.transform, kept.anchor)
+        flat = any(s in FLAT for s in kept.about["sensors"])
+        near, fine = within(error, flat, NEAR), within(error, flat, FINE)
+    believed = bool(said["believed"])
+    rooms = np.array(said["rooms"], np.int64).reshape(-1, 2)
+    counted = match_counts(kept, rooms)
+    return {
+        "mergeable": int(mergeable),
+        "near": int(near),
+        "fine": int(fine),
+        "believed": int(believed),
+        "merged": int(believed and near),
+        "merged_fine": int(believed and fine),
+        "false": int(believed and not near),
+        "refused": int(near and not believed),
+        "probability": said["probability"],
+        "seconds": said["seconds"],
+        "error": error,
+        **counted,
+        "chance": list(said["chance"]),
+        "good": right_matches(kept, rooms).tolist(),
+    }
+
+
+FLAT = ("laser2d", "drawing")  # sensors whose maps have no height

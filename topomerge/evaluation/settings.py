@@ -1,0 +1,171 @@
+"""What an evaluation is told: the pairs, what predicts, and what is reported."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from topomerge.datasets.recipe import Recipe
+from topomerge.embedding.context import HOWS
+from topomerge.embedding.embedders import EMBEDDERS
+from topomerge.errors import InputError
+from topomerge.io.listing import plain
+
+METHODS = ("full", "assignment", "growing", "consistent", "mutual")
+FORMAT = 1  # of the predictions
+
+
+@dataclass
+class Pairs(Recipe):
+    """The pairs: simulated ones of a recipe, or real ones.
+
+    Args:
+        real: sources of real pairs (`datasets.real.SOURCES`); the recipe then only gives the name, the folder and the voxel size.
+        trained: sources that trained something; the others are reported apart.
+    """
+
+    real: list[str] = field(default_factory=list)
+    trained: list[str] = field(default_factory=lambda: ["procedural", "r2v", "campus"])
+
+
+@dataclass
+class Evaluation:
+    """Settings of an evaluation.
+
+    Args:
+        run: trained embedders: runs, or what was exported of them.
+        name: folder below `folder`; empty: from the data and the runs.
+        cache: of the pairs and of descriptors.
+        limit: only the first so many pairs; 0: all.
+        jobs: processes.
+        descriptors: name -> options of `embedder`, its `name` among them.
+        k: steps of context of these; context: how it is put together.
+        methods: "full" (every room that can have a partner gets one: the thesis' assignment), "assignment" (dear pairs stay
+            alone), "growing" (the thesis'), "consistent" (one transform must explain the matches), "mutual" (each other's
+            likeliest, by the probabilities of a trained embedder).
+        slow_k: "consistent" is run for these k only.
+        merge: merge the maps, too, with each of the `mergers` among the descriptors, at k = 0, and each run.
+        baseline: variant that the others are compared with.
+        rounds: of the bootstrap.
+        write: a Markdown file, to the marked section of which a short table goes; empty: none.
+        section: the name of that mark.
+        remake: make predictions again that are there.
+    """
+
+    data: Pairs = field(default_factory=Pairs)
+    run: list[str] = field(default_factory=list)
+    name: str = ""
+    folder: str = "runs/eval"
+    cache: str = "cache/evaluation"
+    limit: int = 0
+    jobs: int = 1
+    descriptors: dict[str, dict[str, Any]] = field(default_factory=dict)
+    k: list[int] = field(default_factory=lambda: [0])
+    context: list[str] = field(default_factory=lambda: ["join"])
+    methods: list[str] = field(default_factory=lambda: ["full", "assignment", "growing", "consistent"])
+    slow_k: list[int] = field(default_factory=lambda: [0])
+    merge: bool = True
+    mergers: list[str] = field(default_factory=lambda: ["engineered"])
+    baseline: str = "engineered"
+    rounds: int = 2000
+    write: str = ""
+    section: str = "evaluation"
+    remake: bool = False
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to describe rooms, and how it is matched."""
+
+    name: str
+    descriptor: str
+    k: int = 0
+    context: str = "join"
+    methods: tuple[str, ...] = ()
+    run: str = ""
+
+
+def check(settings: Evaluation) -> None:
+    """Refuse what can't be evaluated.
+
+    Raises:
+        InputError: names the key.
+    """
+    for name, options in settings.descriptors.items():
+        if options.get("name") not in EMBEDDERS:
+            raise InputError(f"descriptors.{name}.name {options.get('name')!r}: {', '.join(EMBEDDERS)} are possible")
+    for key, known in (("methods", METHODS), ("context", HOWS)):
+        for value in getattr(settings, key):
+            if value not in known:
+                raise InputError(f"{key}: unknown {value!r}; {', '.join(known)} are possible")
+    if any(k < 0 for k in settings.k) or settings.limit < 0 or settings.rounds < 1 or settings.jobs < 1:
+        raise InputError("k and limit must be 0 or more, rounds and jobs 1 or more")
+    for name in settings.mergers:
+        if name not in settings.descriptors and not settings.run:
+            raise InputError(f"mergers: {name!r} is none of the descriptors {', '.join(settings.descriptors)}")
+    if not settings.descriptors and not settings.run:
+        raise InputError("nothing to evaluate: name descriptors, or run=runs/x")
+    for run in settings.run:
+        if not Path(run).exists():
+            raise InputError(f"run={run}: no such folder or file; name a run that was trained")
+
+
+def variants(settings: Evaluation) -> Iterator[Variant]:
+    """Everything that describes rooms: each descriptor at each k (with k = 0 there is one context), then each run."""
+    for name in settings.descriptors:
+        for k in settings.k:
+            for how in settings.context if k else settings.context[:1]:
+                methods = tuple(m for m in settings.methods if m != "mutual" and (m != "consistent" or k in settings.slow_k))
+                title = name if not k else f"{name} k={k} {how}"
+                yield Variant(title, name, k, how, methods)
+    for run in settings.run:
+        yield Variant(run_name(run), run_name(run), methods=tuple(settings.methods), run=run)
+
+
+def run_name(run: str) -> str:
+    """What a run is called in tables: its folder."""
+    path = Path(run)
+    return path.parent.name if path.is_file() or path.name in ("best", "last") else path.name
+
+
+def folder_of(settings: Evaluation) -> Path:
+    """Where the evaluation is written."""
+    name = settings.name or "-".join([settings.data.name, *(run_name(r) for r in settings.run)])
+    return Path(settings.folder) / name
+
+
+def told(settings: Evaluation) -> dict[str, Any]:
+    """What the predictions depend on, as plain values; the weights of runs as a digest."""
+    keys = ("data", "limit", "descriptors", "k", "context", "methods", "slow_k", "merge", "mergers")
+    known = {k: v for k, v in asdict(settings).items() if k in keys}
+    known["data"].pop("trained")
+    known["data"].pop("folder")
+    runs = {run_name(run): digest_of(Path(run)) for run in settings.run}
+    found: dict[str, Any] = plain({"format": FORMAT, **known, "run": runs})
+    return found
+
+
+def digest_of(path: Path) -> str:
+    """Hash of a trained embedder's weights."""
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.suffix == ".safetensors")
+    best = [f for f in files if "best" in f.parts or f.stem == "best"] or files
+    whole = hashlib.sha256()
+    for file in best:
+        whole.update(file.read_bytes())
+    return whole.hexdigest()[:16]
+
+
+def difference(old: Mapping[str, Any], new: Mapping[str, Any], at: str = "") -> str:
+    """The first key in which two settings differ, with both values; empty where they do not."""
+    for key in sorted({*old, *new}):
+        a, b = old.get(key), new.get(key)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            if found := difference(a, b, f"{at}{key}."):
+                return found
+        elif json.dumps(a) != json.dumps(b):
+            return f"{at}{key}: {json.dumps(a)} there, {json.dumps(b)} now"
+    return ""

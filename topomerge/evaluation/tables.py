@@ -1,0 +1,226 @@
+"""Scores as tables: Markdown to read, CSV to reckon with, LaTeX for the thesis."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.evaluation.groups import Value, calibration, gain, value
+from topomerge.evaluation.score import Row
+from topomerge.evaluation.settings import Evaluation
+from topomerge.io.atomic import replacing
+
+BY = {
+    "overlap": "Share of rooms in common, or kind of hard negative",
+    "area": "m² that both maps saw",
+    "sensors": "Sensors",
+    "source": "Source",
+    "seen": "Sources that trained something, and those that did not",
+}
+RANKING = ("recall@1", "recall@1_single", "recall@1_twin", "recall@5", "MRR")
+MATCHING = ("precision", "recall", "F1", "F1_single", "F1_twin", "strict recall")
+MERGING = ("right poses", "merged", "merged finely", "refused")
+NAMES = {
+    "recall@1": "recall@1", "recall@1_single": "without twin", "recall@1_twin": "with twin", "recall@5": "recall@5", "MRR": "MRR",
+    "precision": "precision", "recall": "recall", "F1": "F1", "F1_single": "F1 without twin", "F1_twin": "F1 with twin",
+    "strict recall": "recall one to one", "right poses": "best pose right", "merged": "merged right", "refused": "right, refused",
+    "merged finely": "within 0.1 m, 1°",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of words; the first `names` columns are no numbers."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    names: int = 1
+
+    def markdown(self) -> str:
+        lines = ["| " + " | ".join(self.head) + " |", "|" + "---|" * len(self.head)]
+        return f"{self.title}\n\n" + "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in self.rows)])
+
+    def latex(self) -> str:
+        columns = "l" * self.names + "r" * (len(self.head) - self.names)
+        lines = [" & ".join(_escaped(c) for c in row) + r" \\" for row in (self.head, *self.rows)]
+        body = "\n".join([lines[0], r"\midrule", *lines[1:]])
+        caption = f"\\caption{{{_escaped(self.title)}}}"
+        whole = [r"\begin{table}", r"\centering", caption, f"\\begin{{tabular}}{{{columns}}}", r"\toprule", body, r"\bottomrule"]
+        return "\n".join([*whole, r"\end{tabular}", r"\end{table}"])
+
+
+def _escaped(text: str) -> str:
+    text = re.sub(r"([&%$#_{}])", r"\\\1", text)
+    for plain, tex in (("²", r"$^2$"), ("°", r"$^\circ$"), ("≥", r"$\geq$"), ("<", r"$<$"), (">", r"$>$"), ("–", "--")):
+        text = text.replace(plain, tex)
+    return text
+
+
+def cell(v: Value, interval: bool = True) -> str:
+    """0.52 [0.47, 0.58]; – where nothing was counted."""
+    if not np.isfinite(v.value):
+        return "–"
+    return f"{v.value:.2f}" + (f" [{v.low:.2f}, {v.high:.2f}]" if interval and v.buildings > 1 else "")
+
+
+def by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
+    """Rows by what they say under a key, in the order of their names."""
+    out: dict[str, list[Row]] = {}
+    for row in rows:
+        out.setdefault(str(row[key]), []).append(row)
+    order = ["none", "<40", "40-80", "80-200", ">200"] if key == "area" else sorted(out)
+    return {name: out[name] for name in order if name in out}
+
+
+def ranking(ranks: Sequence[Row], settings: Evaluation) -> Table:
+    """How high the true partner of a room ranks among all rooms of the other map."""
+    first = [r for r in ranks if r["variant"] == settings.baseline]
+    rows = []
+    for name, some in _variants(ranks).items():
+        better = gain(some, first, "recall@1", settings.rounds) if name != settings.baseline else None
+        cells = [cell(value(some, m, settings.rounds), m in ("recall@1", "recall@5")) for m in RANKING]
+        took = np.median([r["seconds"] for r in some])
+        rows.append([name, *cells, _signed(better), f"{took:.2f}"])
+    head = ["descriptor", *(NAMES[m] for m in RANKING), f"recall@1 more than {settings.baseline}", "s a pair"]
+    return Table("Ranking of rooms: is a room's true partner the nearest?", head, rows)
+
+
+def _signed(v: Value | None) -> str:
+    return "" if v is None or not np.isfinite(v.value) else f"{v.value:+.2f} [{v.low:+.2f}, {v.high:+.2f}]"
+
+
+def _variants(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: r["variant"]) -> dict[str, list[Row]]:
+    out: dict[str, list[Row]] = {}
+    for row in rows:
+        out.setdefault(key(row), []).append(row)
+    return out
+
+
+def matching(matches: Sequence[Row], settings: Evaluation) -> Table:
+    """Precision, recall and F1 of each descriptor and method."""
+    rows = []
+    for name, some in _variants(matches).items():
+        for method, these in _variants(some, lambda r: r["method"]).items():
+            cells = [cell(value(these, m, settings.rounds), m == "F1") for m in MATCHING]
+            large = cell(value([r for r in these if r["large"]], "F1", settings.rounds))
+            took = np.median([r["seconds"] for r in these])
+            rows.append([name, method, *cells, large, f"{took:.2f}"])
+    head = ["descriptor", "matching", *(NAMES[m] for m in MATCHING), "F1, ≥ 80 m² shared", "s a pair"]
+    return Table("Matches of rooms", head, rows, 2)
+
+
+def grouped(ranks: Sequence[Row], matches: Sequence[Row], key: str, settings: Evaluation) -> Table:
+    """recall@1, and F1 of the best method, for each group and descriptor without context or trained one."""
+    rows = []
+    of = by(matches, key)
+    for group, some in by(ranks, key).items():
+        for name, these in _variants([r for r in some if r["k"] == 0]).items():
+            own = _variants([m for m in of.get(group, []) if m["variant"] == name], lambda r: r["method"])
+            cells = [cell(value(own.get(m, []), "F1", settings.rounds)) for m in _methods(matches)]
+            pairs = value(these, "recall@1", settings.rounds)
+            rows.append([group, str(pairs.pairs), str(pairs.buildings), name, cell(pairs), *cells])
+    head = [key, "pairs", "buildings", "descriptor", "recall@1", *(f"F1 {m}" for m in _methods(matches))]
+    return Table(BY[key], head, rows, 4)
+
+
+def _methods(matches: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(m["method"] for m in matches if m["k"] == 0))
+
+
+def merging(merges: Sequence[Row], key: str, settings: Evaluation) -> Table:
+    """Share of pairs merged right, refused and merged wrongly, by group."""
+    rows = []
+    for name, some in _variants(merges).items():
+        for group, these in {"all": some, **(by(some, key) if key else {})}.items():
+            pairs, able = len({r["pair"] for r in these}), sum(r["mergeable"] for r in these)
+            cells = [cell(value(these, m, settings.rounds), m == "merged") for m in MERGING]
+            false, took = sum(r["false"] for r in these), np.median([r["seconds"] for r in these])
+            rows.append([name, group, str(pairs), str(able), *cells, str(false), f"{took:.1f}"])
+    head = ["descriptor", key or "pairs", "pairs", "mergeable", *(NAMES[m] for m in MERGING), "merged wrong", "s a pair"]
+    title = "Merges: of the pairs that have something in common, within 0.5 m and 5°"
+    return Table(title + (f", by {BY[key][0].lower()}{BY[key][1:]}" if key else ""), head, rows, 2)
+
+
+def reliability(matches: Sequence[Row], merges: Sequence[Row]) -> Table:
+    """How far told probabilities are from what came true."""
+    rows = []
+    for what, some in ((f"match, {m}", r) for m, r in _variants(matches, lambda r: f"{r['variant']} {r['method']}").items()):
+        if some[0]["k"] == 0 and some[0]["method"] in ("consistent", "mutual"):
+            rows.append(_calibrated(what, [p for r in some for p in r["chance"]], [g for r in some for g in r["good"]]))
+    for name, some in _variants(merges).items():
+        rows.append(_calibrated(f"merge, {name}", [r["probability"] for r in some], [bool(r["near"]) for r in some]))
+        chance, good = [p for r in some for p in r["chance"]], [g for r in some for g in r["good"]]
+        rows.append(_calibrated(f"match of believed merges, {name}", chance, good))
+    head = ["probability of", "number", "told, mean", "right", "expected calibration error"]
+    return Table("Calibration", head, [r for r in rows if r])
+
+
+def _calibrated(what: str, told: Sequence[float], right: Sequence[bool]) -> list[str]:
+    if not len(told):
+        return []
+    found = calibration(told, right)
+    return [what, str(len(told)), f"{np.mean(told):.2f}", f"{np.mean(right):.2f}", f"{found.error:.3f}"]
+
+
+def curves(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Table:
+    """recall@1, F1 and merges against what was changed."""
+    rows = []
+    for change, changed in by([m for m in matches if m["change"]], "change").items():
+        for v in sorted({m["value"] for m in changed}):
+            for name in _variants([m for m in changed if m["k"] == 0]):
+                these = [m for m in changed if m["value"] == v and m["variant"] == name]
+                cells = [cell(value([m for m in these if m["method"] == k], "F1", settings.rounds)) for k in _methods(matches)]
+                there = [r for r in ranks if (r["change"], r["value"], r["variant"]) == (change, v, name)]
+                joined = [r for r in merges if (r["change"], r["value"], r["variant"]) == (change, v, name)]
+                first = value(there, "recall@1", settings.rounds)
+                right = cell(value(joined, "merged", settings.rounds), False)
+                rows.append([change, f"{v:g}", name, str(first.pairs), cell(first), *cells, right])
+    head = ["change", "value", "descriptor", "pairs", "recall@1", *(f"F1 {m}" for m in _methods(matches)), "merged right"]
+    return Table("Robustness", head, rows, 3)
+
+
+def long_rows(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Iterator[Row]:
+    """Every metric of every group, one a row, for other tools."""
+    for rows, metrics in ((ranks, RANKING), (matches, MATCHING), (merges, (*MERGING, "false"))):
+        for (variant, method), some in _pairs(rows).items():
+            for key in ("all", *BY):
+                for group, these in {"all": some}.items() if key == "all" else by(some, key).items():
+                    for metric in metrics:
+                        v = value(these, metric, min(settings.rounds, 500))
+                        head = {"variant": variant, "method": method, "by": key, "group": group, "metric": metric}
+                        yield {**head, "value": v.value, "low": v.low, "high": v.high, "pairs": v.pairs, "buildings": v.buildings}
+
+
+def _pairs(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    out: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        out.setdefault((row["variant"], row.get("method", "")), []).append(row)
+    return out
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> None:
+    """Rows with the same keys; lists are left out."""
+    if not rows:
+        return
+    names = [n for n in rows[0] if not isinstance(rows[0][n], list)]
+    with replacing(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows({n: f"{r[n]:.6g}" if isinstance(r[n], float) else r[n] for n in names} for r in rows)
+
+
+def write_section(path: Path, mark: str, text: str) -> None:
+    """Replace what stands between the two marks of a file, or add marks and a section at its end."""
+    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
+    whole = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
+    if begin not in whole or end not in whole:
+        whole = f"{whole.rstrip()}\n\n## {mark.capitalize()}\n\n{begin}\n{end}\n"
+    before, rest = whole.split(begin, 1)
+    with replacing(path) as beside:
+        beside.write_text(f"{before}{begin}\n{text}\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")
