@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from topomerge.extraction.extract import PRESETS as PRESETS
     from topomerge.extraction.extract import extract as extract
     from topomerge.extraction.voxels import voxelise as voxelise
+    from topomerge.fusion.atlas import AtlasResult as AtlasResult
+    from topomerge.fusion.atlas import atlas as atlas
     from topomerge.fusion.merge import merge as merge
     from topomerge.fusion.result import MergeResult as MergeResult
     from topomerge.io.listing import map_to_json as map_to_json
@@ -26,10 +28,12 @@ if TYPE_CHECKING:
     from topomerge.io.points import read_chunks as read_chunks
     from topomerge.io.points import read_points as read_points
     from topomerge.io.rooms_ply import save_rooms_ply as save_rooms_ply
+    from topomerge.models.learned import load_embedder as load_embedder
     from topomerge.types import PointCloud as PointCloud
     from topomerge.types import Sim3 as Sim3
     from topomerge.types import TopometricMap as TopometricMap
     from topomerge.types import VoxelGrid as VoxelGrid
+    from topomerge.viz.atlas_report import atlas_html as atlas_html
     from topomerge.viz.figures import plan_figure as plan_figure
     from topomerge.viz.figures import save_figure as save_figure
     from topomerge.viz.merge_report import save_merge as save_merge
@@ -38,6 +42,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "AtlasResult": "topomerge.fusion.atlas",
     "InputError": "topomerge.errors",
     "MergeResult": "topomerge.fusion.result",
     "PRESETS": "topomerge.extraction.extract",
@@ -45,7 +50,10 @@ _HOMES = {
     "Sim3": "topomerge.types",
     "TopometricMap": "topomerge.types",
     "VoxelGrid": "topomerge.types",
+    "atlas": "topomerge.fusion.atlas",
+    "atlas_html": "topomerge.viz.atlas_report",
     "extract": "topomerge.extraction.extract",
+    "load_embedder": "topomerge.models.learned",
     "load_map": "topomerge.io.maps",
     "map_to_json": "topomerge.io.listing",
     "merge": "topomerge.fusion.merge",

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import topomerge
+from topomerge.atlas_commands import atlas_verb
 from topomerge.command import Command, count, option
 from topomerge.console import Bars, check_outputs, warn, write_all
 from topomerge.errors import InputError
@@ -184,15 +185,13 @@ def merge_command(args: argparse.Namespace) -> int:
 
 
 def _check_inputs(paths: list[str]) -> None:
-    if len(paths) != 2:
-        later = "more than two need an atlas, which comes later: merge two, then merged/map.tmap with the next"
-        advice = later if len(paths) > 2 else "give another one"
-        raise InputError(f"{paths[-1]}: merge takes two maps, {len(paths)} given; {advice}")
-    for path in paths:
+    if len(paths) < 2:
+        raise InputError(f"{paths[-1]}: merge takes two maps or more, {len(paths)} given; give another one")
+    for k, path in enumerate(paths):
         if not Path(path).exists():
             raise InputError(f"{path}: no such file")
-    if Path(paths[0]).resolve() == Path(paths[1]).resolve():
-        raise InputError(f"{paths[1]}: is given twice; give two different maps")
+        if Path(path).resolve() in [Path(other).resolve() for other in paths[:k]]:
+            raise InputError(f"{path}: is given twice; give different maps")
 
 
 def _merge(args: argparse.Namespace, folder: Path) -> int:
@@ -322,10 +321,10 @@ COMMANDS = (
     Command(
         "merge",
         merge_command,
-        "bring two maps together, or say why not",
+        "bring maps together, or say why not",
         "topomerge merge a.ply b.laz -o merged/",
         (
-            option("inputs", nargs="+", metavar="MAP", help="two clouds or .tmap, in any mix; clouds are extracted first"),
+            option("inputs", nargs="+", metavar="MAP", help="clouds or .tmap, two or more, in any mix"),
             option(
                 "-o",
                 "--output",
@@ -339,7 +338,7 @@ COMMANDS = (
                 dest="scale_of_b",
                 choices=("fixed", "free"),
                 default="fixed",
-                help="free: that of the second is unknown",
+                help="free: those of all but the first are unknown",
             ),
             option("--force", action="store_true", help="write the best merge even if it is not believed (status 2 stays)"),
             option("--threshold", type=_share, metavar="P", help="probability from which a merge is believed (default 0.9)"),
@@ -347,7 +346,8 @@ COMMANDS = (
             option("-q", "--quiet", action="store_true", default=False, help="print nothing but warnings and a refusal"),
         ),
         paths=("inputs", "output"),
-        description="Bring two maps together: status 0 and a joined map, or status 2 and the reason why it is not believed.",
+        description="Bring maps together: status 0 and a joined map, or status 2 and the reason why it is not believed. Of more "
+        "than two, those that belong to the first are joined, and the others are named.",
     ),
     Command(
         "simulate",
@@ -382,6 +382,7 @@ COMMANDS = (
         description="Print a script with which the Tab key completes commands, options and their values: for bash to go into "
         "~/.bashrc, for zsh into ~/.zshrc, for fish into ~/.config/fish/completions/topomerge.fish.",
     ),
+    atlas_verb(_map_from, tuple(o for o in MAPS if o[0][0] not in ("--descriptor", "--k")), _share),
     EXPORT,
     VIEW,
 )

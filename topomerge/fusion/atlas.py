@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, MutableMapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from topomerge.fusion.atlas_assembly import Assembler, Assembly, Link
 from topomerge.fusion.atlas_join import join_many
 from topomerge.fusion.atlas_maps import Maps, map_key
 from topomerge.fusion.atlas_pairs import Checks, Hypothesis, hypotheses, promise
-from topomerge.fusion.merge import _check_units, _warnings
+from topomerge.fusion.merge import _check_units
 from topomerge.fusion.pose_graph import residual
 from topomerge.fusion.verify import model
 from topomerge.io.maps import load_map
@@ -66,7 +66,13 @@ class AtlasResult:
     @property
     def status(self) -> str:
         """merged (all in one), parted (several components), or abstained (nothing could be connected)."""
-        return "merged" if len(self.components) == 1 else "parted" if len(self.components[0]) > 1 else "abstained"
+        if len(self.components) < 2:
+            return "merged"
+        return "parted" if len(self.components[0]) > 1 else "abstained"
+
+    def component_of(self, k: int) -> int:
+        """The component of a map."""
+        return next(n for n, members in enumerate(self.components) if k in members)
 
     def probability(self, component: int) -> float:
         """Of the weakest link of a component; 0 for a map alone."""
@@ -108,26 +114,61 @@ def atlas(
     Raises:
         InputError: fewer than two maps, one map twice, a map without cells, maps in different units, a wrong threshold or scale.
     """
-    began = time.perf_counter()
-    limit = _limit(threshold, scale)
-    first = [load_map(m) if not isinstance(m, TopometricMap) else m for m in maps[:1]]
-    names: list[str] = []
-    keys: list[str] = []
-    warnings: list[str] = []
-    for k, m in enumerate(maps):
-        this = m if isinstance(m, TopometricMap) else load_map(m)
-        names.append(this.source or f"map {k}")
-        keys.append(_checked(this, names, keys))
-        if k and scale == "fixed":
-            _check_units(first[0], this)
-        warnings += [w for w in _warnings(this, this, scale) if w not in warnings]
     if len(maps) < 2:
         raise InputError(f"an atlas needs two or more maps, not {len(maps)}; give another one")
-    order = sorted(range(len(maps)), key=lambda k: keys[k])
+    return solve(maps, scale=scale, threshold=threshold, embedder=embedder, known=known)
+
+
+def solve(
+    maps: Sequence[TopometricMap | str | Path],
+    names: Sequence[str] | None = None,
+    keys: Sequence[str] | None = None,
+    *,
+    scale: str = "fixed",
+    threshold: float | None = None,
+    embedder: str | Descriptor | None = None,
+    known: Known | None = None,
+) -> AtlasResult:
+    """As `atlas`, of any number of maps, one or none, too.
+
+    Args:
+        names: of the maps, for messages; their sources if None.
+        keys: what `map_key` should give for each map.
+
+    Raises:
+        InputError: as `atlas`; and a map has another key.
+    """
+    began = time.perf_counter()
+    limit = _limit(threshold, scale)
+    told, found, warnings = _looked_at(maps, names, keys, scale)
+    order = sorted(range(len(maps)), key=lambda k: found[k])
     inner = Maps([maps[k] for k in order], embedder)
-    explorer = _Explorer(inner, [keys[k] for k in order], scale, limit, {} if known is None else known)
-    found = explorer.explored()
-    return _result(found, explorer, maps, names, order, warnings, began)
+    explorer = _Explorer(inner, [found[k] for k in order], scale, limit, {} if known is None else known)
+    assembly = explorer.explored()
+    result = _result(assembly, explorer, told, order)
+    return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=tuple(warnings))
+
+
+def _looked_at(
+    maps: Sequence[TopometricMap | str | Path], names: Sequence[str] | None, keys: Sequence[str] | None, scale: str
+) -> tuple[list[str], list[str], list[str]]:
+    """Names, keys and warnings of the maps, one after the other."""
+    told: list[str] = []
+    found: list[str] = []
+    warnings: list[str] = []
+    first: TopometricMap | None = None
+    for k, m in enumerate(maps):
+        this = m if isinstance(m, TopometricMap) else load_map(m)
+        first = this if first is None else first
+        told.append(names[k] if names else this.source or f"map {k}")
+        found.append(_checked(this, told, found))
+        if keys and keys[k] != found[k]:
+            raise InputError(f"{m}: is not the map that was added as {told[k]}; take it out with `topomerge atlas remove`")
+        if k and scale == "fixed":
+            _check_units(first, this)
+        if not len(this.rooms):
+            warnings.append(f"{told[k]}: has no rooms: only walls and empty space can be compared")
+    return told, found, warnings
 
 
 def _limit(threshold: float | None, scale: str) -> float:
@@ -192,43 +233,30 @@ class _Explorer:
         return self.known[pair]
 
 
-def _result(
-    found: Assembly,
-    explorer: _Explorer,
-    maps: Sequence[TopometricMap | str | Path],
-    names: Sequence[str],
-    order: Sequence[int],
-    warnings: Sequence[str],
-    began: float,
-) -> AtlasResult:
+def _result(found: Assembly, explorer: _Explorer, names: Sequence[str], order: Sequence[int]) -> AtlasResult:
     """Everything by the places of the maps as they were given, in the frames of the first ones."""
     transforms: dict[int, Sim3] = {}
     residuals: dict[int, float] = {}
-    components = []
     for own in found.components:
         poses, edges = explorer.assembler.settled(own, found.links, fine=True)
         first = min(own, key=lambda k: order[k])
         back = poses[first].inverse()
-        components.append(tuple(sorted(order[k] for k in own)))
         for k in own:
             transforms[order[k]] = Sim3() if k == first else back @ poses[k]
             near = [residual(e, poses) for e in edges if k in e.maps]
             residuals[order[k]] = float(np.sqrt(np.mean(np.square(near)))) if near else float("nan")
+    components = [tuple(sorted(order[k] for k in own)) for own in found.components]
     components.sort(key=lambda c: (len(c) == 1, c))
-    kept = Maps(maps)
     named = [sorted((_renamed(x, order) for x in some), key=lambda x: x.maps) for some in (found.links, found.thrown)]
-    count = len(maps) * (len(maps) - 1) // 2
     return AtlasResult(
-        kept,
+        explorer.maps,
         tuple(names),
         tuple(components),
         transforms,
         tuple(named[0]),
         tuple(named[1]),
         residuals,
-        (len(explorer.tried), count),
-        time.perf_counter() - began,
-        tuple(warnings),
+        (len(explorer.tried), len(names) * (len(names) - 1) // 2),
     )
 
 
@@ -244,10 +272,12 @@ def _renamed(link: Link, order: Sequence[int]) -> Link:
 
 def _words(found: AtlasResult) -> Iterator[str]:
     def names(members: Iterable[int]) -> str:
-        return ", ".join(found.names[k] for k in members)
+        return ", ".join(Path(found.names[k]).name for k in members)
 
     joined = [c for c in found.components if len(c) > 1]
-    if not joined:
+    if len(found.names) < 2:
+        yield "one map, nothing to connect it with yet" if found.names else "no map"
+    elif not joined:
         yield f"nothing could be connected: all {len(found.names)} maps stand apart"
     for n, members in enumerate(joined):
         yield f"{len(members)} maps belong together ({names(members)}), weakest link {found.probability(n):.2f}"

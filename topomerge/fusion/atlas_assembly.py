@@ -241,7 +241,7 @@ class Assembler:
                 check = self.checks(i, j, poses[i].inverse() @ poses[j])
                 if (i, j) in held and not check.overlap:
                     check = Check(held[i, j], 0.0, True, {"walls": 1.0})
-                if check.overlap and (check.log_odds > 0 or (i, j) in held):
+                if check.overlap and ((i, j) in held or self._voice(i, j, poses[i].inverse() @ poses[j]) > 0):
                     pose = self.checks.fine(i, j, check.pose) if fine else check.pose
                     a, b = (self.checks.maps.prepared(k).views for k in (i, j))
                     weight = float(np.clip(check.features["walls"], 0.5, HEAVY))

@@ -39,7 +39,6 @@ class Maps:
         self._surfaces: OrderedDict[int, Surface] = OrderedDict()
         self._rows: dict[int, Array] = {}
         self._prepared: dict[int, Prepared] = {}
-        self._keys: dict[int, str] = {}
 
     def __len__(self) -> int:
         return len(self._maps)
@@ -47,12 +46,6 @@ class Maps:
     def __getitem__(self, k: int) -> TopometricMap:
         known = self._maps[k]
         return known if isinstance(known, TopometricMap) else _recent(self._recent, k, AT_ONCE, lambda: load_map(known))
-
-    def key(self, k: int) -> str:
-        """A hash of what a map holds; its name and how long it took do not count."""
-        if k not in self._keys:
-            self._keys[k] = map_key(self[k])
-        return self._keys[k]
 
     def prepared(self, k: int) -> Prepared:
         """Plans, for registration."""

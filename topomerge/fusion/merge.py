@@ -39,15 +39,19 @@ def merge(
     """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
 
     Args:
-        maps: two topometric maps.
+        maps: two topometric maps or more; `atlas` brings more than two together, as many as belong to the first one.
         scale: "fixed", or "free" where the scale of the second map is unknown.
         force: give the best transform and its joined map, too, where it is not believed; the status stays "abstained".
         threshold: probability from which a merge is believed; that of the calibration if None.
         embedder: "engineered" (default), "shapedna", "feather" or a callable map -> (R, D), for the matching of rooms.
 
     Raises:
-        InputError: not two maps, one map twice, a map without cells, maps in different units, another word for the scale.
+        InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale.
     """
+    if len(maps) > 2:
+        from topomerge.fusion.atlas_merge import merge_many  # it stands above this file
+
+        return merge_many(maps, scale=scale, force=force, threshold=threshold, embedder=embedder)
     a, b = _checked(maps, scale)
     limit = float(model()["threshold"]) if threshold is None else float(threshold)
     if not 0 <= limit <= 1:
@@ -94,8 +98,7 @@ class _Clock:
 
 def _checked(maps: Sequence[TopometricMap], scale: str) -> tuple[TopometricMap, TopometricMap]:
     if len(maps) != 2:
-        words = "more than two need an atlas, which comes later: merge two, then the joined map with the next"
-        raise InputError(f"{len(maps)} maps were given, merge takes two; {words if len(maps) > 2 else 'give another one'}")
+        raise InputError(f"merge takes two maps or more, {len(maps)} given; give another one")
     if scale not in ("fixed", "free"):
         raise InputError(f"scale must be fixed or free, not {scale!r}")
     a, b = maps

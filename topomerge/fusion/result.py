@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from topomerge.fusion.registration import Registration
 from topomerge.io.listing import plain
 from topomerge.types import Sim3, TopometricMap
+
+if TYPE_CHECKING:
+    from topomerge.fusion.atlas import AtlasResult
 
 FORMAT = 1
 STEPS = ("read", "extract", "embed", "match", "fuse")
@@ -44,7 +47,8 @@ class MergeResult:
             are 0 where the maps were made before.
         map: the joined map with the provenance of its cells (bit k: map k saw it), or None.
         maps: what was merged.
-        registration: the evidence.
+        registration: the evidence, of two maps.
+        atlas: the evidence, of more than two.
         warnings: what the user should know.
     """
 
@@ -57,6 +61,7 @@ class MergeResult:
     map: TopometricMap | None = None
     maps: tuple[TopometricMap, ...] = ()
     registration: Registration | None = None
+    atlas: AtlasResult | None = None
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -85,7 +90,8 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
     """`merge.json` as plain values: see docs/outputs.md. Numbers are not rounded: national grids need all digits."""
     registration = result.registration
     rmse = registration.features.get("rmse", float("nan")) if registration else float("nan")
-    transforms = {str(k): _transform(pose, rmse) for k, pose in result.transforms.items()}
+    off = result.atlas.residuals if result.atlas else {1: rmse}
+    transforms = {str(k): transform_to_json(pose, off[k]) for k, pose in result.transforms.items()}
     listing = {
         "format": FORMAT,
         "status": result.status,
@@ -100,9 +106,15 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
     return out
 
 
-def _transform(pose: Sim3, rmse: float) -> dict[str, Any]:
+def transform_to_json(pose: Sim3, rmse: float, into: int = 0) -> dict[str, Any]:
+    """A pose in the frame of another map as plain values.
+
+    Args:
+        rmse: of its surfaces, or of its measurements, m; nan where there are none.
+        into: the other map.
+    """
     return {
-        "into": 0,
+        "into": into,
         "matrix": pose.matrix.tolist(),
         "scale": pose.scale,
         "yaw_deg": pose.yaw * 57.29577951308232,

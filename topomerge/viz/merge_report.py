@@ -21,6 +21,7 @@ from topomerge.io.maps import save_map
 from topomerge.io.palette import room_colours
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.types import Array, Sim3
+from topomerge.viz.atlas_report import atlas_html
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.merge_plan import Drawn, blend_view, laid_alike
 from topomerge.viz.report import page, plan_view, scene_view, scroller, section, warnings
@@ -70,6 +71,9 @@ def _write(text: str, path: Path) -> None:
 
 def merge_html(result: MergeResult) -> str:
     """The report as HTML. A result that is not believed shows its best hypothesis, said to be none."""
+    if result.atlas is not None:
+        names = " + ".join(Path(m.source).name or "map" for m in result.maps)
+        return atlas_html(result.atlas, {} if result.map is None else {result.atlas.component_of(0): result.map}, names)
     a, b = result.maps
     found = result.registration
     pose = found.transform if found else None
