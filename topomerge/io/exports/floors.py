@@ -19,6 +19,7 @@ from topomerge.types import Array, TopometricMap
 GAP = 0.1  # m: gaps in a floor up to twice this are closed: scan lines
 HOLE = 1.0  # m2: smaller holes in a floor are furniture, shadows or columns
 STEP = 1.6  # cells: smaller jogs of an outline are steps of its cells
+BEVEL = 7  # cells: a wall across a corner that is shorter is none
 REACH = 4.0  # cells: so far from the end of a wall it may meet the next
 GROWTH = 0.3  # m: a floor is grown to its wall by at most this
 SPECK = 0.05  # m2: smaller pieces of a floor are left out
@@ -180,8 +181,19 @@ def _straight_ring(corners: Array) -> Array:
     kept = shapely.simplify(shapely.LineString(middle), STEP, preserve_topology=False).coords
     cuts = [number[point] for point in kept[:-1]] + [len(middle) - 1]
     walls = [middle[a : b + 1] for a, b in pairwise(cuts)]
-    long = [wall for wall in walls if len(wall) > 3] if len(walls) > 4 else walls
-    return _corners(long) if len(long) > 2 else corners
+    walls = _without_bevels([wall for wall in walls if len(wall) > 3] if len(walls) > 4 else walls)
+    return _corners(walls) if len(walls) > 2 else corners
+
+
+def _without_bevels(walls: list[Array]) -> list[Array]:
+    """Walls without short ones across a corner, where the two beside them meet: nobody stood in the tip of that corner."""
+    lines = [_line(points) for points in walls]
+    kept = []
+    for k, points in enumerate(walls):
+        met = _meet(lines[k - 1], lines[(k + 1) % len(walls)]) if len(points) <= BEVEL else None
+        if met is None or np.hypot(*(met - points.mean(axis=0))) > REACH:
+            kept.append(points)
+    return kept
 
 
 def _corners(walls: list[Array]) -> Array:

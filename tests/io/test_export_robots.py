@@ -1,0 +1,175 @@
+"""ROS grids read back with our own reader, and routes that a robot could drive."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+import topomerge
+from tests.io.export_maps import AT, GRID, nothing, stair_scene, two_floors, without_doors
+from tests.scenes import Scene, corridor
+from tests.scenes_map import building
+from topomerge.errors import InputError
+from topomerge.io.exports import outputs
+from topomerge.io.points import read_points
+from topomerge.types import TopometricMap
+
+
+def write(map: TopometricMap, folder: Path, **options) -> dict[str, Path]:
+    files = outputs(map, "ros", folder, False, **options)
+    folder.mkdir(exist_ok=True)
+    for path, save in files:
+        save(path)
+    return {path.name: path for path, _ in files}
+
+
+class Grid:
+    """A map_server grid as its documentation reads it: free and occupied by place, m."""
+
+    def __init__(self, path: Path) -> None:
+        about = yaml.safe_load(path.read_text())
+        self.image = np.array(Image.open(path.parent / about["image"]))
+        self.low, self.size = np.array(about["origin"][:2]), about["resolution"]
+        assert about["negate"] == 0 and set(np.unique(self.image)) <= {0, 205, 254}
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """(n,) values at points (n, 2)."""
+        i, j = np.floor((points - self.low) / self.size).astype(int).T
+        return self.image[self.image.shape[0] - 1 - j, i]
+
+
+@pytest.mark.parametrize("at", [AT, GRID])
+def test_walls_stand_where_they_were(tmp_path, at):
+    map = building(2, 1, at)
+    files = write(map, tmp_path / "ros")
+    assert sorted(files) == ["storey_0.pgm", "storey_0.yaml", "storey_0_route.geojson"]
+    cloud = read_points(files["storey_0.yaml"])
+    points = (cloud.points + cloud.shift).astype(np.float64)
+    height = map.grid.centroids()[:, 2] - map.storeys["floor"][0]
+    walls = map.grid.centroids()[(height > 0.5) & (height < 1.5)][:, :2]
+    read = np.unique(np.round(points[points[:, 2] > 0.5][:, :2], 2), axis=0)
+    known = np.unique(np.round(walls, 2), axis=0)
+    assert {tuple(p) for p in read.tolist()} == {tuple(p) for p in known.tolist()}
+    grid = Grid(files["storey_0.yaml"])
+    assert (grid.at(map.navigable.centroids()[:, :2]) == 254).all(), "all of the floor is free"
+    assert (grid.image == 205).any(), "what nobody saw is unknown"
+
+
+def test_turned_buildings_and_the_way_back(tmp_path):
+    c, s = np.cos(0.4), np.sin(0.4)
+    points = corridor().points() @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + (30.0, -20.0, 5.0)
+    first = topomerge.extract(points.astype(np.float32))
+    files = write(first, tmp_path / "ros")
+    again = topomerge.extract(read_points(files["storey_0.yaml"], extrude=2.5))
+    assert len(again.rooms) == len(first.rooms) == 9
+    apart = np.linalg.norm(first.rooms["centroid"][:, None, :2] - again.rooms["centroid"][:, :2], axis=2).min(axis=1)
+    assert (apart < 0.25).all()
+
+
+def route(path: Path) -> tuple[dict[int, dict], list[dict]]:
+    """Nodes by number and edges of a file, checked as nav2_route's loader needs them."""
+    features = json.loads(path.read_text())["features"]
+    nodes = {f["properties"]["id"]: f for f in features if f["geometry"]["type"] == "Point"}
+    edges = [f for f in features if f["geometry"]["type"] == "MultiLineString"]
+    ids = [f["properties"]["id"] for f in features]
+    assert nodes and edges and len(nodes) + len(edges) == len(features) == len(set(ids)) and min(ids) >= 0
+    assert all(f["properties"]["frame"] == "map" for f in nodes.values())
+    for edge in edges:
+        ends = [nodes[edge["properties"][end]]["geometry"]["coordinates"] for end in ("startid", "endid")]
+        assert edge["geometry"]["coordinates"] == [ends] and ends[0] != ends[1]
+        assert edge["properties"]["cost"] == pytest.approx(np.hypot(*np.subtract(*ends)), abs=1e-3)
+    pairs = {(e["properties"]["startid"], e["properties"]["endid"]) for e in edges}
+    assert pairs == {(b, a) for a, b in pairs} and len(pairs) == len(edges), "both directions, each once"
+    return nodes, edges
+
+
+def free_ways(path: Path, grid: Grid) -> bool:
+    """Do all edges run over free pixels?"""
+    _, edges = route(path)
+    t = np.linspace(0, 1, 200)[:, None]
+    for edge in edges:
+        a, b = np.array(edge["geometry"]["coordinates"][0])
+        if not (grid.at(a + t * (b - a)) == 254).all():
+            return False
+    return True
+
+
+def kinds(nodes: dict[int, dict]) -> dict[str, int]:
+    found = [node["properties"]["metadata"]["kind"] for node in nodes.values()]
+    return {kind: found.count(kind) for kind in set(found) - {"way"}}
+
+
+def joined(nodes: dict[int, dict], edges: list[dict]) -> bool:
+    beside: dict[int, set[int]] = {n: set() for n in nodes}
+    for edge in edges:
+        beside[edge["properties"]["startid"]].add(edge["properties"]["endid"])
+    seen, ahead = set(), [next(iter(nodes))]
+    while ahead:
+        at = ahead.pop()
+        if at not in seen:
+            seen.add(at)
+            ahead += beside[at]
+    return seen == set(nodes)
+
+
+def test_routes_lead_from_room_to_room_without_walls_between(tmp_path):
+    for name, map in (("hand", building(3)), ("seen", topomerge.extract(corridor().points()))):
+        files = write(map, tmp_path / name)
+        grid = Grid(files["storey_0.yaml"])
+        nodes, edges = route(files["storey_0_route.geojson"])
+        doors = int((map.edges["kind"] == "door").sum())
+        assert kinds(nodes) == {"room": len(map.rooms), "door": doors} | ({"opening": len(map.edges) - doors} if doors < len(map.edges) else {})
+        assert joined(nodes, edges) and free_ways(files["storey_0_route.geojson"], grid)
+        assert len(nodes) < 60, "straight ways have no nodes in between"
+
+
+def test_around_corners(tmp_path):
+    """An L-shaped room: the straight line from its middle to the door would cross the wall."""
+    scene = Scene().shell(0, 0, 10, 10)
+    scene.wall((3, 0), (3, 7)).wall((3, 7), (10, 7)).wall((7, 0), (7, 7), doors=(2.0,)).wall((0, 2), (3, 2), doors=(1.5,))
+    files = write(topomerge.extract(scene.points()), tmp_path / "ros")
+    assert free_ways(files["storey_0_route.geojson"], Grid(files["storey_0.yaml"]))
+
+
+def test_stairs_are_no_floor_for_robots(tmp_path):
+    map = topomerge.extract(stair_scene().points())
+    assert len(map.storeys) == 2 and "stairs" in map.edges["kind"].tolist()
+    files = write(map, tmp_path / "ros")
+    steps = np.array([[x, 7.4] for x in np.arange(2.6, 4.0, 0.1)])
+    assert (Grid(files["storey_0.yaml"]).at(steps) == 0).all()
+    ends, seen = [], set()
+    for s in (0, 1):
+        nodes, edges = route(files[f"storey_{s}_route.geojson"])
+        assert not seen & set(nodes) and joined(nodes, edges)
+        assert free_ways(files[f"storey_{s}_route.geojson"], Grid(files[f"storey_{s}.yaml"]))
+        seen |= set(nodes) | {e["properties"]["id"] for e in edges}
+        ends += [n for n in nodes.values() if n["properties"]["metadata"]["kind"] == "stairs"]
+    assert [e["properties"]["metadata"]["to_storey"] for e in ends] == [1, 0]
+    foot, head = (np.array(e["geometry"]["coordinates"]) for e in ends)
+    assert foot[0] < 2.3 and 6.8 < foot[1] < 8 and head[0] > 6.5 and 6.8 < head[1] < 8
+
+
+def test_a_threshold_and_a_ramp_are_floor(tmp_path):
+    from tests.scenes import ramp
+
+    files = write(topomerge.extract(ramp().points()), tmp_path / "ros")
+    assert (Grid(files["storey_0.yaml"]).at(np.array([[x, 1.0] for x in np.arange(0.5, 15.5, 0.1)])) == 254).mean() > 0.97
+
+
+def test_maps_with_little_in_them(tmp_path):
+    with pytest.raises(InputError, match="no storeys"):
+        write(nothing(), tmp_path / "none")
+    assert sorted(write(without_doors(), tmp_path / "closed")) == ["storey_0.pgm", "storey_0.yaml"]
+    assert sorted(write(two_floors(), tmp_path / "upper", storey=1)) == ["storey_1.pgm", "storey_1.yaml", "storey_1_route.geojson"]
+    with pytest.raises(InputError, match="no such storey"):
+        write(two_floors(), tmp_path / "top", storey=2)
+
+
+def test_the_same_map_gives_the_same_bytes(tmp_path):
+    a, b = (write(two_floors(), tmp_path / name) for name in ("a", "b"))
+    assert {n: p.read_bytes() for n, p in a.items()} == {n: p.read_bytes() for n, p in b.items()}
