@@ -26,6 +26,7 @@ class LossSettings:
     dustbin: weight of the choice between the other map's rooms and no partner at all.
     margin: of the triplets, in distances between unit vectors.
     temperature: of NT-Xent; that of InfoNCE is learned.
+    faint: weight of rooms of which one of the maps saw little (`Truth.clear`).
     """
 
     kind: str = "infonce"
@@ -33,6 +34,7 @@ class LossSettings:
     dustbin: float = 1.0
     margin: float = 0.3
     temperature: float = 0.1
+    faint: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -44,12 +46,15 @@ class Truth:
         side: (N,) 0 for a, 1 for b.
         same: (N, N) bool, the two are one true room, in the two maps of a pair.
         piece: (N, N) bool, the two are of one true room in one map.
+        clear: (N,) bool, most of a room was seen, and so of one of its partners if it has any: one that was only looked into
+            says little about what it is.
     """
 
     pair: Tensor
     side: Tensor
     same: Tensor
     piece: Tensor
+    clear: Tensor
 
 
 def check(settings: LossSettings) -> None:
@@ -60,7 +65,7 @@ def check(settings: LossSettings) -> None:
     """
     if settings.kind not in KINDS:
         raise InputError(f"loss.kind: unknown {settings.kind!r}; {', '.join(KINDS)} are possible")
-    for key in ("easy", "dustbin", "margin"):
+    for key in ("easy", "dustbin", "margin", "faint"):
         if getattr(settings, key) < 0:
             raise InputError(f"loss.{key} must be 0 or more, not {getattr(settings, key)}")
     if settings.temperature <= 0:
@@ -70,7 +75,7 @@ def check(settings: LossSettings) -> None:
 def matching_loss(
     settings: LossSettings, embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth
 ) -> dict[str, Tensor]:
-    """Losses by name; `loss` is their weighted sum.
+    """Losses by name; `loss` is their weighted sum. Each is the mean over rooms, the faint ones weighing less.
 
     Args:
         embedding: (N, D) of length 1.
@@ -78,56 +83,56 @@ def matching_loss(
         temperature: learned one.
     """
     if settings.kind == "infonce":
-        main = info_nce(embedding, temperature, truth, settings.easy)
+        main, counts = info_nce(embedding, temperature, truth, settings.easy)
     elif settings.kind == "ntxent":
-        main = info_nce(embedding, embedding.new_tensor(settings.temperature), truth, 1.0)
+        main, counts = info_nce(embedding, embedding.new_tensor(settings.temperature), truth, 1.0)
     else:
-        main = triplet(embedding, truth, settings.margin)
+        main, counts = triplet(embedding, truth, settings.margin)
     # Where another loss than InfoNCE shapes the embedding, only the dustbins and the temperature are fitted to it.
     fixed = embedding if settings.kind == "infonce" else embedding.detach()
-    none = dustbin_loss(fixed, dustbin, temperature, truth)
-    return {"loss": main + settings.dustbin * none, settings.kind: main.detach(), "dustbin": none.detach()}
+    weight = torch.where(truth.clear, 1.0, settings.faint)
+    first = _mean(main, weight * counts)
+    second = _mean(dustbin_loss(fixed, dustbin, temperature, truth), weight)
+    return {"loss": first + settings.dustbin * second, settings.kind: first.detach(), "dustbin": second.detach()}
 
 
-def info_nce(embedding: Tensor, temperature: Tensor, truth: Truth, easy: float = 1.0) -> Tensor:
-    """Mean over rooms with a partner of -log(sum of exp(s) of partners / sum of exp(s) of partners and negatives), s being the
-    cosine over the temperature; negatives of other pairs count `easy` times (van den Oord et al. 2018; both directions)."""
+def _mean(values: Tensor, weight: Tensor) -> Tensor:
+    return (values * weight).sum() / weight.sum().clamp(min=1e-6)
+
+
+def info_nce(embedding: Tensor, temperature: Tensor, truth: Truth, easy: float = 1.0) -> tuple[Tensor, Tensor]:
+    """(N,) -log(sum of exp(s) of partners / sum of exp(s) of partners and negatives), s being the cosine over the temperature;
+    and (N,) bool, which rooms have a partner; negatives of other pairs count `easy` times (van den Oord et al. 2018)."""
     logits = embedding @ embedding.T / temperature
     own = truth.pair[:, None] == truth.pair[None]
     weight = torch.where(own, 1.0, easy) * ~(truth.piece | torch.eye(len(own), dtype=torch.bool, device=own.device))
-    has = truth.same.any(dim=1)
-    if not has.any():
-        return logits.sum() * 0
-    logits, same, weight = logits[has], truth.same[has], weight[has]
     every = (logits + weight.clamp(min=1e-30).log()).masked_fill(weight == 0, NEVER).logsumexp(dim=1)
-    partners = logits.masked_fill(~same, NEVER).logsumexp(dim=1)
-    return (every - partners).mean()
+    partners = logits.masked_fill(~truth.same, NEVER).logsumexp(dim=1)
+    has = truth.same.any(dim=1)
+    return torch.where(has, every - partners, 0.0), has
 
 
-def triplet(embedding: Tensor, truth: Truth, margin: float) -> Tensor:
-    """Mean over rooms with a partner of max(0, d(partner) - d(negative) + margin): the farthest partner, the nearest negative of
-    the same pair of maps (Hermans et al. 2017)."""
+def triplet(embedding: Tensor, truth: Truth, margin: float) -> tuple[Tensor, Tensor]:
+    """(N,) max(0, d(partner) - d(negative) + margin), and (N,) bool, which rooms have both: the farthest partner, the nearest
+    negative of the same pair of maps (Hermans et al. 2017)."""
     # Distances of unit vectors; the root needs a gradient at 0.
     apart = (2 - 2 * embedding @ embedding.T).clamp(min=0).add(1e-8).sqrt()
     own = truth.pair[:, None] == truth.pair[None]
     negative = own & ~truth.same & ~truth.piece & ~torch.eye(len(own), dtype=torch.bool, device=own.device)
     has = truth.same.any(dim=1) & negative.any(dim=1)
-    if not has.any():
-        return apart.sum() * 0
-    far = apart[has].masked_fill(~truth.same[has], NEVER).amax(dim=1)
-    near = apart[has].masked_fill(~negative[has], -NEVER).amin(dim=1)
-    return (far - near + margin).relu().mean()
+    far = apart.masked_fill(~truth.same, NEVER).amax(dim=1)
+    near = apart.masked_fill(~negative, -NEVER).amin(dim=1)
+    return torch.where(has, (far - near + margin).relu(), 0.0), has
 
 
 def dustbin_loss(embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth) -> Tensor:
-    """Mean over all rooms of -log(probability of their partners, or of having none where they have none), among the rooms of the
-    other map of the pair and the dustbin."""
+    """(N,) -log(probability of its partners, or of having none where it has none), among the rooms of the other map of the pair
+    and the dustbin."""
     logits = embedding @ embedding.T / temperature
     other = (truth.pair[:, None] == truth.pair[None]) & (truth.side[:, None] != truth.side[None])
     every = torch.cat([logits.masked_fill(~other, NEVER), dustbin[:, None]], dim=1).logsumexp(dim=1)
     partners = logits.masked_fill(~truth.same, NEVER).logsumexp(dim=1)
-    right = torch.where(truth.same.any(dim=1), partners, dustbin)
-    return (every - right).mean()
+    return every - torch.where(truth.same.any(dim=1), partners, dustbin)
 
 
 class Objective(nn.Module):

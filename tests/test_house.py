@@ -32,6 +32,7 @@ RANKS = {
     "completion": 11,
     "command": 11,
     "export_commands": 12,
+    "learn_commands": 12,
     "atlas_commands": 12,
     "commands": 13,
     "cli": 14,

@@ -17,6 +17,7 @@ from topomerge.command import Command, count, option
 from topomerge.console import Bars, check_outputs, warn, write_all
 from topomerge.errors import InputError
 from topomerge.export_commands import EXPORT, VIEW
+from topomerge.learn_commands import EXPORT_EMBEDDER
 
 FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
@@ -242,7 +243,7 @@ def _map_from(path: str, args: argparse.Namespace) -> Any:
 
 
 MAPS = (
-    option("--descriptor", choices=("engineered", "shapedna", "feather"), default="engineered", help="default engineered"),
+    option("--descriptor", choices=("engineered", "shapedna", "feather", "learned"), default="engineered", help="default engineered"),
     option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)"),
     option("--voxel-size", type=_above_zero, metavar="E", help="edge length of a cell where a cloud is given, m (default 0.1)"),
     *(o for o in READING if o[0][0] in ("--up", "--unit")),
@@ -384,5 +385,6 @@ COMMANDS = (
     ),
     atlas_verb(_map_from, tuple(o for o in MAPS if o[0][0] not in ("--descriptor", "--k")), _share),
     EXPORT,
+    EXPORT_EMBEDDER,
     VIEW,
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 from topomerge.embedding.context import with_context
@@ -13,14 +14,32 @@ from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.shapedna import shapedna
 from topomerge.errors import InputError
 
-EMBEDDERS: dict[str, Callable[..., Descriptor]] = {"engineered": engineered, "shapedna": shapedna, "feather": feather}
+
+def learned(path: str | None = None) -> Descriptor:
+    """The trained embedder in a folder (see `topomerge.load_embedder`), or the one that ships with the package.
+
+    The networks stand above this package, and need torch: they are looked up when they are asked for.
+    """
+    try:
+        found: Descriptor = import_module("topomerge.models.learned").load_embedder(path)
+    except ModuleNotFoundError as error:
+        raise InputError(f"a learned embedder needs {error.name}: pip install topomerge[learn]") from error
+    return found
+
+
+EMBEDDERS: dict[str, Callable[..., Descriptor]] = {
+    "engineered": engineered,
+    "shapedna": shapedna,
+    "feather": feather,
+    "learned": learned,
+}
 
 
 def embedder(name: str | Descriptor, k: int = 0, context: str = "join", **options: Any) -> Descriptor:
     """A callable map -> (R, D) float64.
 
     Args:
-        name: ``"engineered"``, ``"shapedna"``, ``"feather"``, or a descriptor.
+        name: ``"engineered"``, ``"shapedna"``, ``"feather"``, ``"learned"``, or a descriptor.
         k: steps of context (see `with_context`).
         context: ``"join"`` or ``"mean"``.
         options: those of the function of that name.

@@ -51,21 +51,20 @@ def has_twin(sizes: Array, matches: Array, rooms: Array) -> Array:
     return out
 
 
-def assign_with_none(rows: Array, columns: Array, least: float = 0.5) -> Array:
-    """(M, 2) one-to-one pairs: those whose probability is above that of staying alone.
+def certainty(rows: Array, columns: Array) -> Array:
+    """(R_a, R_b) geometric mean of the probabilities that j is i's partner and i is j's.
 
     Args:
         rows: (R_a, R_b + 1) probabilities of the partner of each room of a; the last: none.
         columns: (R_b, R_a + 1) likewise.
-        least: share of the geometric mean of both against that of having no partner; 0.5: the likelier of the two.
     """
-    if not rows.shape[0] or not columns.shape[0]:
-        return np.zeros((0, 2), np.int64)
-    tiny = 1e-12
-    pair = np.log(rows[:, :-1] + tiny) + np.log(columns[:, :-1].T + tiny)
-    alone = np.log(rows[:, -1:] + tiny) + np.log(columns[:, -1:].T + tiny)
-    gain = pair - alone  # of log likelihood, when the two are taken for one instead of being left alone
-    return assign(-gain, -2 * float(np.log(least / (1 - least))))
+    out: Array = np.sqrt(rows[:, :-1] * columns[:, :-1].T)
+    return out
+
+
+def assign_certain(certain: Array, least: float) -> Array:
+    """(M, 2) one-to-one pairs of the largest sum of certainty, each at least `least`; the other rooms stay alone."""
+    return assign(1 - certain, 1 - least)
 
 
 def pair_counts(found: Array, matches: Array) -> tuple[int, int, int, int]:

@@ -16,6 +16,7 @@ from topomerge.training.settings import Augment
 LENGTHS, AREAS, VOLUMES = (1, 3, 4, 7, 12, 13), (0,), (2,)  # columns of x that are m, m2, m3 (`embedding.graph.ROOM_FEATURES`)
 EDGE_LENGTHS = (0, 1, 5, 6, 7, 8)  # columns of edge_attr that are m
 MM = 0.001
+CLEAR = 0.4  # IoU of an extracted room and the true one
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Batch:
 
     def to(self, device: torch.device | str) -> Batch:
         """The same on another device."""
-        truth = Truth(*(getattr(self.truth, name).to(device) for name in ("pair", "side", "same", "piece")))
+        truth = Truth(*(getattr(self.truth, name).to(device) for name in ("pair", "side", "same", "piece", "clear")))
         return Batch({name: tensor.to(device) for name, tensor in self.tensors.items()}, truth, self.rooms)
 
 
@@ -41,7 +42,7 @@ def make_batch(
         names: tensors that the network reads.
         augment: how maps are changed; needs the generator. None: not at all.
     """
-    graphs, pair, side, true, matches, start = [], [], [], [], [], 0
+    graphs, pair, side, true, clear, matches, start = [], [], [], [], [], [], 0
     for number, one in enumerate(pairs):
         links = torch.zeros((len(one.true[0]), len(one.true[1])), dtype=torch.bool)
         links[one.matches[:, 0], one.matches[:, 1]] = True
@@ -57,11 +58,13 @@ def make_batch(
             pair.append(torch.full((len(kept[k]),), number))
             side.append(torch.full((len(kept[k]),), k))
             true.append(one.true[k][kept[k]])
-        i, j = torch.nonzero(links[kept[0]][:, kept[1]], as_tuple=True)
+        links = links[kept[0]][:, kept[1]]
+        clear += _clear(links, one.iou[0][kept[0]] >= CLEAR, one.iou[1][kept[1]] >= CLEAR)
+        i, j = torch.nonzero(links, as_tuple=True)
         matches.append(torch.stack([start + i, start + len(kept[0]) + j]))
         start += len(kept[0]) + len(kept[1])
     rooms = [len(t) for t in true]
-    truth = _truth(torch.cat(pair), torch.cat(side), torch.cat(true), torch.cat(matches, dim=1))
+    truth = _truth(torch.cat(pair), torch.cat(side), torch.cat(true), torch.cat(clear), torch.cat(matches, dim=1))
     return Batch(join(graphs, rooms, names), truth, rooms)
 
 
@@ -74,13 +77,18 @@ def join(graphs: Sequence[Graph], rooms: Sequence[int], names: Sequence[str]) ->
     return out
 
 
-def _truth(pair: Tensor, side: Tensor, true: Tensor, matches: Tensor) -> Truth:
+def _clear(links: Tensor, a: Tensor, b: Tensor) -> list[Tensor]:
+    """Was most of each room seen, and of a partner if it has any?"""
+    return [a & ((links & b).any(dim=1) | ~links.any(dim=1)), b & ((links.T & a).any(dim=1) | ~links.any(dim=0))]
+
+
+def _truth(pair: Tensor, side: Tensor, true: Tensor, clear: Tensor, matches: Tensor) -> Truth:
     count = len(pair)
     same = torch.zeros((count, count), dtype=torch.bool)
     same[matches[0], matches[1]] = same[matches[1], matches[0]] = True
     map = 2 * pair + side
     piece = (map[:, None] == map[None]) & (true[:, None] == true[None]) & (true >= 0)[:, None]
-    return Truth(pair, side, same, piece & ~torch.eye(count, dtype=torch.bool))
+    return Truth(pair, side, same, piece & ~torch.eye(count, dtype=torch.bool), clear)
 
 
 def changed(graph: Graph, rooms: int, augment: Augment, generator: torch.Generator) -> tuple[Graph, Tensor]:

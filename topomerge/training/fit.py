@@ -193,7 +193,7 @@ class Run:
         self.log.row(row)
         if better:
             save_embedder(self.network, self.settings.folder / "best", about(self.settings, row))
-            self.log.show(self.network, self.watched, row["epoch"], self.fabric.device)
+            self.log.show(self.network, self.watched, row["epoch"], row["val/least"], self.fabric.device)
         self.save()
 
     def save(self) -> None:
@@ -238,10 +238,8 @@ def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], l
     """Pairs to train on, and to watch; a set is packed by one process while the others wait."""
     extras = [part for part in settings.network.geometry.parts if part in EXTRAS]
     with fabric.rank_zero_first():
-        train = load_pairs(_manifest(settings, settings.data), extras, say)
+        train = load_pairs(_manifest(settings, settings.data), extras, say, settings.limit)
         watched = load_pairs(_manifest(settings, settings.validation), extras, say) if settings.validation else []
-    if settings.limit:
-        train = train[: settings.limit]
     if settings.overfit:
         some = [pair for pair in train if len(pair.matches)][: settings.batch]
         return some, some

@@ -53,7 +53,7 @@ class Log:
         with replacing(self.path) as beside:
             beside.write_text("".join(json.dumps(row) + "\n" for row in self.rows), encoding="utf-8")
 
-    def show(self, network: Embedder, pairs: Sequence[GraphPair], epoch: int, device: Any) -> None:
+    def show(self, network: Embedder, pairs: Sequence[GraphPair], epoch: int, least: float, device: Any) -> None:
         """Embedding projector and a figure of matched rooms, of the best network so far."""
         if self.board is None:
             return
@@ -63,7 +63,7 @@ class Log:
         found = embed(network, some, device)
         labels = [f"{k // 2}{'ab'[k % 2]} {int(t)}" for k, p in enumerate(_sides(some)) for t in p]
         self.board.add_embedding(np.concatenate([e.numpy() for e, _ in found]), labels, global_step=epoch, tag="rooms")
-        self.board.add_figure("matched rooms", figure(network, some[0], found[0], found[1]), epoch)
+        self.board.add_figure("matched rooms", figure(network, some[0], found[0], found[1], least), epoch)
 
     def close(self) -> None:
         """Write what is left."""
@@ -75,15 +75,15 @@ def _sides(pairs: Sequence[GraphPair]) -> list[Any]:
     return [true.tolist() for pair in pairs for true in pair.true]
 
 
-def figure(network: Embedder, pair: GraphPair, a: tuple[Any, Any], b: tuple[Any, Any]) -> Any:
+def figure(network: Embedder, pair: GraphPair, a: tuple[Any, Any], b: tuple[Any, Any], least: float) -> Any:
     """Two maps beside each other with the matches that were found: right ones green, wrong ones red, missing ones grey."""
     from matplotlib.figure import Figure
 
-    from topomerge.matching.scores import assign_with_none
+    from topomerge.matching.scores import assign_certain, certainty
     from topomerge.models.embedder import match_scores
 
     rows, columns = match_scores(a[0], b[0], a[1], b[1], float(network.temperature.detach()))
-    found = {(i, j) for i, j in assign_with_none(rows.exp().numpy(), columns.exp().numpy()).tolist()}
+    found = {(i, j) for i, j in assign_certain(certainty(rows.exp().numpy(), columns.exp().numpy()), least).tolist()}
     true = {(i, j) for i, j in pair.matches.tolist()}
     places = [graph["pos"][:, :2].numpy() for graph in (pair.a, pair.b)]
     places = [p - p.min(axis=0) for p in places]

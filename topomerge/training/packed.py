@@ -22,12 +22,13 @@ from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array
 
-FORMAT = 1
+FORMAT = 2
 CHUNK = 100  # pairs; descriptors that take long are kept chunk by chunk
 TABLES = ("x", "edge_attr", "door_attr", "pos")  # positions are for figures, no network reads them
 INDICES = ("edge_index", "door_index")
 COUNTS = {"edge_attr": "edges", "edge_index": "edges", "door_attr": "doors", "door_index": "doors"}  # of the others: rooms
 EXTRAS = ("engineered", "shapedna")
+WIDTHS = {"engineered": 12, "shapedna": 32}
 Graph = dict[str, Tensor]
 
 
@@ -38,6 +39,7 @@ class GraphPair:
     Args:
         matches: (M, 2) rooms of a and of b that are one true room.
         true: (R,) true room of each room of a and of b, -1 none.
+        iou: (R,) how much of each room and of its true room is common to both.
         about: building, sensors, overlap, source, ...
     """
 
@@ -45,24 +47,26 @@ class GraphPair:
     b: Graph
     matches: Tensor
     true: tuple[Tensor, Tensor]
+    iou: tuple[Tensor, Tensor]
     about: dict[str, Any]
 
 
 def load_pairs(
-    manifest: str | Path, extras: Sequence[str] = (), say: Callable[[str], None] = lambda text: None
+    manifest: str | Path, extras: Sequence[str] = (), say: Callable[[str], None] = lambda text: None, limit: int = 0
 ) -> list[GraphPair]:
     """The pairs of a manifest (`datasets.build`), from the packed file, which is made if there is none.
 
     Args:
         manifest: or a packed file itself.
         extras: descriptors that are wanted, too: of `EXTRAS`.
+        limit: of the first pairs only; 0: all.
 
     Raises:
         InputError: no such manifest, or a file is damaged.
     """
     path = Path(manifest)
     if path.suffix == ".npz":
-        return _unpacked(archive.read(path, "packed set"), {})
+        return _unpacked(archive.read(path, "packed set"), {})[: limit or None]
     rows = _rows(path)
     names = [str(row["file"]) for row in rows]
     digest = hashlib.sha256(json.dumps([FORMAT, names]).encode()).hexdigest()[:12]
@@ -73,7 +77,8 @@ def load_pairs(
         say(f"packing {len(names)} pairs")
         archive.write(_packed([archive.read(path.parent / "pairs" / name, "cached pair") for name in names], rows), whole)
     arrays = archive.read(whole, "packed set")
-    return _unpacked(arrays, {name: _extra(name, arrays, whole, say) for name in extras})
+    pairs = _unpacked(arrays, {name: _extra(name, arrays, whole, say, limit) for name in extras})
+    return pairs[: limit or None]
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
@@ -98,6 +103,7 @@ def _packed(pairs: list[dict[str, Array]], rows: list[dict[str, Any]]) -> dict[s
     for name, of in (("rooms", "x"), ("edges", "edge_attr"), ("doors", "door_attr")):
         out[name] = np.array([len(side[of]) for side in sides])
     out["true"] = np.concatenate([side["true_room"] for side in sides]).astype(np.int32)
+    out["iou"] = np.concatenate([side["true_iou"] for side in sides]).astype(np.float32)
     out["matches"] = np.concatenate([pair["matches"] for pair in pairs]).astype(np.int32)
     out["partners"] = np.array([len(pair["matches"]) for pair in pairs])
     told = json.dumps([_short(row) for row in rows], ensure_ascii=False)
@@ -121,24 +127,27 @@ def _unpacked(arrays: dict[str, Array], extras: dict[str, Array]) -> list[GraphP
     true = torch.from_numpy(arrays["true"]).long().split(counts["rooms"])
     matches = torch.from_numpy(arrays["matches"]).long().split(arrays["partners"].tolist())
     told = json.loads(arrays["about"].tobytes())
-    sides = zip(graphs[::2], graphs[1::2], matches, zip(true[::2], true[1::2], strict=True), told, strict=True)
-    return [GraphPair(*one) for one in sides]
+    iou = torch.from_numpy(arrays["iou"]).split(counts["rooms"])
+    truth = [list(zip(of[::2], of[1::2], strict=True)) for of in (true, iou)]
+    return [GraphPair(*one) for one in zip(graphs[::2], graphs[1::2], matches, *truth, told, strict=True)]
 
 
-def _extra(name: str, arrays: dict[str, Array], whole: Path, say: Callable[[str], None]) -> Array:
-    """A descriptor of all rooms; chunks that were reckoned before are read."""
+def _extra(name: str, arrays: dict[str, Array], whole: Path, say: Callable[[str], None], limit: int) -> Array:
+    """A descriptor of all rooms, 0 of those beyond the limit; chunks that were reckoned before are read."""
     from topomerge.embedding.point_features import point_features, point_spectra
 
     reckon = {"engineered": point_features, "shapedna": point_spectra}[name]
-    ends = np.concatenate([[0], np.cumsum(arrays["rooms"])])[:: 2 * CHUNK]
-    starts = np.append(ends[ends < len(arrays["x"])], len(arrays["x"]))
+    ends = np.concatenate([[0], np.cumsum(arrays["rooms"])])
+    wanted = int(ends[2 * limit]) if 0 < 2 * limit < len(ends) else len(arrays["x"])
+    starts = np.append(ends[: -1 : 2 * CHUNK], len(arrays["x"]))
     found = []
     for k, (first, last) in enumerate(itertools.pairwise(starts)):
         path = whole.with_name(f"{whole.stem}-{name}-{k}.npz")
-        if not path.exists():
-            say(f"{name} of rooms {first} to {last} of {len(arrays['x'])}")
+        if first < wanted and not path.exists():
+            say(f"{name} of rooms {first} to {last} of {wanted}")
             archive.write({"values": reckon(metres(arrays["room_points"][first:last]))}, path)
-        found.append(archive.read(path, "descriptors")["values"])
+        empty = np.zeros((last - first, WIDTHS[name]), np.float32)
+        found.append(archive.read(path, "descriptors")["values"] if first < wanted else empty)
     return np.concatenate(found)
 
 

@@ -9,14 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from topomerge.matching.scores import assign_with_none, has_twin, pair_counts, partner_ranks
+from topomerge.matching.scores import assign_certain, certainty, has_twin, pair_counts, partner_ranks
 from topomerge.models.embedder import Embedder, match_scores
-from topomerge.training.batches import make_batch
+from topomerge.training.batches import CLEAR, make_batch
 from topomerge.training.packed import GraphPair
 from topomerge.types import Array
 
 SIZES = (0, 3, 4)  # area, length, width: columns of x
 AT_ONCE = 8  # pairs
+LEAST = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)  # certainty of a match: the best of these is told
 
 
 @torch.no_grad()
@@ -36,24 +37,32 @@ def embed(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") ->
 
 def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> dict[str, float]:
     """Scores over all rooms with a partner, of both maps: recall@1, recall@5 and MRR, apart for those with and without a
-    near-identical twin; precision, recall and F1 of the assignment in which a room may stay alone."""
+    near-identical twin; precision, recall and F1 of the assignment in which a room may stay alone, at the certainty
+    (`least`) that is best."""
     found, temperature = embed(network, pairs, device), float(network.temperature.detach())
-    ranks, twins, counts = [], [], np.zeros(4, int)
+    ranks, twins, clear, counts = [], [], [], np.zeros((len(LEAST), 4), int)
     for pair, (a, bin_a), (b, bin_b) in zip(pairs, found[::2], found[1::2], strict=True):
         similarity, matches = (a @ b.T).numpy(), pair.matches.numpy()
-        for one, truth, other in ((similarity, matches, pair.b), (similarity.T, matches[:, ::-1], pair.a)):
+        good = [(iou >= CLEAR).numpy() for iou in pair.iou]
+        sides = ((similarity, matches, pair.b, good), (similarity.T, matches[:, ::-1], pair.a, good[::-1]))
+        for one, truth, other, (mine, theirs) in sides:
             rooms, rank = partner_ranks(one, truth)
             ranks.append(rank)
+            clear.append(np.array([mine[i] and theirs[truth[truth[:, 0] == i, 1]].any() for i in rooms], bool))
             twins.append(has_twin(other["x"][:, SIZES].numpy(), truth, rooms))
         rows, columns = match_scores(a, b, bin_a, bin_b, temperature)
-        counts += pair_counts(assign_with_none(rows.exp().numpy(), columns.exp().numpy()), matches)
-    return scores(np.concatenate(ranks), np.concatenate(twins), counts)
+        certain = certainty(rows.exp().numpy(), columns.exp().numpy())
+        counts += [pair_counts(assign_certain(certain, least), matches) for least in LEAST]
+    return scores(*(np.concatenate(of) for of in (ranks, twins, clear)), counts)
 
 
-def scores(ranks: Array, twins: Array, counts: Array) -> dict[str, float]:
-    """Ranks (n,) and whether each room has a twin (n,); the sums of `pair_counts`."""
-    found, right, wanted, got = (int(c) for c in counts)
-    precision, recall = right / max(found, 1), got / max(wanted, 1)
+def scores(ranks: Array, twins: Array, clear: Array, counts: Array) -> dict[str, float]:
+    """Ranks (n,), whether each room has a twin (n,), and whether most of it was seen by both (n,); the sums of `pair_counts`
+    for each of `LEAST`."""
+    found, right, wanted, got = counts.T
+    precision, recall = right / np.maximum(found, 1), got / np.maximum(wanted, 1)
+    f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-9)
+    best = int(f1.argmax())
 
     def share(of: Array, most: int) -> float:
         return float((of <= most).mean()) if len(of) else 0.0
@@ -64,11 +73,16 @@ def scores(ranks: Array, twins: Array, counts: Array) -> dict[str, float]:
         "mrr": float((1 / ranks).mean()) if len(ranks) else 0.0,
         "recall@1_twin": share(ranks[twins], 1),
         "recall@1_single": share(ranks[~twins], 1),
+        "recall@1_clear": share(ranks[clear], 1),
+        "recall@5_clear": share(ranks[clear], 5),
+        "recall@1_clear_single": share(ranks[clear & ~twins], 1),
         "recall@5_twin": share(ranks[twins], 5),
         "recall@5_single": share(ranks[~twins], 5),
         "twins": float(twins.mean()) if len(twins) else 0.0,
-        "precision": precision,
-        "recall": recall,
-        "f1": 2 * precision * recall / max(precision + recall, 1e-9),
+        "clear": float(clear.mean()) if len(clear) else 0.0,
+        "precision": float(precision[best]),
+        "recall": float(recall[best]),
+        "f1": float(f1[best]),
+        "least": LEAST[best],
         "rooms": float(len(ranks)),
     }

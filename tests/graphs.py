@@ -1,0 +1,83 @@
+"""Small random graphs and sets of pairs for the tests of networks and of training."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from topomerge.io import archive
+from topomerge.training.packed import GraphPair
+
+
+def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Tensor]:
+    """Tensors as of `embedding.graph`, of a ring of rooms with one more door across; points are metres."""
+    g = torch.Generator().manual_seed(seed)
+    ends = torch.tensor([*((i, (i + 1) % rooms) for i in range(rooms)), (0, rooms // 2)]).T
+    index = torch.cat([ends, ends.flip(0)], dim=1)
+    doors = torch.tensor(
+        [(e, f) for e in range(index.shape[1]) for f in range(index.shape[1]) if e != f and index[0, e] == index[0, f]]
+    ).T
+    size = 1 + 3 * torch.rand((rooms, 1, 3), generator=g)
+    return {
+        "x": 10 * torch.rand((rooms, 16), generator=g),
+        "engineered": torch.rand((rooms, 12), generator=g),
+        "shapedna": torch.rand((rooms, 32), generator=g),
+        "room_points": size * (torch.rand((rooms, points, 3), generator=g) - torch.tensor([0.5, 0.5, 0.0])),
+        "edge_index": index,
+        "edge_attr": torch.randn((index.shape[1], 11), generator=g),
+        "door_index": doors,
+        "door_attr": torch.randn((doors.shape[1], 3), generator=g),
+        "pos": torch.rand((rooms, 3), generator=g),
+    }
+
+
+def turned(tensors: dict[str, torch.Tensor], angle: float) -> dict[str, torch.Tensor]:
+    """The same map in a frame turned about the vertical: all but the points stays."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float32)
+    return {**tensors, "room_points": tensors["room_points"] @ turn.T}
+
+
+def shuffled(tensors: dict[str, torch.Tensor], seed: int = 0) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """The same map with rooms and edges in another order; and where each new room was."""
+    g = torch.Generator().manual_seed(seed)
+    rooms, edges = (torch.randperm(n, generator=g) for n in (len(tensors["x"]), tensors["edge_index"].shape[1]))
+    new_room, new_edge = rooms.argsort(), edges.argsort()
+    out = {name: tensors[name][rooms] for name in ("x", "engineered", "shapedna", "room_points", "pos")}
+    out |= {"edge_index": new_room[tensors["edge_index"][:, edges]], "edge_attr": tensors["edge_attr"][edges]}
+    return out | {"door_index": new_edge[tensors["door_index"]], "door_attr": tensors["door_attr"]}, rooms
+
+
+def pair(seed: int, rooms: int = 7) -> GraphPair:
+    """A map and the same one in another order with a little noise; room 0 of a has no partner."""
+    a = graph(rooms, seed)
+    b, rooms_of = shuffled(a, seed)
+    b["x"] = b["x"] * (1 + 0.01 * torch.randn(b["x"].shape, generator=torch.Generator().manual_seed(seed)))
+    for one in (a, b):
+        one["room_points"] = (one["room_points"] * 1000).to(torch.int16)
+    where = rooms_of.argsort()
+    matches = torch.tensor([(i, int(where[i])) for i in range(1, rooms)])
+    true = (torch.arange(rooms), torch.where(rooms_of > 0, rooms_of, torch.tensor(-1)))
+    return GraphPair(a, b, matches, true, (torch.ones(rooms), torch.ones(rooms)), {"building": f"b{seed}"})
+
+
+def write_set(folder: Path, name: str, pairs: int) -> Path:
+    """A cached set as `datasets.build` leaves it: a manifest and a file a pair."""
+    (folder / "pairs").mkdir(parents=True, exist_ok=True)
+    rows = []
+    for k in range(pairs):
+        one = pair(k)
+        arrays = {}
+        for side, g, true, iou in zip("ab", (one.a, one.b), one.true, one.iou, strict=True):
+            tensors = {n: t for n, t in g.items() if n not in ("engineered", "shapedna")}
+            arrays |= {f"{side}.{n}": t.numpy() for n, t in tensors.items()}
+            arrays[f"{side}.room_points"] = g["room_points"].numpy().astype(np.float32) / 1000
+            arrays |= {f"{side}.true_room": true.numpy().astype(np.int32), f"{side}.true_iou": iou.numpy()}
+        arrays["matches"] = one.matches.numpy()
+        archive.write(arrays, folder / "pairs" / f"{name}{k}.npz")
+        rows.append({"file": f"{name}{k}.npz", "building": f"b{k}", "source": "procedural", "sensors": ["tls", "depth"]})
+    (folder / f"{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return folder / f"{name}.jsonl"

@@ -1,0 +1,225 @@
+"""Networks: what must not matter does not, gradients reach every weight, files are trusted only as far as they can be."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import torch
+from topomerge.models.config import GEOMETRY, Geometry, Network, Node, check, network_from
+from topomerge.models.embedder import Embedder, match_scores
+from topomerge.models.layers import Standardise, segment_softmax
+from topomerge.models.learned import Learned, load_embedder
+from topomerge.models.nodes import EDGE, PAIR
+from topomerge.models.pointnet import farthest, nearest
+from topomerge.models.voxelcnn import crop
+from topomerge.models.weights import read_embedder, save_embedder
+from topomerge.models.yaw import turn
+
+from tests.graphs import graph, shuffled, turned
+from tests.scenes_map import building
+from topomerge.embedding.graph import DOOR_FEATURES, EDGE_FEATURES, ROOM_FEATURES, to_graph
+from topomerge.errors import InputError
+
+NODES = [
+    Node("none"),
+    Node("sage", 1),
+    Node("sage", 2, edges=False, skip=False, jump="last"),
+    Node("gat", 3, doors=1, jump="max"),
+]
+NODES += [Node("gat", 2, told=False), Node("gat", 1, edges=False), Node("gat", 4, skip=False)]
+
+
+def network(*parts: str, node: Node | None = None, **geometry) -> Embedder:
+    torch.manual_seed(0)
+    return Embedder(Network(Geometry(list(parts or ["scalars"]), **geometry), node or Node("gat", doors=1))).eval()
+
+
+def test_widths_are_those_of_the_graph():
+    assert (GEOMETRY["scalars"], EDGE, PAIR) == (len(ROOM_FEATURES), len(EDGE_FEATURES), len(DOOR_FEATURES))
+
+
+@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}")
+def test_the_order_of_rooms_does_not_matter(node):
+    net, one = network("scalars", "pointnet", node=node), graph()
+    other, rooms = shuffled(one)
+    with torch.no_grad():
+        (a, bin_a), (b, bin_b) = net(one), net(other)
+    assert torch.allclose(a[rooms], b, atol=1e-5) and torch.allclose(bin_a[rooms], bin_b, atol=1e-5)
+    assert torch.allclose(a.norm(dim=1), torch.ones(len(a)))
+
+
+@pytest.mark.parametrize("part", GEOMETRY)
+def test_yaw(part):
+    """Tables of numbers: exactly; points about their longest axis: to 1e-3; points as they are: at the turns that are averaged."""
+    one = graph(points=200)
+    exact = network(part, canonical=True, yaws=2)
+    loose = network(part, yaws=4)
+    with torch.no_grad():
+        for angle in (0.4, 2.0, math.pi):
+            apart = (exact(one)[0] - exact(turned(one, angle))[0]).abs().max()
+            assert apart < (1e-6 if GEOMETRY[part] else 1e-3 if part != "voxelcnn" else 0.1), angle  # cells: points cross borders
+        assert (loose(one)[0] - loose(turned(one, math.pi / 2))[0]).abs().max() < (1e-3 if part != "voxelcnn" else 0.1)
+
+
+def test_the_scale_matters():
+    one = graph()
+    big = {**one, "room_points": 1.5 * one["room_points"]}
+    for part in ("pointnet", "pointnet_local", "voxelcnn"):
+        net = network(part, node=Node("none"))
+        with torch.no_grad():
+            assert (net.geometry(one) - net.geometry(big)).abs().max() > 1e-3, part
+
+
+@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}")
+@pytest.mark.parametrize("parts", [("scalars", "engineered", "shapedna"), ("pointnet", "voxelcnn"), ("pointnet_local",)])
+def test_gradients_reach_every_weight(parts, node):
+    net = network(*parts, node=node).train()
+    embedding, dustbin = net(graph())
+    rows, columns = match_scores(embedding[:3], embedding[3:], dustbin[:3], dustbin[3:], net.temperature)
+    (rows[:, 0].sum() + columns[:, 1].sum()).backward()
+    silent = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    # A shift of all scores of a softmax changes nothing: biases of what is only compared stay where they are.
+    assert not [name for name in silent if not name.endswith(("here.bias", "there.bias"))]
+
+
+def test_rooms_without_doors_and_maps_without_rooms():
+    one = graph(3)
+    bare = {**one, "edge_index": one["edge_index"][:, :0], "edge_attr": one["edge_attr"][:0]}
+    bare |= {"door_index": one["door_index"][:, :0], "door_attr": one["door_attr"][:0]}
+    for node in NODES:
+        embedding, _ = network(node=node)(bare)
+        assert torch.isfinite(embedding).all()
+
+
+def test_standardise_and_softmax_by_hand():
+    scale = Standardise(2)
+    scale.fit(torch.tensor([[0.0, 5.0], [math.e - 1, 5.0], [1 - math.e, 5.0]]))
+    assert torch.allclose(scale(torch.tensor([[math.e - 1, 5.0]])), torch.tensor([[1 / math.sqrt(2 / 3), 0.0]]), atol=1e-6)
+    weight = segment_softmax(torch.tensor([[0.0], [math.log(3.0)], [7.0]]), torch.tensor([0, 0, 1]), 2)
+    assert torch.allclose(weight[:, 0], torch.tensor([0.25, 0.75, 1.0]), atol=1e-3)
+
+
+def test_grouping_and_crop_by_hand():
+    line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 0, 0]]])
+    assert farthest(line, 3).tolist() == [[3, 0, 2]]
+    assert sorted(nearest(line, line[:, 3:], 2)[0, 0].tolist()) == [2, 3]
+    grid = crop(torch.tensor([[[0.01, 0.01, 0.01], [0.02, 0.01, 0.01], [100.0, 0, 0]]]))
+    assert grid.sum() == 1 and grid[0, 0, 16, 16, 4] == 1
+    assert torch.allclose(turn(line, torch.tensor([math.pi / 2]))[0, 3], torch.tensor([0.0, 5, 0]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ({"geometry": {"parts": ["lidar"]}}, "geometry.parts"),
+        ({"geometry": {"parts": ["pointnet"], "canonical": True, "yaws": 3}}, "geometry.yaws"),
+        ({"node": {"kind": "gcn"}}, "node.kind"),
+        ({"node": {"layers": 5}}, "node.layers"),
+        ({"node": {"doors": 1, "edges": False}}, "node.edges"),
+        ({"node": {"heads": 7}}, "geometry.width"),
+        ({"node": {"layer": 2}}, "node.layer"),
+        ({"node": {"layers": True}}, "node.layers"),
+        ({"size": "64"}, "size"),
+        ({"dropout": 1.0}, "dropout"),
+    ],
+)
+def test_bad_networks_name_their_key(told, said):
+    with pytest.raises(InputError, match=said):
+        network_from(told)
+
+
+def test_a_file_gives_the_same_network(tmp_path):
+    net = network("scalars", "pointnet")
+    save_embedder(net, tmp_path / "best", {"data": "x"})
+    read, about = read_embedder(tmp_path)  # a run: its best
+    assert about == {"data": "x"} and asdict(read.network) == asdict(net.network)
+    with torch.no_grad():
+        assert torch.equal(read(graph())[0], net(graph())[0])
+
+
+def spoil(path, change) -> None:
+    told = json.loads(path.read_text())
+    change(told)
+    path.write_text(json.dumps(told))
+
+
+def test_bad_files_are_refused(tmp_path):
+    def fresh():
+        save_embedder(network(), tmp_path)
+        return tmp_path / "embedder.json", tmp_path / "embedder.safetensors"
+
+    settings, weights = fresh()
+    with pytest.raises(InputError, match="no_such"):
+        load_embedder(tmp_path / "no_such")
+    weights.write_bytes(weights.read_bytes()[:-100])
+    with pytest.raises(InputError, match="cut off"):
+        load_embedder(tmp_path)
+    weights.unlink()
+    with pytest.raises(InputError, match="safetensors"):
+        load_embedder(tmp_path)
+    for change, said in (
+        (lambda t: t.update(format=99), "format 99"),
+        (lambda t: t.update({"class": "os.system"}), "class 'os.system'"),
+        (lambda t: t.pop("sha256"), "lacks"),
+        (lambda t: t["network"].update(size=32), "does not fit"),
+        (lambda t: t["network"].update(kind="x"), "kind"),
+    ):
+        settings, _ = fresh()
+        spoil(settings, change)
+        with pytest.raises(InputError, match=said):
+            load_embedder(tmp_path)
+    settings, _ = fresh()
+    settings.write_text(settings.read_text()[:50])
+    with pytest.raises(InputError, match="damaged"):
+        load_embedder(tmp_path)
+
+
+def test_a_pickle_under_another_name_is_not_run(tmp_path):
+    """What torch.save wrote could run anything when unpickled: it is refused by its digest, or as no safetensors."""
+    import hashlib
+
+    save_embedder(network(), tmp_path)
+    torch.save({"x": torch.ones(1)}, tmp_path / "embedder.safetensors")
+    with pytest.raises(InputError, match="cut off, damaged"):
+        load_embedder(tmp_path)
+    digest = hashlib.sha256((tmp_path / "embedder.safetensors").read_bytes()).hexdigest()
+    spoil(tmp_path / "embedder.json", lambda t: t.update(sha256=digest))
+    with pytest.raises(InputError, match="does not fit"):
+        load_embedder(tmp_path)
+
+
+def test_an_embedder_of_maps():
+    map = building(2, 2)
+    describe = Learned(network("scalars", "engineered", "shapedna", "pointnet"))
+    rows = describe(map)
+    assert rows.shape == (len(map.rooms), 64) and rows.dtype == np.float64 and np.array_equal(rows, describe(map))
+    assert np.array_equal(rows, describe.graph(to_graph(map))[0]) and describe.matchability(map).shape == (len(map.rooms),)
+    ours, theirs = describe.probabilities(map, map)
+    assert np.allclose(ours.sum(axis=1), 1) and ours.shape == (len(map.rooms), len(map.rooms) + 1) and np.allclose(ours, theirs)
+
+
+def test_check_takes_the_defaults():
+    check(Network())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("parts", [("scalars",), ("scalars", "pointnet")])
+def test_onnx_agrees(parts, tmp_path):
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    from topomerge.models.onnx import sample, save_onnx
+
+    net = network(*parts, node=Node("gat", doors=1))
+    save_onnx(net, tmp_path / "a.onnx")
+    session = runtime.InferenceSession(tmp_path / "a.onnx", providers=["CPUExecutionProvider"])
+    for rooms, edges, doors in ((6, 10, 12), (23, 50, 140), (1, 0, 0)):
+        tensors = sample(net, rooms, edges, doors, seed=rooms)
+        with torch.no_grad():
+            wanted = net(tensors)
+        found = session.run(None, {name: tensor.numpy() for name, tensor in tensors.items()})
+        for one, other in zip(found, wanted, strict=True):
+            assert np.abs(one - other.numpy()).max() < 1e-5
