@@ -53,7 +53,8 @@ def spectrum(cells: Array, edge: float, laplacian: str, values: int, spacing: fl
     """(values,) smallest eigenvalues above 0 of one room's cells (n, 3); the last ones by Weyl's law if there are too few."""
     if laplacian == "graph":
         while len(cells) > largest:
-            cells = np.unique(cells // 2, axis=0)
+            halved = cells // 2
+            cells = halved[_firsts(halved)[0]]
         found = smallest_eigenvalues(graph_laplacian(cells), values)
     else:
         points = thinned((cells + 0.5) * edge, spacing)
@@ -71,11 +72,21 @@ def spectrum(cells: Array, edge: float, laplacian: str, values: int, spacing: fl
 def thinned(points: Array, spacing: float) -> Array:
     """Middle of the points (n, 3) in each cube of a grid that is laid over them; all points if hardly any would be left."""
     cube = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
-    _, of, count = np.unique(cube, axis=0, return_inverse=True, return_counts=True)
-    if len(count) < LEAST:
+    first, of = _firsts(cube)
+    if len(first) < LEAST:
         return points
-    sums = np.stack([np.bincount(of.ravel(), points[:, a]) for a in range(3)], axis=1)
-    return sums / count[:, None]
+    sums = np.stack([np.bincount(of, points[:, a]) for a in range(3)], axis=1)
+    return sums / np.bincount(of)[:, None]
+
+
+def _firsts(cells: Array) -> tuple[Array, Array]:
+    """First row of each different cell (n, 3), in the order of x, y, z, and the number of its cell for each row: as `np.unique` of
+    rows, which takes ten times as long."""
+    low = cells.min(axis=0)
+    wide = (np.ptp(cells, axis=0) + 1).astype(np.int64)
+    x, y, z = (cells - low).astype(np.int64).T
+    _, first, of = np.unique((x * wide[1] + y) * wide[2] + z, return_index=True, return_inverse=True)
+    return first, of
 
 
 def normalised(values: Array, how: str) -> Array:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +12,9 @@ import numpy as np
 
 import topomerge
 from topomerge.datasets.kept import KeptPair, load_kept
-from topomerge.embedding.embedders import embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
+from topomerge.evaluation.describe import UNTRAINED, Maps, code, described, trained
 from topomerge.evaluation.settings import Evaluation, Variant, variants
 from topomerge.fusion.merge import merge
 from topomerge.fusion.verify import model
@@ -24,9 +22,7 @@ from topomerge.io import archive
 from topomerge.io.listing import plain
 from topomerge.matching.costs import descriptor_costs
 from topomerge.matching.match import match
-from topomerge.types import Array, TopometricMap
-
-Maps = tuple[TopometricMap, TopometricMap]
+from topomerge.types import Array
 
 
 def predict(path: Path, target: Path, settings: Evaluation) -> None:
@@ -62,86 +58,6 @@ def predict(path: Path, target: Path, settings: Evaluation) -> None:
 def merges(variant: Variant, settings: Evaluation) -> bool:
     """Does this variant merge maps, too?"""
     return settings.merge and (bool(variant.run) or (variant.descriptor in settings.mergers and variant.k == 0))
-
-
-UNTRAINED = (
-    *(f"embedding/{n}" for n in ("engineered.*", "shapedna.py", "laplacian.py", "feather.py", "context.py", "room_cells.py")),
-    "kernels/voronoi.py",
-)
-
-
-@cache
-def code(*patterns: str) -> str:
-    """Digest of the code that something comes from: files of the package, by pattern."""
-    whole = hashlib.sha256()
-    for pattern in patterns:
-        for file in sorted(Path(topomerge.__file__).parent.glob(pattern)):
-            whole.update(file.read_bytes())
-    return whole.hexdigest()[:12]
-
-
-def described(variant: Variant, maps: Maps, path: Path, settings: Evaluation) -> tuple[tuple[Array, Array], float]:
-    """Descriptors (R, D) of both maps, from the cache where they are there, and the seconds that making them took.
-
-    The columns of fewer steps of context are the first ones of more, so that only the largest k is made.
-    """
-    if variant.run:
-        began = time.perf_counter()
-        learned = trained(variant.run)
-        a, b = (np.asarray(learned(m)) for m in maps)
-        return (a, b), time.perf_counter() - began
-    folder = Path(settings.cache) / "descriptors"
-    folder.mkdir(parents=True, exist_ok=True)
-    options = dict(settings.descriptors[variant.descriptor])
-    top = max(settings.k)
-    found, seconds = [], 0.0
-    for side, m in zip("ab", maps, strict=True):
-        source = path.with_name(f"{path.stem}{side}.tmap")
-        rows, took = _cached(folder, source, m, options, top, variant.context if top else "join", variant.k)
-        found.append(rows)
-        seconds += took
-    return (found[0], found[1]), seconds
-
-
-def _cached(
-    folder: Path, source: Path, m: TopometricMap, options: Mapping[str, Any], top: int, how: str, k: int
-) -> tuple[Array, float]:
-    inputs = [
-        hashlib.sha256(source.read_bytes()).hexdigest(),
-        plain(options),
-        top,
-        how if top else "",
-        code(*UNTRAINED),
-    ]
-    file = folder / f"{hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:24]}.npz"
-    if not file.exists():
-        rest = {key: value for key, value in options.items() if key != "name"}
-        own = _Timed(embedder(options["name"], **rest))
-        rows = embedder(own, top, how)(m) if top else own(m)
-        archive.write({"rows": rows, "seconds": np.array([own.first, own.total])}, file)
-    data = archive.read(file, "cached descriptors")
-    width = data["rows"].shape[1] // (top + 1)
-    return data["rows"][:, : (k + 1) * width], float(data["seconds"][0] if k == 0 else data["seconds"][1])
-
-
-class _Timed:
-    """A descriptor that knows how long it took: at first, for the rooms themselves, and in all."""
-
-    def __init__(self, describe: Descriptor) -> None:
-        self.describe, self.first, self.total = describe, 0.0, 0.0
-
-    def __call__(self, m: TopometricMap) -> Array:
-        began = time.perf_counter()
-        rows = self.describe(m)
-        self.total += time.perf_counter() - began
-        self.first = self.first or self.total
-        return rows
-
-
-@cache
-def trained(run: str) -> Any:
-    """A trained embedder; read once."""
-    return topomerge.load_embedder(run)
 
 
 def matched(variant: Variant, method: str, maps: Maps, rows: tuple[Array, Array]) -> dict[str, Array]:

@@ -11,6 +11,11 @@ CORNERS = 40  # of a cell, at most: each neighbour adds one
 @njit(cache=True)
 def _clip(corners, owner, count, x, y, half, name):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Keep of a convex polygon what has (x, y) . p <= half; the new side belongs to `name`. Gives the number of corners."""
+    beyond = False  # of most neighbours the cell is clear already
+    for c in range(count):
+        beyond |= corners[c, 0] * x + corners[c, 1] * y > half
+    if not beyond:
+        return count
     cut, cut_owner = np.empty((CORNERS, 2)), np.empty(CORNERS, np.int64)
     m = 0
     for c in range(count):

@@ -1,0 +1,95 @@
+"""Descriptors of the maps of a pair; those that are not trained are kept in a cache, as some take seconds a map."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import topomerge
+from topomerge.embedding.embedders import embedder
+from topomerge.embedding.room_cells import Descriptor
+from topomerge.evaluation.settings import Evaluation, Variant
+from topomerge.io import archive
+from topomerge.io.listing import plain
+from topomerge.types import Array, TopometricMap
+
+Maps = tuple[TopometricMap, TopometricMap]
+UNTRAINED = (
+    *(f"embedding/{n}" for n in ("engineered.*", "shapedna.py", "laplacian.py", "feather.py", "context.py", "room_cells.py")),
+    "kernels/voronoi.py",
+)
+
+
+@cache
+def code(*patterns: str) -> str:
+    """Digest of the code that something comes from: files of the package, by pattern."""
+    whole = hashlib.sha256()
+    for pattern in patterns:
+        for file in sorted(Path(topomerge.__file__).parent.glob(pattern)):
+            whole.update(file.read_bytes())
+    return whole.hexdigest()[:12]
+
+
+@cache
+def trained(run: str) -> Any:
+    """A trained embedder; read once."""
+    return topomerge.load_embedder(run)
+
+
+def described(variant: Variant, maps: Maps, path: Path, settings: Evaluation) -> tuple[tuple[Array, Array], float]:
+    """Descriptors (R, D) of both maps of the pair `path`, and the seconds that making them took."""
+    if variant.run:
+        began = time.perf_counter()
+        learned = trained(variant.run)
+        a, b = (np.asarray(learned(m)) for m in maps)
+        return (a, b), time.perf_counter() - began
+    options = settings.descriptors[variant.descriptor]
+    top = max(settings.k) if variant.k and variant.context == "join" else 0
+    found, seconds = [], 0.0
+    for side, m in zip("ab", maps, strict=True):
+        shelf = Shelf(Path(settings.cache) / "descriptors", path.with_name(f"{path.stem}{side}.tmap"))
+        rows, took = shelf.rows(m, options, top)
+        if variant.context == "mean" and variant.k:
+            rows = embedder(_gives(rows), variant.k, "mean")(m)
+        found.append(rows[:, : rows.shape[1] // (top + 1) * (variant.k + 1)] if top else rows)
+        seconds += took
+    return (found[0], found[1]), seconds
+
+
+def _gives(rows: Array) -> Descriptor:
+    return lambda m: rows
+
+
+class Shelf:
+    """Cached descriptors of the map of one file, named by a hash of the map, the options and the code.
+
+    Joined surroundings of fewer steps are the first columns of those of more, so that only the most are made.
+    """
+
+    def __init__(self, folder: Path, source: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self.source = folder, source
+
+    def rows(self, m: TopometricMap, options: Mapping[str, Any], steps: int) -> tuple[Array, float]:
+        """(R, (steps + 1) D) the rooms' own and those of their joined surroundings; and the seconds that they took."""
+        digest = hashlib.sha256(self.source.read_bytes()).hexdigest()
+        inputs = json.dumps([digest, plain(dict(options)), steps, code(*UNTRAINED)], sort_keys=True)
+        file = self.folder / f"{hashlib.sha256(inputs.encode()).hexdigest()[:24]}.npz"
+        if not file.exists():
+            describe = embedder(str(options["name"]), **{k: v for k, v in options.items() if k != "name"})
+            own, took = self.rows(m, options, 0) if steps else (None, 0.0)
+            began = time.perf_counter()
+            if own is None:
+                rows = describe(m)
+            else:
+                rows = embedder(lambda other: own if other is m else describe(other), steps, "join")(m)
+            archive.write({"rows": rows, "seconds": np.array(took + time.perf_counter() - began)}, file)
+        data = archive.read(file, "cached descriptors")
+        return data["rows"], float(data["seconds"])
