@@ -52,9 +52,7 @@ def test_ranks_by_hand() -> None:
     rooms, rank = ranks_of(cost, np.array([(0, 2), (1, 0)]))
     assert rooms.tolist() == [0, 1]
     assert rank.tolist() == [2, 2]  # 0.1 is cheaper than 0.3; the other 0.2 costs as much, and counts before
-    assert ranks_of(cost, np.array([(0, 2), (0, 1)]))[1].tolist() == [
-        1
-    ]  # the better of two partners
+    assert ranks_of(cost, np.array([(0, 2), (0, 1)]))[1].tolist() == [1]  # the better of two partners
 
 
 def test_rank_counts_of_both_directions() -> None:

@@ -46,10 +46,10 @@ def trained(run: str) -> Any:
 def described(variant: Variant, maps: Maps, path: Path, settings: Evaluation) -> tuple[tuple[Array, Array], float]:
     """Descriptors (R, D) of both maps of the pair `path`, and the seconds that making them took."""
     if variant.run:
-        began = time.perf_counter()
+        began = time.process_time()
         learned = trained(variant.run)
         a, b = (np.asarray(learned(m)) for m in maps)
-        return (a, b), time.perf_counter() - began
+        return (a, b), time.process_time() - began
     options = settings.descriptors[variant.descriptor]
     top = max(settings.k) if variant.k and variant.context == "join" else 0
     found, seconds = [], 0.0
@@ -85,11 +85,11 @@ class Shelf:
         if not file.exists():
             describe = embedder(str(options["name"]), **{k: v for k, v in options.items() if k != "name"})
             own, took = self.rows(m, options, 0) if steps else (None, 0.0)
-            began = time.perf_counter()
+            began = time.process_time()
             if own is None:
                 rows = describe(m)
             else:
                 rows = embedder(lambda other: own if other is m else describe(other), steps, "join")(m)
-            archive.write({"rows": rows, "seconds": np.array(took + time.perf_counter() - began)}, file)
+            archive.write({"rows": rows, "seconds": np.array(took + time.process_time() - began)}, file)
         data = archive.read(file, "cached descriptors")
         return data["rows"], float(data["seconds"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -58,7 +59,7 @@ def evaluate(settings: Evaluation, say: Say = lambda text: None, command: str = 
     check(settings)
     folder = folder_of(settings)
     claim(folder, told(settings))
-    pairs = pairs_of(settings, say)
+    pairs = listed_pairs(folder / "pairs.json", settings, say)
     if not pairs:
         raise InputError(f"{settings.data.name}: no pair could be made; see the reasons above")
     files = predict_all(pairs, folder / "predictions", settings, say)
@@ -102,6 +103,17 @@ def claim(folder: Path, known: dict[str, Any]) -> None:
         raise InputError(f"{folder}: holds something else than an evaluation; take another folder with name=...")
     folder.mkdir(parents=True, exist_ok=True)
     _write(path, json.dumps(known, indent=1, sort_keys=True))
+
+
+def listed_pairs(listed: Path, settings: Evaluation, say: Say) -> list[Path]:
+    """The pairs of `pairs_of`; once they are all made, a list of them is kept: reading all plans again takes its time."""
+    if listed.exists():
+        files = [Path(settings.cache) / name for name in json.loads(listed.read_text(encoding="utf-8"))]
+        if all(file.exists() for file in files):
+            return files
+    files = pairs_of(settings, say)
+    _write(listed, json.dumps([Path(os.path.relpath(f, settings.cache)).as_posix() for f in files], indent=0))
+    return files
 
 
 def pairs_of(settings: Evaluation, say: Say) -> list[Path]:

@@ -103,25 +103,31 @@ def _variants(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: r["vari
 
 
 def matching(matches: Sequence[Row], settings: Evaluation) -> Table:
-    """Precision, recall and F1 of each descriptor and method."""
+    """Precision, recall and F1 of each descriptor and method where maps share rooms; how many matches are told of where not."""
     rows = []
     for name, some in _variants(matches).items():
         for method, these in _variants(some, lambda r: r["method"]).items():
-            cells = [cell(value(these, m, settings.rounds), m == "F1") for m in MATCHING]
+            sharing, apart = shares(these)
+            cells = [cell(value(sharing, m, settings.rounds), m == "F1") for m in MATCHING]
             large = cell(value([r for r in these if r["large"]], "F1", settings.rounds))
-            took = np.median([r["seconds"] for r in these])
-            rows.append([name, method, *cells, large, f"{took:.2f}"])
-    head = ["descriptor", "matching", *(NAMES[m] for m in MATCHING), "F1, ≥ 80 m² shared", "s a pair"]
-    return Table("Matches of rooms", head, rows, 2)
+            wrong = f"{np.mean([r['predicted'] for r in apart]):.1f}" if apart else "–"
+            rows.append([name, method, *cells, large, wrong, f"{np.median([r['seconds'] for r in these]):.2f}"])
+    head = ["descriptor", "matching", *(NAMES[m] for m in MATCHING), "F1, ≥ 80 m² shared", "matches where none is", "s a pair"]
+    return Table("Matches of rooms, in pairs that share some", head, rows, 2)
+
+
+def shares(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    """Rows of pairs that share rooms, and of those that share none."""
+    return [r for r in rows if r["units"]], [r for r in rows if not r["units"]]
 
 
 def grouped(ranks: Sequence[Row], matches: Sequence[Row], key: str, settings: Evaluation) -> Table:
-    """recall@1, and F1 of the best method, for each group and descriptor without context or trained one."""
+    """recall@1, and F1 of each method, for each group and descriptor without context or trained one."""
     rows = []
     of = by(matches, key)
     for group, some in by(ranks, key).items():
         for name, these in _variants([r for r in some if r["k"] == 0]).items():
-            own = _variants([m for m in of.get(group, []) if m["variant"] == name], lambda r: r["method"])
+            own = _variants(shares([m for m in of.get(group, []) if m["variant"] == name])[0], lambda r: r["method"])
             cells = [cell(value(own.get(m, []), "F1", settings.rounds)) for m in _methods(matches)]
             pairs = value(these, "recall@1", settings.rounds)
             rows.append([group, str(pairs.pairs), str(pairs.buildings), name, cell(pairs), *cells])
@@ -191,8 +197,9 @@ def long_rows(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row
         for (variant, method), some in _pairs(rows).items():
             for key in ("all", *BY):
                 for group, these in {"all": some}.items() if key == "all" else by(some, key).items():
+                    sharing = shares(these)[0] if rows is matches else these
                     for metric in metrics:
-                        v = value(these, metric, min(settings.rounds, 500))
+                        v = value(sharing, metric, min(settings.rounds, 500))
                         head = {"variant": variant, "method": method, "by": key, "group": group, "metric": metric}
                         yield {**head, "value": v.value, "low": v.low, "high": v.high, "pairs": v.pairs, "buildings": v.buildings}
 
