@@ -104,7 +104,7 @@ class Run:
         best: dict[str, float] = {}
         if self.log is not None and self.state.best_epoch >= 0:
             best = next((row for row in self.log.rows if row["epoch"] == self.state.best_epoch), {})
-        while self.state.epoch < settings.epochs and not (settings.patience and self.state.stale >= settings.patience):
+        while self.state.epoch < settings.epochs and not self.enough():
             row = self.epoch()
             scored = validate(self.network, self.watched, self.fabric.device)
             row |= {f"val/{name}": value for name, value in scored.items()}
@@ -123,6 +123,11 @@ class Run:
         if self.log is not None:
             self.log.close()
         return {name: value for name, value in best.items() if isinstance(value, float)}
+
+    def enough(self) -> bool:
+        """Has nothing become better for long, or is nothing left to learn of the one batch?"""
+        settings, state = self.settings, self.state
+        return bool(settings.patience and state.stale >= settings.patience) or (settings.overfit and state.best >= 1)
 
     def epoch(self) -> dict[str, Any]:
         """The steps of an epoch that are left."""

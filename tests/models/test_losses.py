@@ -1,0 +1,104 @@
+"""Losses against examples reckoned by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from topomerge.models.losses import LossSettings, Truth, check, dustbin_loss, info_nce, matching_loss, triplet
+
+from topomerge.errors import InputError
+
+E = math.exp
+
+
+def truth(matches, pair, side, true=None) -> Truth:
+    """Rooms that are all clear."""
+    n = len(pair)
+    same = torch.zeros((n, n), dtype=torch.bool)
+    for i, j in matches:
+        same[i, j] = same[j, i] = True
+    map, true = 2 * torch.tensor(pair) + torch.tensor(side), torch.tensor(true if true else range(n))
+    piece = (map[:, None] == map[None]) & (true[:, None] == true[None]) & ~torch.eye(n, dtype=torch.bool)
+    return Truth(torch.tensor(pair), torch.tensor(side), same, piece, torch.ones(n, dtype=torch.bool))
+
+
+FLAT = torch.tensor([[1.0, 0], [0, 1], [1, 0], [0, 1]])  # a: rooms 0 and 1, b: rooms 2 and 3, 0 looks like 2
+ONE = truth([(0, 2)], [0, 0, 0, 0], [0, 0, 1, 1])
+
+
+def test_info_nce_with_negatives_of_both_maps():
+    loss, has = info_nce(FLAT, torch.tensor(1.0), ONE)
+    assert has.tolist() == [True, False, True, False]
+    # Room 0: its partner has cosine 1, room 1 of its own map and room 3 of the other have 0.
+    assert loss.tolist() == pytest.approx([math.log((E(1) + 2) / E(1)), 0, math.log((E(1) + 2) / E(1)), 0])
+
+
+def test_a_room_in_two_pieces():
+    """Both pieces are partners, and no negatives of each other."""
+    embedding = torch.tensor([[1.0, 0], [1, 0], [0, 1]])  # a: room 0; b: its pieces 1 and 2
+    loss, has = info_nce(embedding, torch.tensor(1.0), truth([(0, 1), (0, 2)], [0, 0, 0], [0, 1, 1], [0, 5, 5]))
+    assert has.all() and loss.tolist() == pytest.approx([0, 0, 0], abs=1e-6)
+
+
+def test_easy_negatives_count_less():
+    embedding = torch.tensor([[1.0, 0], [1, 0], [0, 1]])
+    other = truth([(0, 1)], [0, 0, 1], [0, 1, 0])
+    for easy in (0.0, 0.3, 1.0):
+        loss, _ = info_nce(embedding, torch.tensor(0.5), other, easy)
+        assert loss[0].item() == pytest.approx(math.log((E(2) + easy * E(0)) / E(2)), abs=1e-6)
+
+
+def test_the_dustbin():
+    loss = dustbin_loss(FLAT, torch.tensor([0.0, 1.0, 0.0, 1.0]), torch.tensor(1.0), ONE)
+    # Room 0 sees 2 (cosine 1), 3 (0) and its dustbin (0); room 1, that has no partner, sees 2 (0), 3 (1) and its dustbin (1).
+    assert loss[0].item() == pytest.approx(math.log((E(1) + 2) / E(1)))
+    assert loss[1].item() == pytest.approx(math.log((1 + E(1) + E(1)) / E(1)))
+
+
+def test_triplets():
+    loss, has = triplet(FLAT, ONE, 0.3)
+    assert has.tolist() == [True, False, True, False] and loss[0].item() == 0  # the negative is sqrt 2 away
+    swapped = torch.tensor([[1.0, 0], [1, 0], [0, 1], [0, 1]])
+    assert triplet(swapped, ONE, 0.3)[0][0].item() == pytest.approx(math.sqrt(2) + 0.3, abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["infonce", "ntxent", "triplet"])
+def test_each_kind_learns_and_stays_finite(kind):
+    torch.manual_seed(0)
+    rows, bins = torch.randn(8, 4, requires_grad=True), torch.zeros(8, requires_grad=True)
+    hot = torch.tensor(0.1, requires_grad=True)
+    what = truth([(0, 2), (4, 6)], [0, 0, 0, 0, 1, 1, 1, 1], [0, 0, 1, 1, 0, 0, 1, 1])
+    optimizer = torch.optim.Adam([rows, bins], 0.05)
+    losses = []
+    for _ in range(60):
+        parts = matching_loss(LossSettings(kind), torch.nn.functional.normalize(rows, dim=1), bins, hot, what)
+        optimizer.zero_grad()
+        parts["loss"].backward()
+        assert all(torch.isfinite(p.grad).all() for p in (rows, bins, hot))
+        optimizer.step()
+        losses.append(parts["loss"].item())
+    assert losses[-1] < 0.5 * losses[0]
+    nothing = truth([], [0, 0], [0, 1])
+    alone = matching_loss(LossSettings(kind), torch.eye(2), torch.zeros(2), hot, nothing)
+    assert torch.isfinite(alone["loss"])
+
+
+def test_faint_rooms_count_less():
+    clear = torch.tensor([False, False, True, True])
+    faint = Truth(ONE.pair, ONE.side, ONE.same, ONE.piece, clear)
+    embedding, bins = torch.nn.functional.normalize(torch.tensor([[1.0, 0.5], [0, 1], [1, 0], [0.3, 1]]), dim=1), torch.zeros(4)
+    single, _ = info_nce(embedding, torch.tensor(1.0), ONE, 0.3)
+    told = matching_loss(LossSettings(faint=0.25, dustbin=0.0), embedding, bins, torch.tensor(1.0), faint)
+    assert told["loss"].item() == pytest.approx(((0.25 * single[0] + single[2]) / 1.25).item())
+
+
+def test_bad_settings_name_their_key():
+    for wrong, said in (
+        (LossSettings("cosine"), "loss.kind"),
+        (LossSettings(easy=-1), "loss.easy"),
+        (LossSettings(temperature=0), "temper"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check(wrong)

@@ -1,0 +1,324 @@
+"""Training: what is cached, batched and logged; that a run which was interrupted ends with the same bytes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from topomerge.models.config import Geometry, Network, Node
+from topomerge.models.embedder import Embedder
+from topomerge.models.learned import load_embedder
+
+from tests.graphs import pair, write_set
+from topomerge.checkpoint import load_state
+from topomerge.errors import InputError
+from topomerge.training import fit as loop
+from topomerge.training.batches import changed, make_batch
+from topomerge.training.fit import fit, hold_out, pace
+from topomerge.training.packed import load_pairs
+from topomerge.training.settings import Augment, Training, from_dict, from_file, from_words, to_dict
+from topomerge.training.table import write_table
+from topomerge.training.validate import embed, validate
+
+ROOT = Path(__file__).parent.parent.parent
+NAMES = ("x", "room_points", "edge_index", "edge_attr", "door_index", "door_attr")
+SMALL = Network(Geometry(["scalars"], width=16), Node("gat", 1, heads=2, doors=1, width=8), size=16)
+
+
+def quiet(text: str) -> None:
+    """Say nothing."""
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("cache")
+    write_set(folder, "some", 10)
+    write_set(folder, "other", 3)
+    return folder
+
+
+@pytest.fixture
+def settings(cache, tmp_path) -> Training:
+    common = {"runs": str(tmp_path), "cache": str(cache), "data": "some", "validation": "other", "tensorboard": False}
+    return Training(**common, epochs=3, batch=4, rate=0.01, network=SMALL)
+
+
+def test_a_set_is_packed_once(cache):
+    said: list[str] = []
+    pairs = load_pairs(cache / "some.jsonl", ["engineered", "shapedna"], said.append)
+    again = load_pairs(cache / "some.jsonl", ["engineered"], said.append, limit=4)
+    assert len(pairs) == 10 and len(again) == 4 and sum("packing" in text for text in said) <= 1
+    for k, one in enumerate(pairs):
+        made = pair(k)
+        assert torch.equal(one.matches, made.matches) and one.about["building"] == f"b{k}"
+        for name in NAMES:
+            assert torch.equal(one.b[name], made.b[name]), name
+        assert torch.isfinite(one.a["shapedna"]).all() and one.a["engineered"].shape == (7, 12)
+    file = next((cache / "packed").glob("some-*[0-9a-f].npz"))
+    assert len(load_pairs(file)) == 10
+    with pytest.raises(InputError, match=r"datasets\.build data=none"):
+        load_pairs(cache / "none.jsonl")
+
+
+def test_a_batch_is_its_maps_beside_each_other():
+    torch.manual_seed(0)
+    net = Embedder(Network(Geometry(["scalars", "pointnet"]), Node("gat", doors=1))).eval()
+    pairs = [pair(k) for k in range(3)]
+    with torch.no_grad():
+        together = torch.cat([e for e, _ in embed(net, pairs)])
+        alone = torch.cat([e for one in pairs for e, _ in embed(net, [one])])
+    assert torch.allclose(together, alone, atol=1e-5)
+    truth = make_batch(pairs, NAMES).truth
+    assert truth.same.sum() == 2 * sum(len(p.matches) for p in pairs) and torch.equal(truth.same, truth.same.T)
+    assert not truth.same[truth.pair[:, None] != truth.pair[None]].any()
+
+
+def test_lost_rooms_take_their_doors_and_matches_along():
+    one = pair(0, rooms=9)
+    some = {name: one.a[name] for name in NAMES}
+    generator = torch.Generator().manual_seed(1)
+    out, kept = changed(some, 9, Augment(rooms=0.9, edges=0.5, jitter=0.0, points=16), generator)
+    assert 2 <= len(kept) < 9 and torch.equal(out["x"], some["x"][kept]) and out["room_points"].shape == (len(kept), 16, 3)
+    assert out["edge_index"].max() < len(kept) and len(out["edge_attr"]) == out["edge_index"].shape[1]
+    assert torch.equal(out["edge_index"][0][out["door_index"][0]], out["edge_index"][0][out["door_index"][1]])
+    for k in range(out["edge_index"].shape[1]):  # each edge is one of the old ones, with its features
+        old = (some["edge_attr"] == out["edge_attr"][k]).all(dim=1).nonzero()[0, 0]
+        assert torch.equal(some["edge_index"][:, old], kept[out["edge_index"][:, k]])
+    batch = make_batch([one], NAMES, Augment(rooms=0.8), generator)
+    i, j = batch.truth.same.nonzero(as_tuple=True)
+    assert (
+        sum(batch.rooms) == len(batch.tensors["x"]) == len(batch.truth.same)
+        and (batch.truth.side[i] != batch.truth.side[j]).all()
+    )
+
+
+def test_validation_of_a_perfect_and_of_a_blind_network():
+    pairs = [pair(k) for k in range(3)]
+    net = Embedder(SMALL).eval()
+    net.fit_scales([g for p in pairs for g in (p.a, p.b)])
+    assert validate(net, pairs)["recall@1"] > 0.9  # the maps are nearly equal, and so are embeddings by any network
+    blind = Embedder(SMALL)
+    for weights in blind.parameters():
+        torch.nn.init.zeros_(weights)
+    scored = validate(blind, pairs)
+    assert scored["recall@1"] == 0 and scored["rooms"] == 36 and 0 <= scored["f1"] <= 1
+
+
+def test_overfit_one_batch(settings):
+    best = fit(replace(settings, overfit=True, epochs=60, batch=3), quiet)
+    assert best["val/f1"] == 1.0 and best["val/recall@1"] == 1.0
+
+
+@pytest.mark.parametrize("kind", ["ntxent", "triplet"])
+def test_other_losses_train(settings, kind):
+    settings.loss.kind = kind
+    assert np.isfinite(fit(replace(settings, epochs=1), quiet)["train/loss"])
+
+
+def test_a_run_is_a_folder(settings, tmp_path):
+    best = fit(replace(settings, name="a", tensorboard=True), quiet)
+    rows = [json.loads(line) for line in (tmp_path / "a" / "metrics.jsonl").read_text().splitlines()]
+    assert [row["epoch"] for row in rows] == [0, 1, 2] and best["val/recall@1"] == max(r["val/recall@1"] for r in rows)
+    assert (
+        from_file(tmp_path / "a" / "config.json")
+        == from_file(tmp_path / "a" / "config.yaml")
+        == replace(settings, name="a", tensorboard=True)
+    )
+    assert any((tmp_path / "a" / "tb").rglob("events*")) and list((tmp_path / "a" / "tb").rglob("tensors.tsv"))
+    assert load_embedder(tmp_path / "a").about["data"] == "some" and load_embedder(tmp_path / "a" / "last")
+    assert "| a | scalars | gat 1 | doors | infonce |" in write_table(tmp_path).read_text()
+
+
+def weights(folder: Path) -> bytes:
+    return (folder / "embedder.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("parts", [("scalars",), ("scalars", "pointnet")])
+def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch, parts):
+    settings.network = replace(SMALL, geometry=Geometry(list(parts), width=16))
+    fit(replace(settings, name="whole"), quiet)
+    step, done = loop.Run.step, []
+
+    def interrupted(self, batch):
+        done.append(1)
+        if len(done) == 4:  # in the middle of the second epoch
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, batch)
+
+    monkeypatch.setattr(loop.Run, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit(replace(settings, name="cut"), quiet)
+    state = json.loads((tmp_path / "cut" / "last" / "state.json").read_text())["told"]
+    assert (state["epoch"], state["step"]) == (1, 2)
+    monkeypatch.setattr(loop.Run, "step", step)
+    fit(replace(settings, name="cut", resume=True), quiet)
+    for folder in ("best", "last"):
+        assert weights(tmp_path / "cut" / folder) == weights(tmp_path / "whole" / folder), folder
+    for cut, whole in zip(*((tmp_path / n / "metrics.jsonl").read_text().splitlines() for n in ("cut", "whole")), strict=True):
+        a, b = json.loads(cut), json.loads(whole)
+        assert {k: v for k, v in a.items() if k.startswith(("val", "train"))} == {
+            k: v for k, v in b.items() if k.startswith(("val", "train"))
+        }
+
+
+def test_another_seed_gives_other_weights(settings, tmp_path):
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        fit(replace(settings, name=name, seed=seed, epochs=1), quiet)
+    assert weights(tmp_path / "a" / "last") == weights(tmp_path / "b" / "last") != weights(tmp_path / "c" / "last")
+
+
+def test_it_stops_early(settings):
+    said: list[str] = []
+    fit(replace(settings, epochs=30, patience=2, rate=1e-9), said.append)
+    assert len(said) < 10
+
+
+def test_geometry_alone_then_frozen(settings, tmp_path):
+    alone = replace(settings, name="alone", network=replace(SMALL, node=Node("none")))
+    fit(alone, quiet)
+    fit(replace(settings, name="frozen", geometry_from=str(tmp_path / "alone"), freeze="geometry"), quiet)
+    first, second = (load_embedder(tmp_path / n).network.geometry.state_dict() for n in ("alone", "frozen"))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    with pytest.raises(InputError, match="geometry_from"):
+        fit(replace(settings, freeze="geometry"), quiet)
+
+
+def test_bad_states_are_refused(settings, tmp_path):
+    with pytest.raises(InputError, match="nothing to resume"):
+        fit(replace(settings, resume=True), quiet)
+    last = tmp_path / "run" / "last"
+    net = Embedder(SMALL)
+    optimizer = torch.optim.AdamW(net.parameters())
+
+    def fresh():
+        fit(replace(settings, epochs=1), quiet)
+
+    fresh()
+    file = last / "optimizer.safetensors"
+    file.write_bytes(file.read_bytes()[:-10])
+    with pytest.raises(InputError, match="optimizer"):
+        load_state(last, net, optimizer)
+    for change, said in (({"format": 7}, "format 7"), ({"class": "builtins.eval"}, "no state")):
+        fresh()
+        told = json.loads((last / "state.json").read_text())
+        (last / "state.json").write_text(json.dumps({**told, **change}))
+        with pytest.raises(InputError, match=said):
+            load_state(last, net, optimizer)
+    fresh()
+    other = Embedder(replace(SMALL, size=8))
+    with pytest.raises(InputError, match="another network"):
+        load_state(last, other, torch.optim.AdamW(other.parameters()))
+
+
+def test_pace_and_holding_out():
+    assert pace(0.0, 0.1) < 0.02 and pace(0.1, 0.1) == pytest.approx(1) and pace(1.0, 0.1) == pytest.approx(0)
+    train, held = hold_out([pair(k, 3) for k in range(60)])
+    assert len(train) + len(held) == 60 and 0 < len(held) < 20
+
+
+CONFIGS = ROOT / "configs"
+GROUPS = [("geometry", p.stem) for p in sorted((CONFIGS / "geometry").glob("*.yaml"))]
+GROUPS += [(group, p.stem) for group in ("node", "loss", "experiment") for p in sorted((CONFIGS / group).glob("*.yaml"))]
+
+
+@pytest.mark.parametrize(("group", "name"), GROUPS)
+def test_every_config_composes_and_builds(group, name):
+    found = from_words([f"{group}={name}"])
+    assert sum(p.numel() for p in Embedder(found.network).parameters()) > 1000
+    assert from_dict(to_dict(found)) == found
+    if group == "experiment":
+        assert found.name == name
+
+
+def test_typos_name_their_key(tmp_path):
+    for word in ("epoch=3", "network.node.layer=3", "loss.kinds=triplet", "epochs=many", "data.pears=3", "geometry=pointnets"):
+        with pytest.raises(InputError, match=word.split("=")[0].split(".")[-1]):
+            from_words([word])
+    assert from_words(["data=procedural", "data.pairs=3"]).data == "procedural"
+    path = tmp_path / "run.json"
+    for text, said in (
+        ('{"epoch": 3}', "epoch"),
+        ('{"epochs": "3"}', "epochs"),
+        ('{"loss": {"sort": 1}}', "loss.sort"),
+        ("{", "damaged"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=said):
+            from_file(path)
+
+
+def run(words: list[str], **environment: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        words, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, env={**os.environ, "OMP_NUM_THREADS": "1", **environment}
+    )  # fmt: skip
+
+
+def test_without_hydra(settings, tmp_path):
+    """On a machine with no Hydra and no Open3D, and without importing the extraction."""
+    (tmp_path / "run.json").write_text(json.dumps({**to_dict(settings), "epochs": 1}))
+    code = (
+        "import sys; from topomerge.training.__main__ import main; status = main(sys.argv[1:]); "
+        "bad = [m for m in sys.modules if m in ('hydra', 'omegaconf', 'open3d') or m.startswith('topomerge.extraction')]; "
+        "print(bad); sys.exit(status or bool(bad))"
+    )
+    done = run([sys.executable, "-c", code, str(tmp_path / "run.json"), "name=bare"])
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert load_embedder(tmp_path / "bare").about["run"] == "bare"
+    assert run([sys.executable, "-m", "topomerge.training", str(tmp_path / "run.json"), "batch=0"]).stderr.startswith(
+        "train: batch"
+    )
+
+
+@pytest.mark.slow
+def test_train_py_and_a_sweep(settings, tmp_path):
+    common = [
+        f"runs={settings.runs}",
+        f"cache={settings.cache}",
+        "validation=other",
+        "data.name=some",
+        "epochs=1",
+        "batch=4",
+        "tensorboard=false",
+    ]
+    done = run([sys.executable, "train.py", *common, "experiment=gat_scalars", "--overfit"])
+    assert done.returncode == 0 and (tmp_path / "gat_scalars" / "best" / "embedder.json").exists(), done.stderr
+    done = run([sys.executable, "train.py", "-m", *common, "geometry=scalars,pointnet", "node=none,gat"])
+    assert done.returncode == 0 and (tmp_path / "sweep" / "table.md").read_text().count("\n") == 6, done.stderr
+    done = run([sys.executable, "train.py", *common, "epoch=3"])
+    assert done.returncode == 1 and "epoch" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_launchers(settings, tmp_path, launcher):
+    pytest.importorskip({"joblib": "hydra_plugins.hydra_joblib_launcher", "submitit_local": "submitit"}[launcher])
+    common = [
+        f"runs={settings.runs}",
+        f"cache={settings.cache}",
+        "validation=other",
+        "data.name=some",
+        "epochs=1",
+        "batch=4",
+        "tensorboard=false",
+    ]
+    done = run([sys.executable, "train.py", "-m", *common, f"hydra/launcher={launcher}", "node=none,gat"])
+    assert done.returncode == 0 and (tmp_path / "sweep" / "table.md").read_text().count("\n") == 4, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_two_processes(settings, tmp_path):
+    """torchrun with gloo: both processes end with the same weights as each other, written once."""
+    (tmp_path / "run.json").write_text(json.dumps(to_dict(replace(settings, batch=2))))
+    words = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "topomerge.training"]
+    done = run([sys.executable, *words, str(tmp_path / "run.json"), "name=two"])
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in (tmp_path / "two" / "metrics.jsonl").read_text().splitlines()]
+    assert len(rows) == 3 and load_embedder(tmp_path / "two")
