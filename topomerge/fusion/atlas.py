@@ -161,9 +161,9 @@ def _looked_at(
         this = m if isinstance(m, TopometricMap) else load_map(m)
         first = this if first is None else first
         told.append(names[k] if names else this.source or f"map {k}")
-        found.append(_checked(this, told, found))
-        if keys and keys[k] != found[k]:
+        if keys and keys[k] != map_key(this):
             raise InputError(f"{m}: is not the map that was added as {told[k]}; take it out with `topomerge atlas remove`")
+        found.append(_checked(this, told, found))
         if k and scale == "fixed":
             _check_units(first, this)
         if not len(this.rooms):

@@ -23,6 +23,7 @@ BELIEVED = 0.5
 BETTER = 0.5  # log odds by which another link must be better to take a link's place
 HEAVY = 20.0  # m2 of walls in common, above which a measurement counts no more
 Hypotheses = Mapping[tuple[int, int], tuple[Hypothesis, ...]]
+Poses = Mapping[int, Sim3]
 
 
 @dataclass(frozen=True)
@@ -119,37 +120,41 @@ class Assembler:
         found.links.append(link)
         found.components.append(self.settled(joined, found.links)[0])
 
-    def heard(self, a: Mapping[int, Sim3], b: Mapping[int, Sim3], pair: tuple[int, int], h: Hypothesis) -> Link:
-        """A link between two components with what all their maps say to it."""
-        move = across(a, b, pair, h.pose)
-        backing, against, loudest, worst = 0.0, 0.0, None, 0.0
-        for i, p in a.items():
-            for j, q in b.items():
-                if {i, j} != set(pair):
-                    said = self._voice(i, j, p.inverse() @ move @ q)
-                    if said > LOUD:
-                        backing += said
-                    else:
-                        against += said
-                    if said < worst:
-                        loudest, worst = (min(i, j), max(i, j)), said
-        total = h.log_odds + min(backing, self._most(pair, h)) + against
-        return Link(pair, h, total, loudest)
+    def heard(self, a: Poses, b: Poses, pair: tuple[int, int], h: Hypothesis, rival_of: tuple[int, int] | None = None) -> Link:
+        """A link between two components with what all their maps say to it.
 
-    def _voice(self, i: int, j: int, pose: Sim3) -> float:
-        """What two maps say to a pose T_ij that other maps propose, log odds."""
-        if j < i:
-            i, j, pose = j, i, pose.inverse()
+        Args:
+            rival_of: the pair whose claim this one contradicts; it is not asked, and contradictions are not looked into.
+        """
+        move = across(a, b, pair, h.pose)
+        place = {**a, **{j: move @ pose for j, pose in b.items()}}
+        backing, against, loudest, worst = 0.0, 0.0, None, 0.0
+        for one, two in ((min(i, j), max(i, j)) for i in a for j in b):
+            if (one, two) in (pair, rival_of):
+                continue
+            said, other = self._voice(one, two, place[one].inverse() @ place[two])
+            if other is not None and rival_of is None:  # a claim weighs as much as the rest leaves of it
+                other_odds = self.heard(a, b, (one, two), other, pair).log_odds
+                said = min(said, -max(other_odds + 1.0, 0.0))
+            elif other is not None:
+                said = min(said, -other.log_odds - 1.0)
+            if said > LOUD:
+                backing += said
+            else:
+                against += said
+            if said < worst:
+                loudest, worst = (one, two), said
+        return Link(pair, h, h.log_odds + min(backing, self._most(pair, h)) + against, loudest)
+
+    def _voice(self, i: int, j: int, pose: Sim3) -> tuple[float, Hypothesis | None]:
+        """What maps i < j say to a pose T_ij that other maps propose, log odds; and their own claim, if it is another one."""
         check = self.checks(i, j, pose)
-        hypotheses = self.known.get((i, j), ())
-        if not hypotheses:
-            return check.log_odds
-        best = hypotheses[0]
+        best = next(iter(self.known.get((i, j), ())), None)
+        if best is None:
+            return check.log_odds, None
         if self.agrees(i, j, best.pose, pose):
-            return max(check.log_odds, float(np.clip(best.log_odds + FOUND, 0.0, VOICE)))
-        if best.probability > DOUBT:
-            return min(check.log_odds, -best.log_odds - 1.0)
-        return check.log_odds
+            return max(check.log_odds, float(np.clip(best.log_odds + FOUND, 0.0, VOICE))), None
+        return check.log_odds, best if best.probability > DOUBT else None
 
     def agrees(self, i: int, j: int, p: Sim3, q: Sim3) -> bool:
         """Are two poses T_ij one, where the maps overlap?"""
@@ -227,13 +232,13 @@ class Assembler:
         return min(between, key=lambda link: link.log_odds).maps if between else None
 
     def settled(
-        self, poses: Mapping[int, Sim3], links: Sequence[Link], fine: bool = False
+        self, poses: Poses, links: Sequence[Link], fine: bool = False
     ) -> tuple[dict[int, Sim3], list[Measured]]:
         """Poses of a component that agree best with all that is measured between its maps, and that."""
         edges = list(self._measured(poses, links, fine))
         return optimise(poses, edges, self.scaled, min(poses)), edges
 
-    def _measured(self, poses: Mapping[int, Sim3], links: Sequence[Link], fine: bool) -> Iterator[Measured]:
+    def _measured(self, poses: Poses, links: Sequence[Link], fine: bool) -> Iterator[Measured]:
         held = {link.maps: link.hypothesis.pose for link in links}
         names = sorted(poses)
         for i in names:
@@ -241,14 +246,14 @@ class Assembler:
                 check = self.checks(i, j, poses[i].inverse() @ poses[j])
                 if (i, j) in held and not check.overlap:
                     check = Check(held[i, j], 0.0, True, {"walls": 1.0})
-                if check.overlap and ((i, j) in held or self._voice(i, j, poses[i].inverse() @ poses[j]) > 0):
+                if check.overlap and ((i, j) in held or self._voice(i, j, poses[i].inverse() @ poses[j])[0] > 0):
                     pose = self.checks.fine(i, j, check.pose) if fine else check.pose
                     a, b = (self.checks.maps.prepared(k).views for k in (i, j))
                     weight = float(np.clip(check.features["walls"], 0.5, HEAVY))
                     yield Measured((i, j), pose, place(a, b, pose), weight)
 
 
-def across(a: Mapping[int, Sim3], b: Mapping[int, Sim3], pair: tuple[int, int], pose: Sim3) -> Sim3:
+def across(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Sim3:
     """Where component b lies in component a, if map j of the one lies at T_ij in map i of the other; in any order."""
     i, j = pair
     if i not in a:
