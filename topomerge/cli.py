@@ -25,6 +25,7 @@ exit status:
   2    no trustworthy merge: the reason is printed and stands in merge.json
   130  interrupted
   141  what read the output went away (`| head`)
+  143  terminated
 Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""
 
 

@@ -1,0 +1,114 @@
+"""Every example of the README and the docs is run, and the site is built without a warning."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.docs_examples import ROOT, Example, commands, examples, pages
+from topomerge import cli
+
+QUICK = ("cli.md",)  # pages whose examples need no scans; those of all others are slow
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the examples find in their folder: two scans of an office."""
+    folder = tmp_path_factory.mktemp("workshop")
+    small = ["--building", "office", "--seed", "7", "--rooms", "8", "--overlap", "0.5", "--quiet"]
+    assert cli.main(["simulate", *small, "-o", str(folder / "pair")]) == 0
+    for name, other in (("a.ply", "scan.ply"), ("b.ply", "other.ply")):
+        shutil.move(folder / "pair" / name, folder / other)
+    shutil.rmtree(folder / "pair")
+    return folder
+
+
+@contextmanager
+def within(folder: Path) -> Iterator[None]:
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+def run_commands(example: Example, where: str) -> None:
+    """Run what is typed, in a shell, with the `topomerge` and `python` of this environment."""
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    typed = commands(example)
+    assert typed, f"{where}: a console block without a prompt ($)"
+    for number, command in enumerate(typed, 1):
+        done = subprocess.run(
+            command, shell=True, env={**os.environ, "PATH": path}, capture_output=True, text=True, timeout=600, check=False
+        )
+        wanted = example.status if number == len(typed) else 0
+        said = f"{done.stdout[-2000:]}{done.stderr[-2000:]}"
+        assert done.returncode == wanted, f"{where}: `{command}` gives {done.returncode}\n{said}"
+
+
+def run_page(page: Path, folder: Path) -> None:
+    """Run the blocks of a page one after the other, Python in one namespace."""
+    names: dict[str, object] = {"__name__": "example"}
+    with within(folder):
+        for example in examples(page):
+            where = f"{page.name}:{example.line}"
+            if example.skipped:
+                continue
+            if example.kind == "console":
+                run_commands(example, where)
+            else:
+                exec(compile(example.text, where, "exec"), names)
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, id=p.name, marks=[] if p.name in QUICK else [pytest.mark.slow]) for p in pages()]
+)
+def test_examples(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    if page.name not in QUICK:
+        shutil.copytree(request.getfixturevalue("workshop"), tmp_path, dirs_exist_ok=True)
+    run_page(page, tmp_path)
+
+
+@pytest.mark.parametrize("page", [pytest.param(p, id=p.name) for p in pages()])
+def test_python_examples_can_be_read(page: Path) -> None:
+    for example in examples(page):
+        if example.kind == "python":
+            compile(example.text, f"{page.name}:{example.line}", "exec")
+
+
+def test_every_command_in_the_docs_exists() -> None:
+    """Also those that are not run: the command and its options are known to the parser."""
+    known = {c.name: {f for flags, _ in c.arguments for f in flags} for c in cli.COMMANDS}
+    for page in pages():
+        for example in examples(page):
+            for command in commands(example) if example.kind == "console" else ():
+                for words in re.findall(r"(?:^|&& |\| )topomerge ([^|&>]*)", command):
+                    name, *rest = words.split()
+                    flags = {w.partition("=")[0] for w in rest if w.startswith("-")} - {"-v", "--help", "-h"}
+                    assert name.startswith("-") or flags <= known[name], f"{page.name}:{example.line}: {command}"
+
+
+def test_the_exit_statuses_are_told_alike() -> None:
+    page = (ROOT / "docs" / "cli.md").read_text()
+    for status in re.findall(r"(?m)^  (\d+) ", cli.EXIT_STATUSES):
+        assert f"| {status} |" in page
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs")
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0 and "WARNING" not in done.stderr, done.stderr
+    assert (tmp_path / "site" / "method.html").exists()
