@@ -27,6 +27,8 @@ from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
 
 TWIN_AREA, TWIN_SIDE = 0.05, 0.25  # share, m: rooms that differ by less are near-identical
 COLUMN = 0.2  # m, columns by which the area in common is measured
+BELOW = 0.15  # m: what is that far below a floor is the ceiling of the storey below
+STOREY = 1.0  # m between two storeys, at least
 FEW = 50  # columns: maps that share fewer have no middle of what both saw
 LAID = 0.4  # IoU from which rooms that lie over each other are one
 
@@ -109,7 +111,7 @@ def told_of_maps(pair: Pair, maps: Sequence[TopometricMap]) -> dict[str, Any]:
         "source": pair.source,
         "kind": pair.kind,
         "sensors": pair.sensors,
-        "common": round(common_area(pair, maps), 2),
+        "common": round(common_area(maps, pair.truth if pair.kind == "overlap" else None), 2),
         "rooms": "labelled" if pair.a.rooms else "laid",
         "scale_free": pair.truth is not None and abs(pair.truth.scale - 1) > 0.03,
     }
@@ -154,20 +156,20 @@ def _plan(room: TrueRoom) -> tuple[float, float, float]:
     return float(shape.area), float(sides.min()), float(sides.max())
 
 
-def common_area(pair: Pair, maps: Sequence[TopometricMap]) -> float:
+def common_area(maps: Sequence[TopometricMap], truth: Sim3 | None) -> float:
     """Area, m2, of which both maps saw something, on the same storey; 0 where they are of two places."""
-    if pair.truth is None or pair.kind != "overlap":
+    if truth is None:
         return 0.0
-    floors = np.unique(np.round([r.floor for r in pair.a.rooms] or [-1e3], 1))
-    both = np.intersect1d(_columns(maps[0], Sim3(), floors), _columns(maps[1], pair.truth, floors))
+    floors = np.sort([*maps[0].storeys["floor"], *(truth.scale * maps[1].storeys["floor"] + truth.translation[2])])
+    floors = floors[np.diff(floors, prepend=-np.inf) > STOREY] - BELOW
+    both = np.intersect1d(_columns(maps[0], Sim3(), floors), _columns(maps[1], truth, floors))
     return float(len(both) * COLUMN**2)
 
 
 def _columns(map: TopometricMap, into: Sim3, floors: Array) -> Array:
     """Sorted keys of the (storey, x, y) columns of which a map knows anything, in another frame."""
     at = into.apply(np.concatenate([map.grid.centroids(), map.navigable.centroids()]))
-    storey = np.searchsorted(floors - 0.4, at[:, 2]) - 1
-    rows = np.column_stack([storey, np.floor(at[:, :2] / COLUMN)]).astype(np.int64)
+    rows = np.column_stack([np.searchsorted(floors, at[:, 2]) - 1, np.floor(at[:, :2] / COLUMN)]).astype(np.int64)
     return np.unique(rows[:, 0] * 2**40 + (rows[:, 1] + 2**18) * 2**20 + rows[:, 2] + 2**18)
 
 
