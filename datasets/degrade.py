@@ -21,6 +21,7 @@ CHANGES = {
     "noise": (0.0, 0.5),  # m, standard deviation that is added to each coordinate
     "missing": (0.0, 0.95),  # share of the points that lie in holes of 1 m
     "scale": (0.1, 10.0),  # by which the second map is larger
+    "plan": (1.0, 1.0),  # the second map is the building's floor plan (`drawing`)
     "time": (0.0, 1.0),  # share of the furniture that moved, and of the doors; half as much is gone
 }
 

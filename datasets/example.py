@@ -16,6 +16,7 @@ import numpy as np
 from topomerge.datasets.building import Building
 from topomerge.datasets.buildings import make_building
 from topomerge.datasets.degrade import UNCHANGED, degraded
+from topomerge.datasets.drawing import with_plan
 from topomerge.datasets.erect import erect
 from topomerge.datasets.kept import kept_arrays, save_maps, told_of_maps
 from topomerge.datasets.pairs import Pair, make_pair
@@ -205,7 +206,7 @@ def _first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> Pair:
         try:
             building = _building(item, k, plans)
             other = _building(item, len(item.buildings), plans) if item.hard == "other-building" else None
-            return make_pair(
+            pair = make_pair(
                 building,
                 item.overlap,
                 item.sensors,
@@ -218,6 +219,7 @@ def _first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> Pair:
                 item.source,
                 item.over_stairs,
             )
+            return with_plan(pair, building) if item.change[0] == "plan" else pair
         except InputError as error:
             refused = error
     raise refused or InputError("an item without buildings")

@@ -22,7 +22,7 @@ from topomerge.evaluation.settings import Evaluation, Pairs, check, difference, 
 from topomerge.evaluation.tables import Table, write_section
 from topomerge.types import PointCloud, Sim3
 
-SETS = ("heldout", "heldout_small", "real", "robustness")
+SETS = ("heldout", "heldout_small", "heldout_plans", "real", "robustness")
 SMALL = Pairs(
     name="two",
     pairs=2,

@@ -56,6 +56,7 @@ def group_of(kept: KeptPair, settings: Evaluation) -> Row:
     source, common, kind = about["source"], float(about["common"]), about["kind"]
     size = next(name for name, limit in AREAS if common < limit) if kind == "overlap" and common >= 1 else "none"
     change = about.get("change") or ("", 0.0)
+    change = ("", 0.0) if change[0] == "plan" else change  # another sensor, no curve
     return {
         "pair": kept.name,
         "building": f"{source}/{about['building']}",
