@@ -17,9 +17,8 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
     g = torch.Generator().manual_seed(seed)
     ends = torch.tensor([*((i, (i + 1) % rooms) for i in range(rooms)), (0, rooms // 2)]).T
     index = torch.cat([ends, ends.flip(0)], dim=1)
-    doors = torch.tensor(
-        [(e, f) for e in range(index.shape[1]) for f in range(index.shape[1]) if e != f and index[0, e] == index[0, f]]
-    ).T
+    here = index[0]
+    doors = torch.nonzero((here[:, None] == here[None]) & ~torch.eye(len(here), dtype=torch.bool)).T
     size = 1 + 3 * torch.rand((rooms, 1, 3), generator=g)
     return {
         "x": 10 * torch.rand((rooms, 16), generator=g),

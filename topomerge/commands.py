@@ -19,6 +19,7 @@ from topomerge.errors import InputError
 from topomerge.export_commands import EXPORT, VIEW
 from topomerge.learn_commands import EXPORT_EMBEDDER
 
+DESCRIPTORS = ("engineered", "shapedna", "feather", "learned")
 FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 
@@ -243,7 +244,7 @@ def _map_from(path: str, args: argparse.Namespace) -> Any:
 
 
 MAPS = (
-    option("--descriptor", choices=("engineered", "shapedna", "feather", "learned"), default="engineered", help="default engineered"),
+    option("--descriptor", choices=DESCRIPTORS, default="engineered", help="default engineered"),
     option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)"),
     option("--voxel-size", type=_above_zero, metavar="E", help="edge length of a cell where a cloud is given, m (default 0.1)"),
     *(o for o in READING if o[0][0] in ("--up", "--unit")),

@@ -54,7 +54,7 @@ def test_the_order_of_rooms_does_not_matter(node):
 
 @pytest.mark.parametrize("part", GEOMETRY)
 def test_yaw(part):
-    """Tables of numbers: exactly; points about their longest axis: to 1e-3; points as they are: at the turns that are averaged."""
+    """Numbers: exactly; points about their longest axis: to 1e-3; points as they are: at the turns that are averaged."""
     one = graph(points=200)
     exact = network(part, canonical=True, yaws=2)
     loose = network(part, yaws=4)

@@ -113,7 +113,7 @@ def test_validation_of_a_perfect_and_of_a_blind_network():
 
 
 def test_overfit_one_batch(settings):
-    best = fit(replace(settings, overfit=True, epochs=60, batch=3), quiet)
+    best = fit(replace(settings, overfit=True, epochs=60, batch=3, rate=0.02), quiet)
     assert best["val/f1"] == 1.0 and best["val/recall@1"] == 1.0
 
 
@@ -255,10 +255,9 @@ def test_typos_name_their_key(tmp_path):
             from_file(path)
 
 
-def run(words: list[str], **environment: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        words, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, env={**os.environ, "OMP_NUM_THREADS": "1", **environment}
-    )  # fmt: skip
+def run(words: list[str]) -> subprocess.CompletedProcess:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, env=environment)
 
 
 def test_without_hydra(settings, tmp_path):
