@@ -171,13 +171,19 @@ def test_view_serves_the_page_and_nothing_else(tmp_path: Path) -> None:
         root = address.rsplit("/", 1)[0]
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         assert opener.open(address).read() == opener.open(root + "/").read() == b"<p>seen</p>"
-        for path, host, status in (("/secret.txt", "", 404), ("/../secret.txt", "", 404), ("/my%20report.html", "evil.example", 403)):
+        for path, host, status in (
+            ("/secret.txt", "", 404),
+            ("/../secret.txt", "", 404),
+            ("/my%20report.html", "evil.example", 403),
+        ):
             request = urllib.request.Request(root + path, headers={"Host": host} if host else {})
             with pytest.raises(urllib.error.HTTPError) as refused:
                 opener.open(request)
             assert refused.value.code == status
         port = root.rsplit(":", 1)[1]
-        taken = subprocess.run([*command[:-2], "--serve", port, "--no-open"], cwd=tmp_path, capture_output=True, text=True, check=False)
+        taken = subprocess.run(
+            [*command[:-2], "--serve", port, "--no-open"], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
         assert taken.returncode == 1 and "can't be used" in taken.stderr and len(taken.stderr.splitlines()) == 1
         server.send_signal(signal.SIGINT)
         assert server.wait(10) == 0 and server.stderr.read() == ""

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from topomerge.fusion.atlas import atlas as atlas
     from topomerge.fusion.merge import merge as merge
     from topomerge.fusion.result import MergeResult as MergeResult
+    from topomerge.io.exports import save_export as save_export
     from topomerge.io.listing import map_to_json as map_to_json
     from topomerge.io.listing import save_json as save_json
     from topomerge.io.maps import load_map as load_map
@@ -60,6 +61,7 @@ _HOMES = {
     "plan_figure": "topomerge.viz.figures",
     "read_chunks": "topomerge.io.points",
     "read_points": "topomerge.io.points",
+    "save_export": "topomerge.io.exports",
     "save_figure": "topomerge.viz.figures",
     "save_json": "topomerge.io.listing",
     "save_map": "topomerge.io.maps",

@@ -1,16 +1,21 @@
 """Is a document IndoorGML 1.0.3 core? The parts of indoorgmlcore.xsd and of GML 3.2.1 that it uses, as a table.
 
-For each element the children in their order with how often they may stand there. The schema's files can't be fetched where tests run.
+For each element its children in their order, with how often they may stand there. The files can't be fetched where tests run.
 """
 
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-CORE, GML, LINK = "{http://www.opengis.net/indoorgml/1.0/core}", "{http://www.opengis.net/gml/3.2}", "{http://www.w3.org/1999/xlink}"
+CORE, GML, LINK = (
+    "{http://www.opengis.net/indoorgml/1.0/core}",
+    "{http://www.opengis.net/gml/3.2}",
+    "{http://www.w3.org/1999/xlink}",
+)
 HEAD = "gml:description? gml:name* gml:boundedBy? "  # AbstractFeatureType
 ORDER = {
     "core:IndoorFeatures": HEAD + "core:primalSpaceFeatures? core:multiLayeredGraph?",
@@ -28,7 +33,8 @@ ORDER = {
     "core:MultiLayeredGraph": HEAD + "core:spaceLayers+ core:interEdges*",
     "core:spaceLayers": HEAD + "core:spaceLayerMember+",
     "core:spaceLayerMember": "core:SpaceLayer",
-    "core:SpaceLayer": HEAD + "core:usage* core:terminationDate? core:function* core:creationDate? core:class? core:nodes+ core:edges*",
+    "core:SpaceLayer": HEAD
+    + "core:usage* core:terminationDate? core:function* core:creationDate? core:class? core:nodes+ core:edges*",
     "core:nodes": HEAD + "core:stateMember+",
     "core:stateMember": "core:State",
     "core:State": HEAD + "core:duality? core:connects* core:geometry?",
@@ -57,8 +63,17 @@ ORDER = {
     "gml:LineString": "gml:pos gml:pos+",
     "gml:pos": "",
 }
-NAMED = ("IndoorFeatures PrimalSpaceFeatures CellSpace CellSpaceBoundary MultiLayeredGraph spaceLayers SpaceLayer nodes edges State "
-         "Transition Solid Polygon Point LineString").split()  # gml:id is required
+# gml:id is required
+NAMED = {
+    "IndoorFeatures",
+    "PrimalSpaceFeatures",
+    "CellSpace",
+    "CellSpaceBoundary",
+    "MultiLayeredGraph",
+    "spaceLayers",
+    "SpaceLayer",
+}
+NAMED |= {"nodes", "edges", "State", "Transition", "Solid", "Polygon", "Point", "LineString"}
 LINKS = {  # what a link of an element may point to
     ("CellSpace", "duality"): "State",
     ("CellSpace", "partialboundedBy"): "CellSpaceBoundary",
@@ -128,6 +143,6 @@ def is_closed(solid: Any) -> bool:
     edges: dict[tuple, int] = {}
     for ring in solid.iter(GML + "LinearRing"):
         p = [tuple(point) for point in positions(ring).tolist()]
-        for a, b in zip(p, p[1:]):
+        for a, b in pairwise(p):
             edges[(a, b)] = edges.get((a, b), 0) + 1
     return all(edges.get((b, a), 0) == n for (a, b), n in edges.items())

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import shapely
 
+import topomerge
 from tests.io.export_maps import AT, GRID, nothing, rectangles, two_floors, without_doors
 from tests.scenes_map import building
 from topomerge.errors import InputError
@@ -46,13 +47,19 @@ def test_floors_doors_and_stairs(tmp_path):
     door = np.array(ways[0]["geometry"]["coordinates"])
     assert np.linalg.norm(door[1] - door[0]) == pytest.approx(1.0)
     assert door.mean(axis=0) == pytest.approx(two_floors().edges["centre"][0], abs=1e-3)
-    assert ways[4]["properties"]["storeys"] == [0, 1] and np.ptp(np.array(ways[4]["geometry"]["coordinates"])[:, 2]) == pytest.approx(3)
+    assert ways[4]["properties"]["storeys"] == [0, 1] and np.ptp(
+        np.array(ways[4]["geometry"]["coordinates"])[:, 2]
+    ) == pytest.approx(3)
 
 
 def test_one_storey(tmp_path):
     found = geojson(two_floors(), tmp_path, storey=1)
     assert [f["properties"]["storey"] for f in found["features"] if f["properties"]["kind"] == "room"] == [1, 1, 1]
-    assert sorted(f["properties"]["kind"] for f in found["features"] if f["properties"]["kind"] != "room") == ["door", "door", "stairs"]
+    assert sorted(f["properties"]["kind"] for f in found["features"] if f["properties"]["kind"] != "room") == [
+        "door",
+        "door",
+        "stairs",
+    ]
     for wrong in (2, 7):
         with pytest.raises(InputError, match="no such storey"):
             geojson(two_floors(), tmp_path, storey=wrong)
@@ -188,3 +195,12 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "laspy", None)
     with pytest.raises(InputError, match=r"laspy: pip install 'topomerge\[las\]'"):
         outputs(building(1), "las", tmp_path / "a.las", False)
+
+
+def test_from_python(tmp_path):
+    (path,) = topomerge.save_export(two_floors(), "geojson", tmp_path / "a.geojson", storey=0, origin="52.5,13.4,30")
+    assert json.loads(path.read_text())["topomerge"]["origin"]["heading"] == 30.0
+    assert len(topomerge.save_export(two_floors(), "ros", tmp_path / "for" / "robots")) == 6
+    for wrong in ({"name": "shp"}, {"name": "ply", "storey": 1}, {"name": "geojson", "origin": "here"}):
+        with pytest.raises(InputError):
+            topomerge.save_export(two_floors(), path=tmp_path / "x", **wrong)

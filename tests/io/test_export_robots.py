@@ -123,7 +123,9 @@ def test_routes_lead_from_room_to_room_without_walls_between(tmp_path):
         grid = Grid(files["storey_0.yaml"])
         nodes, edges = route(files["storey_0_route.geojson"])
         doors = int((map.edges["kind"] == "door").sum())
-        assert kinds(nodes) == {"room": len(map.rooms), "door": doors} | ({"opening": len(map.edges) - doors} if doors < len(map.edges) else {})
+        assert kinds(nodes) == {"room": len(map.rooms), "door": doors} | (
+            {"opening": len(map.edges) - doors} if doors < len(map.edges) else {}
+        )
         assert joined(nodes, edges) and free_ways(files["storey_0_route.geojson"], grid)
         assert len(nodes) < 60, "straight ways have no nodes in between"
 
@@ -165,7 +167,11 @@ def test_maps_with_little_in_them(tmp_path):
     with pytest.raises(InputError, match="no storeys"):
         write(nothing(), tmp_path / "none")
     assert sorted(write(without_doors(), tmp_path / "closed")) == ["storey_0.pgm", "storey_0.yaml"]
-    assert sorted(write(two_floors(), tmp_path / "upper", storey=1)) == ["storey_1.pgm", "storey_1.yaml", "storey_1_route.geojson"]
+    assert sorted(write(two_floors(), tmp_path / "upper", storey=1)) == [
+        "storey_1.pgm",
+        "storey_1.yaml",
+        "storey_1_route.geojson",
+    ]
     with pytest.raises(InputError, match="no such storey"):
         write(two_floors(), tmp_path / "top", storey=2)
 

@@ -85,6 +85,36 @@ def outputs(map: TopometricMap, name: str, path: Path, folder: bool, **options: 
     return [(path.with_name(path.name + form.suffixes[0]) if folder else path, partial(module.save, map, **given))]
 
 
+def save_export(map: TopometricMap, name: str, path: str | Path, **options: Any) -> list[Path]:
+    """Write a map in the format of another tool.
+
+    Args:
+        map: any map.
+        name: graphml, geojson, indoorgml, dsg, ros, ply, las or ifc.
+        path: the file; for ros the folder, which is made.
+        options: `storey` (geojson, ros) a number; `origin` (geojson) "latitude,longitude" or "latitude,longitude,heading".
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        InputError: an unknown format, a missing package, a wrong option, or the path can't be written.
+    """
+    if name not in FORMATS:
+        raise InputError(f"{name}: is no format that can be written; choose from {', '.join(FORMATS)}")
+    if isinstance(options.get("origin"), str):
+        options["origin"] = import_module("topomerge.io.exports.geojson").parse_origin(options["origin"])
+    unknown = ", ".join(sorted(set(options) - set(FORMATS[name].options)))
+    if unknown:
+        raise InputError(f"{unknown}: means nothing for {name}")
+    files = outputs(map, name, Path(path), False, **options)
+    if FORMATS[name].folder:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    for place, save in files:
+        save(place)
+    return [place for place, _ in files]
+
+
 def _check_package(name: str, form: Format) -> None:
     if form.needs is None:
         return

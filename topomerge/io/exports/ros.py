@@ -24,8 +24,8 @@ FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 def files(map: TopometricMap, folder: Path, stem: str, storey: int | None = None) -> list[tuple[Path, partial[None]]]:
     """What stands in the folder: for each storey `storey_0.pgm` and `.yaml`, and `storey_0_route.geojson` where there are routes.
 
-    Numbers of nodes and edges are unique over all storeys. Where stairs begin or end, a node says in its metadata to which room of
-    which storey they lead.
+    Numbers of nodes and edges are unique over all storeys. Where stairs begin or end, a node says in its metadata to which room
+    of which storey they lead.
 
     Raises:
         InputError: there is no such storey, or none at all.
@@ -55,7 +55,7 @@ def _save_image(grid: Occupancy, path: Path) -> None:
     image[grid.free] = FREE
     image[grid.occupied] = OCCUPIED
     image = np.ascontiguousarray(image.T[::-1])  # rows from the top, y up
-    height, width = image.shape
+    height, width = len(image), len(image[0])
     with replacing(path) as beside, beside.open("wb") as file:
         file.write(f"P5\n# topomerge: {grid.size:g} m a pixel\n{width} {height}\n255\n".encode("ascii"))
         file.write(image.tobytes())
