@@ -1,6 +1,6 @@
 """Sets of simulated partial maps of one building, extracted and cached: what `benchmarks/atlas.py` measures atlases with.
 
-``python benchmarks/atlas_maps.py test 8 4`` makes four sets of eight maps in ``cache/atlas/test``; what is there is not made again.
+``python benchmarks/atlas_maps.py test 8 4`` makes four sets of eight maps in ``cache/atlas/test``, unless they are there.
 Sensors and kinds of building are mixed; in every second set of four or more maps the last map is of another building of the same
 kind, which must stay apart. Buildings of the test split train and tune nothing.
 """

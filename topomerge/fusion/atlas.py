@@ -25,7 +25,8 @@ from topomerge.fusion.verify import model
 from topomerge.io.maps import load_map
 from topomerge.types import Sim3, TopometricMap
 
-SURE = 4.0  # log odds of a link, above which no further ones are looked for
+SURE = 4.0  # log odds of a link, above which no further ones are looked for within its component
+ENOUGH = 3  # registrations of a map, after which none within its component is made
 Known = MutableMapping[tuple[str, str], tuple[Hypothesis, ...]]
 
 
@@ -215,14 +216,15 @@ class _Explorer:
                 return found
 
     def _next(self, found: Assembly) -> Iterator[tuple[int, int]]:
-        """For each map its most promising partner in another component, and where it is not surely connected in its own."""
+        """For each map its most promising partner in another component, and where it is not surely connected one in its own."""
+        many = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
         for k in range(len(self.maps)):
             own = found.of(k)
             sure = any(link.log_odds >= SURE for link in found.links if k in link.maps)
             partners = [m for m in np.argsort(-self.promise[k], kind="stable").tolist() if m != k]
             partners = [m for m in partners if (min(k, m), max(k, m)) not in self.tried]
             outside = [m for m in partners if m not in own]
-            inside = [m for m in partners if m in own and not sure]
+            inside = [m for m in partners if m in own and not sure and many[k] < ENOUGH]
             for m in (*outside[:1], *inside[:1]):
                 yield min(k, m), max(k, m)
 
