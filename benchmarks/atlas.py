@@ -1,7 +1,7 @@
 """Atlases of 2, 4, 8 and 16 simulated maps: time, memory, maps placed right and wrong, registrations that were needed.
 
-``python benchmarks/atlas.py test`` puts together every set that `benchmarks/atlas_maps.py` made of the split, each in a process of
-its own, and prints a Markdown table; what was measured is kept in ``cache/atlas/results_SPLIT.jsonl`` and not measured again
+``python benchmarks/atlas.py test`` puts together every set that `benchmarks/atlas_maps.py` made of the split, each in a process
+of its own, and prints a Markdown table; what was measured is kept in ``cache/atlas/results_SPLIT.jsonl`` and not measured again
 (``--anew``: all of it). A map is right within 0.5 m and 5 degrees of where it lies in the first map of its component, at its own
 middle; with slices, which say nothing of heights, seen from above.
 """
