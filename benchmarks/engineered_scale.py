@@ -1,7 +1,7 @@
 """Write `topomerge/embedding/engineered.json`: what the engineered features are scaled by.
 
-Run from the root: ``python benchmarks/engineered_scale.py FOLDER``, FOLDER being pairs of the *training* split that
-`benchmarks/matching_pairs.py` made. Rooms weigh alike, looked-into ones (most of the outline unseen) not at all.
+Run from the root: ``python benchmarks/engineered_scale.py MANIFEST``, of pairs of the *training* split (``python -m
+topomerge.datasets.build data=matching_train``). Rooms weigh alike, looked-into ones (most of the outline unseen) not at all.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from matching_pairs import load
+from topomerge.datasets.kept import load_set
 
 from topomerge.embedding.engineered import FEATURES, raw_features
 from topomerge.io.atomic import replacing
@@ -19,13 +19,14 @@ from topomerge.io.atomic import replacing
 SHRINK = 0.1  # share of the features' own variances in the covariance of the differences: few rooms give a noisy one
 
 
-def main(folder: str) -> None:
+def main(manifest: str) -> None:
     values, differences = [], []
-    for pair in load(Path(folder)):
-        a, b = raw_features(pair.a), raw_features(pair.b)
-        values += [a[~pair.a.rooms["glimpsed"]], b[~pair.b.rooms["glimpsed"]]]
+    for pair in load_set(Path(manifest)):
+        maps = pair.maps()
+        (a, b), (glimpsed_a, glimpsed_b) = map(raw_features, maps), (m.rooms["glimpsed"] for m in maps)
+        values += [a[~glimpsed_a], b[~glimpsed_b]]
         i, j = pair.matches.T
-        good = pair.one_a[i] & pair.one_b[j] & ~pair.a.rooms["glimpsed"][i] & ~pair.b.rooms["glimpsed"][j]
+        good = pair.one[0][i] & pair.one[1][j] & ~glimpsed_a[i] & ~glimpsed_b[j]
         differences.append((a[i] - b[j])[good])
     rooms, apart = np.concatenate(values), np.concatenate(differences)
     limit = 4 * rooms.std(axis=0)

@@ -1,8 +1,7 @@
 """The weights of `ODDS` in `topomerge/matching/consistency.py`: how likely a hypothesis is right, given its evidence.
 
-Run from the root: ``python benchmarks/matching_odds.py FOLDER``, FOLDER being pairs of the *training* split that
-`benchmarks/matching_pairs.py` made. Hypotheses are searched in each pair, and in as many pairs of maps of two buildings;
-then a softmax over the hypotheses and "none" is fitted to which one is right. Prints the weights, and how often which was right.
+Run from the root: ``python benchmarks/matching_odds.py MANIFEST``, of pairs of the *training* split (``python -m
+topomerge.datasets.build data=matching_train``). Hypotheses are searched in each pair, and in as many of two buildings; then a softmax over the hypotheses and "none" is fitted to which one is right. Prints the weights, and how often which was right.
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from matching_pairs import load
 from scipy.optimize import minimize
+from topomerge.datasets.kept import load_set
 
 from topomerge.matching.consistency import odds_features
 from topomerge.matching.match import match
@@ -22,14 +21,16 @@ from topomerge.types import Array
 RIGHT = (1.0, np.radians(5))  # m at any room's middle, rad
 
 
-def collect(folder: Path) -> list[tuple[Array, Array]]:
+def collect(manifest: Path) -> list[tuple[Array, Array]]:
     """(features (H, 4), right (H,)) of each pair of maps."""
-    pairs, found = load(folder), []
+    pairs, found = [p for p in load_set(manifest) if p.transform is not None and len(p.matches)], []
     for n, p in enumerate(pairs):
         if "tablet" in p.about["sensors"]:  # the extraction of September finds their floor a table high
             continue
-        for b, true in ((p.b, True), (pairs[(n + 7) % len(pairs)].b, False)):
-            hypotheses = match(p.a, b).alternatives
+        a, own = p.maps()
+        for b, true in ((own, True), (pairs[(n + 7) % len(pairs)].maps()[1], False)):
+            hypotheses = match(a, b).alternatives
+            assert p.transform is not None
             c = b.rooms["centroid"]
             off = [np.linalg.norm(h.transform.apply(c) - p.transform.apply(c), axis=1).max() for h in hypotheses]
             right = np.array(off) < RIGHT[0] if true else np.zeros(len(off), bool)
@@ -52,8 +53,8 @@ def fit(found: list[tuple[Array, Array]]) -> Array:
     return out
 
 
-def main(folder: str) -> None:
-    found = collect(Path(folder))
+def main(manifest: str) -> None:
+    found = collect(Path(manifest))
     w = fit(found)
     print(json.dumps(np.round(w, 3).tolist()), len(found))
     top = np.array([(p[0], right[0]) for p, right in ((chances(x @ w), r) for x, r in found) if len(p)])

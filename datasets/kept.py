@@ -89,6 +89,18 @@ def load_kept(path: Path) -> KeptPair:
     return KeptPair(path.stem, path.parent, matches, true, one, twin, sim3_of(data["transform"]), data["anchor"], about)
 
 
+def load_set(manifest: Path) -> list[KeptPair]:
+    """All pairs of a manifest that `build` wrote.
+
+    Raises:
+        InputError: no such manifest, or a pair's maps were not kept.
+    """
+    if not manifest.is_file():
+        raise InputError(f"{manifest}: no such manifest; make it with python -m topomerge.datasets.build")
+    rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
+    return [load_kept(manifest.parent / "pairs" / row["file"]) for row in rows]
+
+
 def _rooms_of_matches(matches: Array, sizes: Sequence[int]) -> tuple[Array, Array]:
     """A number of its own for each match; rooms without one have -1."""
     out = [np.full(n, -1) for n in sizes]

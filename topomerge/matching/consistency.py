@@ -153,7 +153,9 @@ def refined(poses: Poses, plans: tuple[TopDown, TopDown], scale_free: bool) -> P
             to = target[near, 0] + 1j * target[near, 1]
             p, q = at[near] - at[near].mean(), to - to.mean()
             fit = np.vdot(p, q)
-            step = fit / np.vdot(p, p) if scale_free else fit / max(abs(fit), 1e-12)
+            if abs(fit) < 1e-9:  # all walls that meet lie in one place: no turn fits better than another
+                break
+            step = fit / np.vdot(p, p) if scale_free else fit / abs(fit)
             move[h] = step * (move[h] - at[near].mean()) + to.mean()
             turn[h] *= step
     shift = np.stack([move.real, move.imag, poses.shift[:, 2]], axis=1)
