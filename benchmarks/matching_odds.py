@@ -1,7 +1,8 @@
 """The weights of `ODDS` in `topomerge/matching/consistency.py`: how likely a hypothesis is right, given its evidence.
 
 Run from the root: ``python benchmarks/matching_odds.py MANIFEST``, of pairs of the *training* split (``python -m
-topomerge.datasets.build data=matching_train``). Hypotheses are searched in each pair, and in as many of two buildings; then a softmax over the hypotheses and "none" is fitted to which one is right. Prints the weights, and how often which was right.
+topomerge.datasets.build data=matching_train``). Hypotheses are searched in each pair, and in as many of two buildings; then
+a softmax over the hypotheses and "none" is fitted to which one is right. Prints the weights, and how often which was right.
 """
 
 from __future__ import annotations
