@@ -1,16 +1,29 @@
-"""MkDocs: what the parser knows of the commands is written into docs/cli.md where it says `<!-- commands -->`."""
+"""MkDocs: what the program knows of itself is written into the pages.
+
+docs/cli.md: the help of every command, where it says `<!-- commands -->`; docs/api.md: what the package offers and no line names.
+"""
 
 from __future__ import annotations
 
 import argparse
+import re
 from typing import Any
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put the commands' help into the page of the command line."""
-    if page.file.src_uri != "cli.md":
-        return markdown
-    return markdown.replace("<!-- commands -->", commands())
+    """Complete the pages of the command line and of Python."""
+    if page.file.src_uri == "cli.md":
+        return markdown.replace("<!-- commands -->", commands())
+    return markdown + others(markdown) if page.file.src_uri == "api.md" else markdown
+
+
+def others(markdown: str) -> str:
+    """Lines for mkdocstrings, of the public names that the page does not name yet."""
+    from topomerge import _HOMES
+
+    lines = [f"::: {home}.{name}" for name, home in _HOMES.items() if not re.search(rf"(?m)^::: .*\.{name}$", markdown)]
+    lines = [line.replace("topomerge.models.", "models.").replace("topomerge.datasets.", "datasets.") for line in lines]
+    return "\n## More\n\n" + "\n".join(lines) + "\n" if lines else ""
 
 
 def commands() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shutil
@@ -102,6 +103,24 @@ def test_the_exit_statuses_are_told_alike() -> None:
     page = (ROOT / "docs" / "cli.md").read_text()
     for status in re.findall(r"(?m)^  (\d+) ", cli.EXIT_STATUSES):
         assert f"| {status} |" in page
+
+
+def named_in(path: Path) -> set[str]:
+    """Functions and classes of a file, and `Class.method`."""
+    found = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            found |= {f"{node.name}.{n.name}" for n in node.body if isinstance(n, ast.FunctionDef)}
+    return found
+
+
+def test_every_formula_has_its_function() -> None:
+    named = re.findall(r"`((?:topomerge|models|datasets)/[\w/]+\.py):([\w.]+)`", (ROOT / "docs" / "method.md").read_text())
+    assert len(named) > 60
+    for path, name in named:
+        assert name in named_in(ROOT / path), f"docs/method.md: {path} has no {name}"
 
 
 @pytest.mark.slow
