@@ -1,7 +1,8 @@
 """Pairs of voxel grids with known transforms for benchmarks of registration, made once and cached (resumable).
 
 ``python benchmarks/merge_pairs.py train 400`` simulates pairs of training buildings into ``cache/merge/train``; ``test`` those of
-the test split. Every sixth pair has much moved furniture, every eighth glass walls, and a quarter must not merge.
+the test split. Every sixth pair has much moved furniture, every eighth glass walls, and a quarter must not merge; from seed 2 on
+half of them must not, most of them hard to tell (`MANY`).
 Needs TOPOMERGE_DATA for the buildings from real plans; without it all are procedural.
 """
 
@@ -28,6 +29,7 @@ from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
 
 EDGE = 0.1  # m
 COMMON = 0.2  # m, columns by which the area in common is measured
+BELOW = 0.15  # m: what is that far below a floor is the storey below's ceiling
 STEP = 0.08  # m along a ray
 LONGEST = 120.0  # s a pair
 WEIGHTS = {
@@ -36,6 +38,7 @@ WEIGHTS = {
     "sensors": {"tls": 3, "lidar": 2, "depth": 3, "tablet": 1, "laser2d": 1},
     "hard": {"other-building": 0.13, "other-storey": 0.07, "twin-wing": 0.05},
 }
+MANY = {"other-building": 0.1, "other-storey": 0.15, "twin-wing": 0.25}  # hard negatives from seed 2 on
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +76,7 @@ def recipe(split: str, pairs: int, seed: int = 0) -> Recipe:
     sources = WEIGHTS["sources"] if folder else {"procedural": 1.0}
     return Recipe(
         name=f"merge_{split}", split=split, pairs=pairs, seed=seed, folder=folder, sources=dict(sources),
-        kinds=dict(WEIGHTS["kinds"]), sensors=dict(WEIGHTS["sensors"]), hard=dict(WEIGHTS["hard"]),
+        kinds=dict(WEIGHTS["kinds"]), sensors=dict(WEIGHTS["sensors"]), hard=dict(MANY if seed > 1 else WEIGHTS["hard"]),
         overlaps=[0.0, 0.1, 0.25, 0.4, 0.6], rooms=[4, 15], two_storeys=0.15,
     )  # fmt: skip
 
@@ -121,7 +124,7 @@ def columns_seen(grid: VoxelGrid, free: VoxelGrid | None, into: Sim3, floors: Ar
     """Unique (storey, ix, iy) of the columns of which a map knows anything, in another frame."""
     points = [grid.centroids()] + ([free.centroids()] if free is not None else [])
     at = into.apply(np.concatenate(points))
-    storey = np.searchsorted(floors - 0.4, at[:, 2]) - 1
+    storey = np.searchsorted(floors - BELOW, at[:, 2]) - 1
     rows = np.column_stack([storey, np.floor(at[:, :2] / COMMON)]).astype(np.int64)
     return np.unique(rows[:, 0] * 2**40 + (rows[:, 1] + 2**18) * 2**20 + rows[:, 2] + 2**18)
 

@@ -111,6 +111,6 @@ def test_on_lines_keeps_straight_runs_only():
     for leg in legs:
         mask[leg] = True
     angles = np.pi * np.arange(24) / 24
-    kept = on_lines(mask, np.cos(angles), np.sin(angles), 12, 11)
+    kept = on_lines(mask, np.cos(angles), np.sin(angles), 12, 11, 3)
     assert kept[5, 3:30].all() and kept[np.arange(10, 35), np.arange(10, 35)].all()
     assert not any(kept[leg] for leg in legs)

@@ -29,6 +29,7 @@ LAYER = 0.1  # share of the cells that a layer of a map of slices holds at least
 NOMINAL = (2.7, 0.3, 1.375)  # m: floor to ceiling; a slice's height above the floor; and the height at which slices are drawn
 FLAT = 1.5  # m, radius over which the floor may rise and fall
 STRAIGHT = 1.2  # m; what a slice shows in no straight run of this length is furniture
+BESIDE = 0.35  # m from such a run, and on one side of it at least, hardly anything stands
 UNIT = np.uint32(1)
 
 
@@ -92,15 +93,13 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
         raise InputError("the map has no occupied cells: there is nothing to register")
     cell = max(cell, grid.edge)
     points = cell_middles(grid)
-    low = np.floor(points[:, :2].min(axis=0) / cell).astype(np.int64)
-    columns = np.floor(points[:, :2] / cell).astype(np.int64) - low
+    corner = grid.origin[:2]  # columns are those of the cells: on another lattice some get two rows of cells, and some none
+    low = np.floor((points[:, :2].min(axis=0) - corner) / cell + 1e-6).astype(np.int64)
+    columns = np.floor((points[:, :2] - corner) / cell + 1e-6).astype(np.int64) - low
+    corner = corner + low * cell
     shape = tuple((columns.max(axis=0) + 1).tolist())
     ix, iy = np.ascontiguousarray(columns.T)
-    empty = None
-    if free is not None and len(free):
-        at = free.centroids()
-        columns = np.floor(at[:, :2] / cell).astype(np.int64) - low
-        empty = (np.ascontiguousarray(columns[:, 0]), np.ascontiguousarray(columns[:, 1]), at[:, 2])
+    empty = None if free is None or not len(free) else _crossed(free, corner, cell)
     layers, found = slices(grid), []
     storeys = [(z - NOMINAL[1], np.nan, z - NOMINAL[2]) for z in layers] if layers else levels(grid)
     for floor, ceiling, base in storeys:
@@ -115,8 +114,18 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
         occupied = column_bits(ix, iy, z, heights, LOW, BAND)
         crossed = column_bits(*crossing, heights, LOW, BAND) if crossing else np.zeros(shape, np.uint32)
         high = _ceiling(ix, iy, z, base, ceiling, shape)
-        found.append(_plan(occupied, crossed, low * cell, cell, floor, ceiling, (high, heights), bool(layers)))
+        found.append(_plan(occupied, crossed, corner, cell, floor, ceiling, (high, heights), bool(layers)))
     return found
+
+
+def _crossed(free: VoxelGrid, corner: Array, cell: float) -> tuple[Array, Array, Array]:
+    """Columns ix, iy and heights, m, of empty cells; one that is wider than a column is in several."""
+    side = max(round(free.edge / cell), 1)
+    at = free.centroids()
+    steps = (np.arange(side) - (side - 1) / 2) * free.edge / side
+    parts = [np.floor((at[:, :2] + (dx, dy) - corner) / cell + 1e-6).astype(np.int64) for dx in steps for dy in steps]
+    ix, iy = np.ascontiguousarray(np.concatenate(parts).T)
+    return ix, iy, np.tile(at[:, 2], side**2)
 
 
 def cell_middles(grid: VoxelGrid) -> Array:
@@ -268,10 +277,10 @@ def _plan(
 
 
 def _straight(mask: Array, cell: float) -> Array:
-    """What a slice shows of walls: straight runs. Legs and chairs are as dense, but do not line up."""
+    """What a slice shows of walls: straight runs beside which little stands. Legs and chairs are as dense, but stand in heaps."""
     angles = np.pi * np.arange(24) / 24
     long = max(round(STRAIGHT / cell), 3)
-    found: Array = on_lines(mask, np.cos(angles), np.sin(angles), long, long - 1)
+    found: Array = on_lines(mask, np.cos(angles), np.sin(angles), long, long - 1, max(round(BESIDE / cell), 2))
     return found
 
 

@@ -11,11 +11,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.fusion.closer import closer
 from topomerge.fusion.evidence import cell_middles, plans
 from topomerge.fusion.refine import Surface, refine_pose, surface
 from topomerge.fusion.scale import search_scaled
-from topomerge.fusion.search import Candidate, View, search
-from topomerge.fusion.verify import MARGIN_CAP, Judge, model, probability, rank
+from topomerge.fusion.search import View, search
+from topomerge.fusion.verify import MARGIN_CAP, Judge, Ranked, model, probability, rank
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
 log = logging.getLogger(__name__)
@@ -25,11 +26,13 @@ DRIFTED = (0.5, np.radians(3.0))  # m, rad: a refinement that moves the middle b
 
 @dataclass(frozen=True)
 class Alternative:
-    """A hypothesis: T_ab, log odds that it is right seen by itself, and what it was judged by."""
+    """A hypothesis: T_ab, log odds that it is right seen by itself, what it was judged by, and its probability beside all others
+    (those of a registration and that none is right sum to 1)."""
 
     transform: Sim3
     plausibility: float
     features: dict[str, float]
+    probability: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Registration:
         transform: T_ab of the best hypothesis, believed or not; None where there was none.
         probability: that it is right, calibrated on simulated pairs; 0 without a hypothesis.
         accepted: is the probability above the threshold of the calibration?
-        features: what it was judged by (`verify.Judge`), with ``margin`` and ``rmse`` (m).
+        features: what it was judged by (`verify.Judge`, `closer.closer`), with ``margin`` and ``rmse`` (m).
         alternatives: the hypotheses, best first; the first one is the best before its fine registration.
         reason: in words.
         seconds: step -> s.
@@ -126,13 +129,15 @@ def register(
     clock("search")
     if not candidates:
         return Registration(None, 0.0, False, reason="the maps show no walls that could be compared", seconds=clock.seconds)
-    ranked = rank(candidates, Judge(first, second))
+    judge = Judge(first, second)
+    ranked = rank(candidates, judge)
+    seen = closer(judge, ranked[0][0].pose)
     clock("verify")
     pose, rmse = ranked[0][0].pose, float("nan")
     if refined and not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
         pose, rmse = fine(a, b, pose, scale == "free")
     clock("refine")
-    return _verdict(ranked, pose, rmse, clock.seconds)
+    return _verdict(ranked, seen, pose, rmse, clock.seconds)
 
 
 class _Clock:
@@ -148,18 +153,19 @@ class _Clock:
 
 
 def _verdict(
-    ranked: Sequence[tuple[Candidate, dict[str, float], float]], pose: Sim3, rmse: float, seconds: dict[str, float]
+    ranked: Sequence[Ranked], seen: dict[str, float], pose: Sim3, rmse: float, seconds: dict[str, float]
 ) -> Registration:
     """The best of ranked hypotheses, refined to `pose`, with its probability and the reason in words."""
-    features = {**ranked[0][1], "margin": ranked[0][2] - ranked[1][2] if len(ranked) > 1 else MARGIN_CAP, "rmse": rmse}
-    chance = probability(ranked)
+    margin = ranked[0][2] - ranked[1][2] if len(ranked) > 1 else MARGIN_CAP
+    features = {**ranked[0][1], **seen, "margin": margin, "rmse": rmse}
+    chance, every = probability(ranked, seen)
     accepted = chance >= model()["threshold"]
     share = 100 * features["conflict_share"]
     reason = (
         f"{'believed' if accepted else 'not believed'}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of "
         f"free floor seen by both, {share:.1f} % of the walls stand on free floor of the other map"
     )
-    others = tuple(Alternative(c.pose, s, f) for c, f, s in ranked[:ALTERNATIVES])
+    others = tuple(Alternative(c.pose, s, f, p) for (c, f, s), p in zip(ranked[:ALTERNATIVES], every, strict=False))
     return Registration(pose, chance, accepted, features, others, reason, seconds)
 
 

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy import fft, ndimage
 
-from topomerge.fusion.evidence import Plan
+from topomerge.fusion.evidence import BAND, LOW, Plan
 from topomerge.kernels import align
 from topomerge.types import Array, Sim3
 
@@ -20,8 +20,12 @@ COARSE = 0.2  # m, cells of the correlation; wider where maps are large
 LARGEST = 1300  # cells along a side of the correlated image
 LAMBDA = 0.75  # weight of a wall on free ground, against one on a wall
 MARGIN = 0.25  # m that free ground keeps from anything standing
+HEAD, HANG = 10, 0.15  # band from 2.0 m above the floor on; m below a ceiling that still are it
+LINTEL = 0.5  # m from walls: nearer, what is above a head is part of the wall
+TALL = 0b11 << 10  # 2.0 to 2.5 m above the floor: little furniture is that high
 DEGREE = 0.5  # of the direction profile
 PEAKS, PER_YAW, KEPT = 10, 12, 100
+QUARTERS, TURNED = 3, np.radians(3.0)  # peaks that are tried in all quarters, where no other peak is as near
 APART = 0.6  # m between peaks of one yaw
 SIGMAS = (0.3, 0.15, 0.08)  # m
 SAMPLE = 1500  # wall columns that a pose is refined by
@@ -71,6 +75,34 @@ class View:
         return self.plan.points(self.plan.wall)
 
     @cached_property
+    def directions(self) -> Array:
+        """(n,) rad in [0, pi): of the wall that each column of `walls` belongs to."""
+        image = ndimage.gaussian_filter(self.plan.wall.astype(np.float32), 0.15 / self.plan.cell)
+        x, y = np.gradient(image)
+        double = (x + 1j * y) ** 2
+        smooth = [ndimage.gaussian_filter(part, 0.3 / self.plan.cell)[self.plan.wall] for part in (double.imag, double.real)]
+        out: Array = (np.arctan2(*smooth) / 2 + np.pi / 2) % np.pi
+        return out
+
+    @cached_property
+    def tall(self) -> Array:
+        """(n,) bool: is the wall higher than furniture? All are where the map did not look that high."""
+        high = (self.plan.bits[self.plan.wall] & np.uint32(TALL)) == TALL
+        return high if high.mean() > 0.25 else np.ones_like(high)
+
+    @cached_property
+    def hung(self) -> Array:
+        """(H, W) uint8: 2 where something hangs below the ceiling and above a head, 1 where nothing does, 0 where no ceiling was
+        seen or a wall or the lintel of a door is near."""
+        p = self.plan
+        top = np.floor((np.nan_to_num(p.high, nan=-1e3) - HANG - p.low - LOW) / BAND)  # the first band that may be the ceiling's
+        seen = np.isfinite(p.high) & p.free & (top > HEAD) & (self.to_wall >= LINTEL)
+        below = np.left_shift(np.uint32(1), np.clip(top, 0, 31).astype(np.uint32)) - np.uint32(1)
+        something = (p.bits & below & ~np.uint32((1 << HEAD) - 1)) > 0
+        out: Array = (seen * (1 + something)).astype(np.uint8)
+        return out
+
+    @cached_property
     def middle(self) -> Array:
         """(2,) m, of the walls."""
         return self.walls.mean(axis=0) if len(self.walls) else self.plan.points(self.plan.known).mean(axis=0)
@@ -117,7 +149,8 @@ def direction_profile(walls: Array, cell: float, most: int = 6000) -> Array:
 
 
 def yaw_candidates(a: Array, b: Array, peaks: int = PEAKS) -> list[float]:
-    """Yaws (rad) that turn b's direction profile into a's, best first; each with its half turn."""
+    """Yaws (rad) that turn b's direction profile into a's, best first; each with its half turn, the best ones in all quarters:
+    where one map shows the walls of one direction only, those of the other direction are the nearest peak."""
     blur = 1.5 / DEGREE
     a, b = (ndimage.gaussian_filter1d(p, blur / 2, mode="wrap") for p in (a, b))
     a, b = a / max(a.max(), 1e-9), b / max(b.max(), 1e-9)
@@ -130,8 +163,12 @@ def yaw_candidates(a: Array, b: Array, peaks: int = PEAKS) -> list[float]:
         left, at, right = match[k - 1], match[k], match[(k + 1) % len(match)]
         bend = left - 2 * at + right
         shift = 0.5 * (left - right) / bend if bend < 0 else 0.0
-        found += [float(np.radians((k + shift) * DEGREE)), float(np.radians((k + shift) * DEGREE) + np.pi)]
-    return [wrapped(y) for y in found]
+        found += [wrapped(np.radians((k + shift) * DEGREE) + half) for half in (0.0, np.pi)]
+    for yaw in found[: 2 * QUARTERS]:
+        aside = wrapped(yaw + np.pi / 2)
+        if all(abs(wrapped(aside - other)) > TURNED for other in found):
+            found.append(aside)
+    return found
 
 
 def wrapped(yaw: float) -> float:

@@ -19,6 +19,8 @@ from topomerge.types import Array, Sim3
 
 NEAR = 0.15  # m: walls that near are one
 SAMPLE = 40_000  # columns of a storey that are judged; of larger ones so many
+FULLY, GLANCE = 30, 7  # candidates that are judged by all columns; the others by every seventh
+USUAL, FEW = 0.15, 1.0  # share of walls on free ground, and m2 of walls that weigh as much as that prior
 INNER = 0.3  # m from walls, whose noise is no clutter
 BODY_BITS = (1 << BODY[1]) - (1 << BODY[0])
 SLICE_BITS = 0b111 << 2  # 0 to 0.75 m above the floor: where the lasers of robots look
@@ -27,6 +29,7 @@ MARGIN_CAP = 6.0
 BASIN = (1.2, np.radians(3.0), 0.05)  # m, rad, log scale: a worse pose nearer than that is no rival
 RIVAL = 0.3  # of the walls that the best hypothesis brings together
 Features = Mapping[str, float]
+Ranked = tuple[Candidate, dict[str, float], float]  # a hypothesis, its features, log odds that it is right, seen by itself
 
 
 class Judge:
@@ -38,38 +41,44 @@ class Judge:
         self._rows: dict[int, Array] = {}
         self._steps: dict[int, int] = {}
 
-    def __call__(self, pose: Sim3) -> dict[str, float]:
-        """Features of a pose. Areas, and walls as areas of columns, in m2; shares of 1."""
-        out = np.zeros((2, 11))
-        back = pose.inverse()
+    def __call__(self, pose: Sim3, every: int = 1) -> dict[str, float]:
+        """Features of a pose. Areas, and walls as areas of columns, in m2; shares of 1. `every`: only so many of the columns."""
+        out = self.tally(pose, every)
         gaps = [0.0]
         for v, w in pairs_at(self.a, self.b, pose.translation[2], pose.scale):
-            if (id(v), id(w)) not in self._sides:
-                self._sides[id(v), id(w)] = (Side(v, w), Side(w, v))
-            p, q = self._sides[id(v), id(w)]
-            out[0] += q.tally(p, pose)
-            out[1] += p.tally(q, back) * pose.scale**2
             heights = [(v.plan.floor, w.plan.floor), (v.plan.ceiling, w.plan.ceiling)]
             if pose.scale != 1.0:  # a drawing of unknown scale was raised by a height of nobody's measuring
                 heights.pop()
             seen = [h for h in heights if np.isfinite(h).all()]
             gaps += [abs(h - (pose.scale * k + pose.translation[2])) for h, k in seen]
-        unlike, area = self._ceilings(pose)
+        unlike, area = self._ceilings(pose, every)
         sliced = any(v.plan.sliced for v in (*self.a, *self.b))
         known = {"sliced": float(sliced), "ceilings": unlike, "ceiling_area": area}
         return {**_features(out, max(gaps)), **known}
 
-    def _ceilings(self, pose: Sim3) -> tuple[float, float]:
+    def tally(self, pose: Sim3, every: int = 1) -> Array:
+        """(2, 11) of `align.tally`, m2 in a's frame: of the columns of b, and of those of a; of every n-th one, times n."""
+        out = np.zeros((2, 11))
+        back = pose.inverse()
+        for v, w in pairs_at(self.a, self.b, pose.translation[2], pose.scale):
+            if (id(v), id(w)) not in self._sides:
+                self._sides[id(v), id(w)] = (Side(v, w), Side(w, v))
+            p, q = self._sides[id(v), id(w)]
+            out[0] += q.tally(p, pose, every) * pose.scale**2
+            out[1] += p.tally(q, back, every)
+        return out
+
+    def _ceilings(self, pose: Sim3, every: int = 1) -> tuple[float, float]:
         """How unlike the ceilings are where both maps saw free ground: mean deviation from their median difference, m, and the
         area, m2. Storeys of one plan often differ in nothing else."""
         found, area = [], 0.0
         for v, w in pairs_at(self.a, self.b, pose.translation[2], pose.scale):
             if not (np.isfinite(v.plan.ceiling) and np.isfinite(w.plan.ceiling)):
                 continue
-            gap, at = self._gap(v, w, pose)
+            gap, at = self._gap(v, w, pose, every)
             if len(gap):
                 found.append(np.minimum(np.abs(_smooth(gap, at) - np.median(gap)), 0.4))
-                area += len(gap) * w.plan.cell**2 * self._steps[id(w)]
+                area += len(gap) * w.plan.cell**2 * self._steps[id(w)] * every
         return (float(np.concatenate(found).mean()), area) if found else (0.0, 0.0)
 
     def lifted(self, pose: Sim3) -> Sim3:
@@ -85,26 +94,31 @@ class Judge:
         x, y, z = pose.translation
         return replace(pose, translation=(x, y, z + float(np.clip(np.median(every), -1.2, 1.2))))
 
-    def _gap(self, v: View, w: View, pose: Sim3) -> tuple[Array, Array]:
+    def _gap(self, v: View, w: View, pose: Sim3, every: int = 1) -> tuple[Array, Array]:
         """(n,) m by which the ceilings of a lie above those of b before any shift, where both saw free ground; and the columns
         (n, 2) of a."""
-        rows = self._under(w)
-        at = np.column_stack([w.plan.origin + (rows + 0.5) * w.plan.cell, np.zeros(len(rows))])
-        there = np.floor((pose.apply(at)[:, :2] - v.plan.origin) / v.plan.cell).astype(np.int64)
-        inside = ((there >= 0) & (there < v.plan.wall.shape)).all(axis=1)
-        (i, j), k = there[inside].T, tuple(rows[inside].T)
-        gap = v.plan.high[i, j] - pose.scale * w.plan.high[k]
+        under = self._under(w)[::every]
+        c, s = pose.scale * np.cos(pose.yaw), pose.scale * np.sin(pose.yaw)
+        x, y = under[:, 0], under[:, 1]
+        i = np.floor((c * x - s * y + pose.translation[0] - v.plan.origin[0]) / v.plan.cell).astype(np.int64)
+        j = np.floor((s * x + c * y + pose.translation[1] - v.plan.origin[1]) / v.plan.cell).astype(np.int64)
+        inside = (i >= 0) & (j >= 0) & (i < v.plan.wall.shape[0]) & (j < v.plan.wall.shape[1])
+        i, j, under = i[inside], j[inside], under[inside]
+        gap = v.plan.high[i, j] - pose.scale * under[:, 2]
         if np.isfinite([v.plan.floor, w.plan.floor]).all():  # drift and tilt raise both
-            gap -= v.plan.low[i, j] - pose.scale * w.plan.low[k]
+            gap -= v.plan.low[i, j] - pose.scale * under[:, 3]
         kept = np.isfinite(gap) & v.plan.free[i, j]
-        return gap[kept], there[inside][kept]
+        return gap[kept], np.column_stack([i[kept], j[kept]])
 
     def _under(self, view: View) -> Array:
-        """(n, 2) some of the free columns under a ceiling."""
+        """(n, 4) place, ceiling and floor, m, of some of the free columns under a ceiling."""
         if id(view) not in self._rows:
-            rows = np.argwhere(view.plan.free & np.isfinite(view.plan.high))
+            p = view.plan
+            rows = np.argwhere(p.free & np.isfinite(p.high))
             self._steps[id(view)] = max(len(rows) // 3000, 1)
-            self._rows[id(view)] = rows[:: self._steps[id(view)]]
+            rows = rows[:: self._steps[id(view)]]
+            at = (rows[:, 0], rows[:, 1])
+            self._rows[id(view)] = np.column_stack([p.origin + (rows + 0.5) * p.cell, p.high[at], p.low[at]])
         return self._rows[id(view)]
 
 
@@ -146,14 +160,22 @@ class Side:
         at = (rows[:, 0], rows[:, 1])
         self.points = view.plan.origin + (rows + 0.5) * view.plan.cell
         self.kinds, self.faces, self.inner, self.filled = kind[at], view.face[at], self.open[at], self.bits[at]
+        self._parts: dict[int, tuple[Array, ...]] = {}
 
-    def tally(self, on: Side, pose: Sim3) -> Array:
+    def _some(self, every: int) -> tuple[Array, ...]:
+        """Every n-th of the columns."""
+        if every not in self._parts:
+            whole = (self.points, self.kinds, self.faces, self.inner, self.filled)
+            self._parts[every] = tuple(np.ascontiguousarray(x[::every]) for x in whole)
+        return self._parts[every]
+
+    def tally(self, on: Side, pose: Sim3, every: int) -> Array:
         """(11,) of `align.tally`, m2."""
         at = np.array([*pose.translation[:2], pose.yaw, np.log(pose.scale)])
         v = on.view
         seen = (on.kind, v.to_wall, v.to_any, v.face, on.open, on.bits, v.plan.origin, v.plan.cell)
-        found: Array = align.tally(self.points, self.kinds, self.faces, self.inner, self.filled, *seen, at, NEAR, MARGIN)
-        return found * self.weight
+        found: Array = align.tally(*self._some(every), *seen, at, NEAR, MARGIN)
+        return found * self.weight * every
 
 
 def _features(t: Array, level: float) -> dict[str, float]:
@@ -187,14 +209,17 @@ QUALITY = [VECTOR.index(n) for n in ("ratio", "conflict", "worst", "opposed", "l
 
 def vector(f: Features) -> Array:
     """(14,) what the logistic models see of a pose, named `VECTOR`: amounts in logarithms, clutter weighed by how much."""
-    conflict, lift = np.log(f["conflict_share"] + 0.01), f["met"] - f["chance"]
+    amount = f["walls"] + f["conflict"]  # shares of little are drawn towards what is usual: no conflict of nothing is no praise
+    shares = f["conflict_share"], f["worst_conflict"]
+    conflict, worst = (np.log((s * amount + USUAL * FEW) / (amount + FEW) + 0.01) for s in shares)
+    lift = f["met"] - f["chance"]
     many, known = f["clutter"], min(f["ceiling_area"] / 30, 1.0)
     return np.array(
         [
             f["ratio"],
             np.log(f["walls"] + 0.1),
             conflict,
-            np.log(f["worst_conflict"] + 0.01),
+            worst,
             np.log1p(f["free"]),
             f["opposed"],
             lift * np.sqrt(many / (many + 1)),
@@ -235,27 +260,62 @@ def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[
     return margin, float(np.clip(ahead, -2.0, MARGIN_CAP)), float(1 / np.exp(scores - scores[0]).sum())
 
 
-def probability(ranked: Sequence[tuple[Candidate, dict[str, float], float]]) -> float:
-    """Probability that the first of ranked hypotheses is right: that it is one that is right, times its share of all odds."""
+def probability(ranked: Sequence[Ranked], closer: Features) -> tuple[float, list[float]]:
+    """Probability that the first of ranked hypotheses is right: that the best one is, times its share of all odds; and of each.
+
+    Args:
+        closer: what `closer.closer` found about the first one.
+    """
     pose = model()["pose"]
     vectors = np.array([vector(f) for _, f, _ in ranked])
     scores = np.array([s for _, _, s in ranked])
-    margin, ahead, share = lead(scores, vectors, np.array(pose["weight"]), np.array(pose["scale"]))
-    return float(share / (1 + np.exp(-_logit(model()["winner"], np.append(vectors[0], [margin, ahead])))))
+    margin, ahead, _ = lead(scores, vectors, np.array(pose["weight"]), np.array(pose["scale"]))
+    seen = np.concatenate([vectors[0], [margin, ahead], closer_vector(closer)])[: len(model()["names"])]
+    shares = np.exp(scores - scores[0])
+    every = shares / shares.sum() / (1 + np.exp(-_logit(model()["winner"], seen)))
+    return float(every[0]), every.tolist()
 
 
 def _logit(fitted: Mapping[str, Any], x: Array) -> float:
     return float(np.dot((x - fitted["mean"]) / fitted["scale"], fitted["weight"]) + fitted["bias"])
 
 
-def rank(candidates: Sequence[Candidate], judge: Judge) -> list[tuple[Candidate, dict[str, float], float]]:
+CLOSER = (
+    "tall", "crossing", "worst_ratio", "squares", "bad_squares", "in_place", "out_of_place", "kept", "moved_walls", "hanging",
+    "fallen",
+)  # fmt: skip
+
+
+def closer_vector(f: Features) -> Array:
+    """(11,) what the model of the best hypothesis sees of `closer.closer`, named `CLOSER`."""
+    gain, pieces = max(f["in_place"] - f["by_chance"], 0.0), max(f["pieces"] - f["by_chance"], 0.0)
+    return np.array(
+        [
+            np.log(f["tall_conflict"] + 0.05),
+            np.log(f["crossing"] + 0.1),
+            f["worst_ratio"],
+            np.log1p(f["squares"]),
+            f["bad_squares"],
+            np.log1p(gain),
+            np.log1p(pieces - gain),
+            gain / (pieces + 1.0),
+            np.log(f["moved_walls"] + 0.004),
+            np.log1p(f["hanging_met"]),
+            np.log1p(f["hanging"] - f["hanging_met"]),
+        ]
+    )
+
+
+def rank(candidates: Sequence[Candidate], judge: Judge) -> list[Ranked]:
     """(candidate, features, plausibility), best first.
 
     The findings' two-stage rule (shortlist what reaches 0.6 of the best agreement, then least conflict) put the right pose
     first in 76 of 82 training pairs, the logistic model in 80: a flipped plan can agree in more walls than a true overlap.
     """
     lifted = [replace(c, pose=judge.lifted(c.pose)) for c in candidates]
-    judged = [(c, f, plausibility(f)) for c, f in ((c, judge(c.pose)) for c in lifted)]
+    if len(lifted) > FULLY:
+        lifted.sort(key=lambda c: -plausibility(judge(c.pose, GLANCE)))
+    judged = [(c, f, plausibility(f)) for c, f in ((c, judge(c.pose)) for c in lifted[:FULLY])]
     judged.sort(key=lambda j: -j[2])
     kept = {id(c) for c in distinct((c for c, _, _ in judged), np.append(judge.b[0].middle, 0.0), BASIN)}
     return [j for j in judged if id(j[0]) in kept]

@@ -52,12 +52,30 @@ def evidence_rows(found: Registration) -> list[Row]:
     if f.get("ceiling_area", 0) > 0:
         words = f"how unlike they are over {f['ceiling_area']:.0f} m²; storeys of one plan often differ here"
         rows.append(("ceilings", f"{f['ceilings']:.2f} m", words))
+    rows += _closer_rows(f)
     if np.isfinite(f.get("rmse", np.nan)):
         rows.append(("surfaces", f"{100 * f['rmse']:.1f} cm", "root mean square distance of surfaces that are one"))
     if len(found.alternatives) > 1:
         times = np.exp(min(f["margin"], 15.0))
         words = f"{times:,.0f} times as probable" if times >= 1.5 else "about as probable"
         rows.append(("next best place", words, "how far the best hypothesis is ahead of the next one, each seen by itself"))
+    return rows
+
+
+def _closer_rows(f: Mapping[str, float]) -> list[Row]:
+    """What only the best hypothesis was asked (`closer.closer`); joined maps of older versions do not have it."""
+    if "moved_walls" not in f:
+        return []
+    rows = [
+        ("walls one way", _percent(f["worst_ratio"]), "of the walls along the worse of the two main directions agree"),
+        ("squares of 3 m", f"{f['squares']:.0f}", f"in which walls agree; in {_percent(f['bad_squares'])} of all most do not"),
+        ("parts that fit better elsewhere", _percent(f["moved_walls"]), "more walls agree if squares of 6 m move one by one"),
+    ]
+    if f["tall_conflict"] > 0:
+        rows.append(("high walls on free floor", f"{f['tall_conflict']:.1f} m²", "higher than furniture; speaks against"))
+    if f["hanging"] >= 1:
+        words = f"of {f['hanging']:.0f} pieces of lamps, beams and ducts hang in both maps; no two storeys share theirs"
+        rows.append(("under the ceiling", f"{f['hanging_met']:.0f}", words))
     return rows
 
 

@@ -21,24 +21,41 @@ def column_bits(ix, iy, z, base, low, band):  # type: ignore[no-untyped-def]  # 
 
 
 @njit(cache=True, nogil=True)
-def on_lines(mask, cosines, sines, long, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(H, W) bool: the columns of a mask in, or at an end of, a straight run of `long` columns of which `least` are in it."""
+def on_lines(mask, cosines, sines, long, least, beside):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(H, W) bool: the columns of a mask in, or at an end of, a straight run of `long` columns of which `least` are in it, with a
+    parallel run, `beside` columns away to the left or to the right, of which a fifth at most is in it."""
     out = np.zeros(mask.shape, np.bool_)
-    for x in range(mask.shape[0]):
-        for y in range(mask.shape[1]):
+    height, width = mask.shape
+    for x in range(height):
+        for y in range(width):
             if not mask[x, y]:
                 continue
             for k in range(len(cosines)):
-                far = np.zeros(2, np.int64)  # hits ahead and behind, over the whole length
-                near = 0  # and over half of it both ways
+                ahead, behind, near = 0, 0, 0  # hits over the whole length ahead, behind, and over half of it both ways
                 for d in range(1, long):
-                    for side in range(2):
-                        s = d if side == 0 else -d
-                        u, v = x + int(np.rint(s * cosines[k])), y + int(np.rint(s * sines[k]))
-                        if u >= 0 and v >= 0 and u < mask.shape[0] and v < mask.shape[1] and mask[u, v]:
-                            far[side] += 1
-                            near += d <= long // 2
-                if 1 + max(far[0], far[1], near) >= least:
-                    out[x, y] = True
+                    u, v = x + int(np.rint(d * cosines[k])), y + int(np.rint(d * sines[k]))
+                    if u >= 0 and v >= 0 and u < height and v < width and mask[u, v]:
+                        ahead += 1
+                        near += d <= long // 2
+                    u, v = x - int(np.rint(d * cosines[k])), y - int(np.rint(d * sines[k]))
+                    if u >= 0 and v >= 0 and u < height and v < width and mask[u, v]:
+                        behind += 1
+                        near += d <= long // 2
+                if 1 + max(ahead, behind, near) < least:
+                    continue
+                first, last = -(long // 2), long // 2 + 1
+                if 1 + ahead >= least:
+                    first, last = 0, long
+                elif 1 + behind >= least:
+                    first, last = 1 - long, 1
+                for side in (-beside, beside):
+                    hits = 0
+                    for d in range(first, last):
+                        u = x + int(np.rint(d * cosines[k] - side * sines[k]))
+                        v = y + int(np.rint(d * sines[k] + side * cosines[k]))
+                        hits += u >= 0 and v >= 0 and u < height and v < width and mask[u, v]
+                    if 5 * hits <= last - first:
+                        out[x, y] = True
+                if out[x, y]:
                     break
     return out

@@ -23,6 +23,7 @@ from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.types import Array, Sim3
 from topomerge.viz.atlas_report import atlas_html
 from topomerge.viz.markup import Markup, element, join
+from topomerge.viz.merge_lines import lines_view
 from topomerge.viz.merge_plan import Drawn, blend_view, laid_alike
 from topomerge.viz.report import page, plan_view, scene_view, scroller, section, warnings
 from topomerge.viz.scene import scene_data
@@ -135,6 +136,8 @@ def _maps(result: MergeResult, drawn: tuple[Drawn, Drawn]) -> Markup:
         parts.append(element("p", words, class_="note"))
     parts.append(element("div", *views, class_="pair"))
     if result.matches:
+        figure = element("div", lines_view(result.maps, drawn, result.matches, colours), class_="sheet")
+        parts.append(element("div", element("h3", "The matches, drawn between the maps"), figure, class_="more"))
         parts.append(element("div", element("h3", "Rooms that are one"), scroller(_matches(result)), class_="more"))
     return section("The two maps", join(parts), "maps")
 

@@ -1,0 +1,148 @@
+"""What is asked of the best hypothesis only: do walls agree everywhere and in both directions, and does furniture stand in place?
+
+A wing with nearly the same plan, or the storey above, agrees with a map in most of its walls. What tells it apart is local: ends
+that are longer, walls as high as the room in the midst of free ground, furniture that never stands where it should.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.fusion.search import MARGIN, View, pairs_at
+from topomerge.fusion.verify import NEAR, Judge
+from topomerge.kernels import align
+from topomerge.types import Array, Sim3
+
+RUN = 0.8  # m, length from which walls on free ground are no noise
+BLOCK = 3.0  # m, side of the squares in which walls are compared
+LEAST = 0.3  # m2 of walls in a square, below which it tells nothing
+GOOD, BAD = 0.7, 0.4  # share of a square's walls that agree
+RING = 0.8  # m, by which furniture is moved to see what meets by chance
+WINDOW = 6.0  # m, side of the squares that are moved by themselves
+SHIFTS = (0.4, 3.0, 0.1)  # m: least, most, step; less may be drift
+ENOUGH = 0.6  # m2 of walls in such a square
+SOFT = 0.15  # m
+OBJECT = 0.4  # m2 of a piece of furniture
+HANGING = 0.3  # m2 of a lamp or a piece of a beam
+
+
+def closer(judge: Judge, pose: Sim3) -> dict[str, float]:
+    """Further features of a pose, see `NAMES`; m2, shares, and numbers of squares and of pieces of furniture."""
+    walls = np.zeros((0, 6))
+    conflict, back = np.zeros(2), pose.inverse()
+    main = np.radians(float(judge.a[0].profile.argmax()) / 2)
+    moved = np.zeros(2)
+    for v, w in pairs_at(judge.a, judge.b, pose.translation[2], pose.scale):
+        for here, there, move, side in ((w, v, pose, 0), (v, w, back, 1)):
+            rows, stuck = _walls(here, there, move)
+            moved += _moved(rows, there, main if side == 0 else main - pose.yaw)
+            rows[:, 5] *= (pose.scale if side == 0 else 1.0) ** 2
+            if side == 1:  # all in the frame of a
+                rows[:, :2] = here.walls
+            else:
+                rows[:, 4] += pose.yaw
+            walls = np.concatenate([walls, rows])
+            conflict[side] += stuck * (pose.scale if side == 0 else 1.0) ** 2
+    told = {"moved_walls": float(moved[0] / max(moved[1], 1e-6))}
+    return {**_shares(walls, float(conflict.sum()), main), **told, **_furniture(judge, pose), **_overhead(judge, pose)}
+
+
+def _walls(here: View, there: View, move: Sim3) -> tuple[Array, float]:
+    """(n, 6) of each wall column: place in the other map, is it on known ground, does it agree, direction, m2; and the m2 of high
+    walls in runs that stand on free ground."""
+    points = here.walls
+    at = move.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
+    cells = np.floor((at - there.plan.origin) / there.plan.cell).astype(np.int64)
+    inside = ((cells >= 0) & (cells < there.plan.wall.shape)).all(axis=1)
+    i, j = np.where(inside[:, None], cells, 0).T
+    near = inside & (there.to_wall[i, j] <= NEAR)
+    known = inside & (near | (there.kind[i, j] != 0))
+    clash = inside & (there.kind[i, j] == align.FREE) & (there.to_any[i, j] >= MARGIN)
+    area = here.plan.cell**2
+    rows = np.column_stack([at, known, near, here.directions, np.full(len(at), area)])
+    mask = np.zeros(here.plan.wall.shape, bool)
+    mask[here.plan.wall] = clash & here.tall
+    label, _ = ndimage.label(mask, np.ones((3, 3), int))
+    long = 0.0
+    for number, box in enumerate(ndimage.find_objects(label), 1):
+        if max(s.stop - s.start for s in box) * here.plan.cell >= RUN:
+            long += float((label[box] == number).sum())
+    return rows, long * area
+
+
+def _moved(rows: Array, there: View, main: float) -> Array:
+    """How much more of the walls would agree if each square were moved along one of the main directions by itself, m2, and how
+    much there is of them: a longer end fits only after such a move, and furniture or noise hardly fit better."""
+    rows = rows[rows[:, 2] > 0]
+    steps = np.arange(*SHIFTS)
+    steps = np.concatenate([[0.0], steps, -steps])
+    axes = np.array([[np.cos(main), np.sin(main)], [-np.sin(main), np.cos(main)]])
+    shifts = np.concatenate([steps[:, None] * axes[0], steps[1:, None] * axes[1]])
+    size = np.array(there.to_wall.shape)
+    out = np.zeros(2)
+    for offset in (0.0, 0.5):
+        square = np.floor(rows[:, :2] @ axes.T / WINDOW + offset).astype(np.int64)
+        _, owner = np.unique(square[:, 0] << 32 | (square[:, 1] & 0xFFFFFFFF), return_inverse=True)
+        area = np.bincount(owner, weights=rows[:, 5], minlength=1)
+        fit = np.zeros((len(shifts), len(area)))
+        for k, shift in enumerate(shifts):
+            cells = np.floor((rows[:, :2] + shift - there.plan.origin) / there.plan.cell).astype(np.int64)
+            inside = ((cells >= 0) & (cells < size)).all(axis=1)
+            i, j = np.where(inside[:, None], cells, 0).T
+            weight = np.where(inside, np.exp(-((there.to_wall[i, j] / SOFT) ** 2) / 2), 0.0) * rows[:, 5]
+            fit[k] = np.bincount(owner, weights=weight, minlength=1)
+        told = area >= ENOUGH
+        gain = np.maximum(fit[1:].max(axis=0) - fit[0], 0.0)
+        out += gain[told].sum(), area[told].sum()
+    return out
+
+
+def _shares(walls: Array, conflict: float, main: float) -> dict[str, float]:
+    known, near = (walls[:, k] * walls[:, 5] for k in (2, 3))
+    across = np.abs(np.sin(walls[:, 4] - main)) > np.sqrt(0.5)
+    agree = [float(near[side].sum()) / 2 for side in (across, ~across)]
+    ratio = [float((near[side].sum() + 0.5) / (known[side].sum() + 1.0)) for side in (across, ~across)]
+    block = np.floor(walls[:, :2] / BLOCK).astype(np.int64)
+    _, owner = np.unique(block[:, 0] << 32 | (block[:, 1] & 0xFFFFFFFF), return_inverse=True)
+    both = [np.bincount(owner, weights=x, minlength=1) for x in (known, near)]
+    told = both[0] >= LEAST
+    share = both[1][told] / both[0][told]
+    return {
+        "tall_conflict": conflict / 2,
+        "crossing": min(agree),
+        "worst_ratio": min(ratio),
+        "squares": float((share >= GOOD).sum()),
+        "bad_squares": float((share < BAD).sum() / max(told.sum(), 1)),
+    }
+
+
+def _overhead(judge: Judge, pose: Sim3) -> dict[str, float]:
+    """Pieces of what hangs from ceilings (lamps, beams, ducts) that hang in the other map, too, and of all that both maps would
+    show: it stays when furniture moves, and no storey has that of another."""
+    found, back = np.zeros(2), pose.inverse()
+    for v, w in pairs_at(judge.a, judge.b, pose.translation[2], pose.scale):
+        for here, there, move in ((w, v, pose), (v, w, back)):
+            rows = np.argwhere(here.hung == 2)
+            if not len(rows):
+                continue
+            at = np.column_stack([here.plan.origin + (rows + 0.5) * here.plan.cell, np.zeros(len(rows))])
+            cells = np.floor((move.apply(at)[:, :2] - there.plan.origin) / there.plan.cell).astype(np.int64)
+            cells = cells[((cells >= 1) & (cells < np.array(there.hung.shape) - 1)).all(axis=1)]
+            around = np.stack([there.hung[cells[:, 0] + i, cells[:, 1] + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+            known = (around > 0).sum(axis=0) > 4
+            met = (around[:, known] == 2).any(axis=0)
+            found += np.array([met.sum(), known.sum()]) * here.plan.cell**2 / 2 / HANGING
+    return {"hanging": float(found[1]), "hanging_met": float(found[0])}
+
+
+def _furniture(judge: Judge, pose: Sim3) -> dict[str, float]:
+    """How many pieces of furniture stand in place, of how many, and how many would by chance: where all is moved by `RING`."""
+    found = np.zeros((9, 2))
+    steps = [(0.0, 0.0)] + [(RING * np.cos(t), RING * np.sin(t)) for t in np.arange(8) * np.pi / 4]
+    x, y, z = pose.translation
+    for k, (dx, dy) in enumerate(steps):
+        tally = judge.tally(Sim3(pose.yaw, (x + dx, y + dy, z), pose.scale)).sum(axis=0)
+        found[k] = tally[6:8] / 2 / OBJECT
+    share = found[1:, 1].sum() / max(found[1:, 0].sum(), 1e-6)
+    return {"pieces": float(found[0, 0]), "in_place": float(found[0, 1]), "by_chance": float(share * found[0, 0])}
