@@ -4,7 +4,7 @@ BIN := .venv/bin
 export TOPOMERGE_DATA ?= $(wildcard ../shared/data)
 export MPLBACKEND := Agg
 
-.PHONY: setup demo test test-slow lint bench clean
+.PHONY: setup demo test test-slow lint docs bench clean
 setup: .venv/ready
 
 .venv/ready: pyproject.toml constraints.txt
@@ -31,6 +31,11 @@ lint: setup
 	$(BIN)/ruff check .
 	rm -rf build/lint build/lib && $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/lint .
 	cd build/lint && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p topomerge
+
+docs: setup
+	@$(BIN)/python -c 'import mkdocs, mkdocstrings' 2>/dev/null || $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "The documentation: build/site/index.html"
 
 bench: setup
 	@for b in benchmarks/[a-z]*.py; do case $$b in benchmarks/bench.py) ;; *) $(BIN)/python $$b || exit 1 ;; esac; done
