@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import shapely
@@ -32,19 +33,31 @@ def floor_polygons(map: TopometricMap) -> list[shapely.MultiPolygon]:
     Navigable cells end short of the walls. All outlines are moved outwards by the distance at which their areas are those in the
     table of rooms, in the median. A room without navigable cells has its bounding box; it is empty where that is flat.
     """
-    edge, origin, storey = map.navigable.edge, map.navigable.origin[:2], map.rooms["storey"]
+    if map not in _FOUND:
+        _FOUND[map] = _floors(map)
+    return list(_FOUND[map])
+
+
+_FOUND: WeakKeyDictionary[TopometricMap, list[shapely.MultiPolygon]] = WeakKeyDictionary()  # several formats need them
+
+
+def _floors(map: TopometricMap) -> list[shapely.MultiPolygon]:
+    edge, origin = map.navigable.edge, map.navigable.origin[:2]
     plans = [_plan(map.navigable.cells[rows, :2], edge) for rows in _by_room(map.navigable_room, len(map.rooms))]
     cells = [None if plan is None else _straight(_polygon(plan.cells, plan.low)) for plan in plans]
     growth = _growth(map, plans, cells)
     found: list[shapely.MultiPolygon] = []
+    beside: dict[int, list[shapely.MultiPolygon]] = {}
     for r, shape in enumerate(cells):
         if shape is None:
             floor = shapely.box(*map.rooms["lo"][r, :2], *map.rooms["hi"][r, :2])
         else:
             grown = shape.buffer(growth / edge, join_style="mitre", mitre_limit=1.5)
             floor = shapely.affinity.affine_transform(grown, [edge, 0, 0, edge, *origin])
-        taken = [f for s, f in zip(storey, found, strict=False) if s == storey[r] and f.intersects(floor)]
+        others = beside.setdefault(int(map.rooms["storey"][r]), [])
+        taken = [others[k] for k in np.flatnonzero(shapely.intersects(others, floor))] if others else []
         found.append(_parts(floor.difference(shapely.union_all(taken)) if taken else floor, SPECK))
+        others.append(found[-1])
     return found
 
 

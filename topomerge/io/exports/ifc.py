@@ -16,6 +16,7 @@ import shapely
 
 from topomerge.io.atomic import replacing
 from topomerge.io.exports.floors import cell_polygons, floor_polygons, is_flight, room_levels
+from topomerge.io.exports.markup import text
 from topomerge.io.exports.occupancy import storey_occupancy
 from topomerge.types import Array, TopometricMap
 
@@ -99,7 +100,7 @@ class _Model:
         }
 
     def _frame(self) -> None:
-        self.project = self.root("IfcProject", "map", LongName=self.map.source, UnitsInContext=self.units)
+        self.project = self.root("IfcProject", "map", LongName=text(self.map.source)[:255], UnitsInContext=self.units)
         self.project.RepresentationContexts = [self.context]
         site = self.place(None, *self.shift)
         self.site = self.root("IfcSite", "site", ObjectPlacement=site, CompositionType="ELEMENT")

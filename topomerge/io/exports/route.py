@@ -88,7 +88,8 @@ def _add_room(route: Route, map: TopometricMap, grid: Occupancy, clear: Array, r
     mask = inside.copy()
     for _, edge in edges:
         if not is_flight(edge):
-            mask |= grid.free & _disc(grid, edge["centre"][:2], NEAR)
+            box, disc = _disc(grid, edge["centre"][:2], NEAR)
+            mask[box] |= grid.free[box] & disc
     root = _middle(inside, clear)
     parent = _ways(mask, clear, grid.size, root)
     reached = np.zeros_like(mask)
@@ -144,16 +145,22 @@ def _middle(inside: Array, clear: Array) -> Pixel:
     return i, j
 
 
-def _disc(grid: Occupancy, point: Array, radius: float) -> Array:
-    """(nx, ny) bool: pixels near a point."""
-    x, y = (grid.low[a] + (np.arange(grid.free.shape[a]) + 0.5) * grid.size - point[a] for a in (0, 1))
+def _disc(grid: Occupancy, point: Array, radius: float) -> tuple[tuple[slice, slice], Array]:
+    """The part of the pixels around a point, and which of them are near to it."""
+    first = np.maximum(np.floor((point - radius - grid.low) / grid.size).astype(int), 0)
+    last = np.maximum(np.ceil((point + radius - grid.low) / grid.size).astype(int), first)
+    box = (slice(first[0], last[0]), slice(first[1], last[1]))
+    wide, high = grid.free[box].shape
+    x = grid.low[0] + (first[0] + np.arange(wide) + 0.5) * grid.size - point[0]
+    y = grid.low[1] + (first[1] + np.arange(high) + 0.5) * grid.size - point[1]
     near: Array = x[:, None] ** 2 + y**2 <= radius**2
-    return near
+    return box, near
 
 
 def _nearest(mask: Array, grid: Occupancy, point: Array, radius: float) -> Pixel | None:
     """The pixel of the mask nearest to a point."""
-    options = np.argwhere(mask & _disc(grid, point, radius))
+    box, disc = _disc(grid, point, radius)
+    options = np.argwhere(mask[box] & disc) + (box[0].start, box[1].start)
     if not len(options):
         return None
     i, j = options[((grid.centre(options) - point) ** 2).sum(axis=1).argmin()].tolist()
