@@ -13,8 +13,9 @@ from topomerge.datasets.build import Build, build
 from topomerge.datasets.real_maps import keep_real
 from topomerge.datasets.recipe import Recipe
 from topomerge.errors import InputError
+from topomerge.evaluation.describe import code
 from topomerge.evaluation.figures import save_figures
-from topomerge.evaluation.predict import predict_all
+from topomerge.evaluation.predict import CODE, predict_all
 from topomerge.evaluation.score import Row, score_all
 from topomerge.evaluation.settings import Evaluation, check, difference, folder_of, told
 from topomerge.evaluation.tables import (
@@ -64,6 +65,9 @@ def evaluate(settings: Evaluation, say: Say = lambda text: None, command: str = 
         raise InputError(f"{settings.data.name}: no pair could be made; see the reasons above")
     files = predict_all(pairs, folder / "predictions", settings, say)
     matches, ranks, merges = score_all(pairs, files, settings)
+    old = {r["pair"] for r in (*ranks, *merges) if r["code"] != code(*CODE)}
+    if old:
+        say(f"{len(old)} of {len(files)} pairs were predicted by another version of the code; remake=true predicts them again")
     parts = report(matches, ranks, merges, settings)
     figures = save_figures(ranks, matches, merges, folder)
     head = _about(ranks, merges, settings, command)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,24 +27,20 @@ from topomerge.matching.costs import descriptor_costs
 from topomerge.matching.match import match
 from topomerge.types import Array
 
+CODE = ("matching/*.py", "fusion/*.py", *UNTRAINED)  # that predictions come from
 
-def predict(path: Path, target: Path, settings: Evaluation) -> None:
-    """Write the predictions of the kept pair `path` to `target`, if they are not there.
+
+def predict(path: Path, target: Path, settings: Evaluation) -> str:
+    """Write the predictions of the kept pair `path` to `target`; its name.
 
     Raises:
         InputError: the pair can't be read.
     """
-    if target.exists() and not settings.remake:
-        return
     kept = load_kept(path)
     maps = kept.maps()
     some = list(variants(settings))
     arrays: dict[str, Array] = {}
-    told: dict[str, Any] = {
-        "pair": kept.name,
-        "version": topomerge.__version__,
-        "code": code("matching/*.py", "fusion/*.py", *UNTRAINED),
-    }
+    told: dict[str, Any] = {"pair": kept.name, "version": topomerge.__version__, "code": code(*CODE)}
     rows = {v.name: described(v, maps, path, settings) for v in some}
     told["seconds"] = {name: seconds for name, (_, seconds) in rows.items()}
     for v in some:
@@ -56,6 +52,7 @@ def predict(path: Path, target: Path, settings: Evaluation) -> None:
     told["merge"] = {v.name: merged(maps, rows[v.name][0], kept) for v in some if merges(v, settings)}
     arrays["told"] = np.frombuffer(json.dumps(plain(told)).encode(), np.uint8)
     archive.write(arrays, target)
+    return kept.name
 
 
 def merges(variant: Variant, settings: Evaluation) -> bool:
@@ -130,7 +127,7 @@ def merged(maps: Maps, rows: tuple[Array, Array], kept: KeptPair) -> dict[str, A
 
 
 def predict_all(pairs: Sequence[Path], folder: Path, settings: Evaluation, say: Callable[[str], None]) -> list[Path]:
-    """Files of the predictions of all pairs, made where they are missing; what was made by other code is kept, and said."""
+    """Files of the predictions of all pairs, made where they are missing."""
     folder.mkdir(parents=True, exist_ok=True)
     targets = [folder / f"{p.stem}.npz" for p in pairs]
     left = [(p, t) for p, t in zip(pairs, targets, strict=True) if settings.remake or not t.exists()]
@@ -142,10 +139,11 @@ def predict_all(pairs: Sequence[Path], folder: Path, settings: Evaluation, say: 
     return targets
 
 
-def _done(left: Sequence[tuple[Path, Path]], settings: Evaluation) -> Any:
+def _done(left: Sequence[tuple[Path, Path]], settings: Evaluation) -> Iterator[str]:
     if settings.jobs == 1:
         return (predict(p, t, settings) for p, t in left)
     from joblib import Parallel, delayed
 
     parallel = Parallel(settings.jobs, return_as="generator", batch_size=1)
-    return parallel(delayed(predict)(p, t, settings) for p, t in left)
+    made: Iterator[str] = parallel(delayed(predict)(p, t, settings) for p, t in left)
+    return made

@@ -36,7 +36,7 @@ def score_all(pairs: Sequence[Path], predictions: Sequence[Path], settings: Eval
     for path, file in zip(pairs, predictions, strict=True):
         kept, data = load_kept(path), archive.read(file, "predictions")
         told = json.loads(data["told"].tobytes())
-        about = group_of(kept, settings)
+        about = {**group_of(kept, settings), "code": told["code"]}
         known = kept.about["rooms"] != "laid" or bool(len(kept.matches))
         for v in some if known else ():
             head = {**about, "variant": v.name, "descriptor": v.descriptor, "k": v.k, "context": v.context if v.k else "-"}
