@@ -12,6 +12,7 @@ import topomerge as tm
 from tests.fusion.atlas_scenes import FRAMES, NAMES, office_map, stranger, truth
 from topomerge.errors import InputError
 from topomerge.fusion.atlas import AtlasResult
+from topomerge.fusion.atlas_join import extruded, join_many
 from topomerge.fusion.atlas_maps import AT_ONCE, Maps, map_key
 from topomerge.fusion.atlas_pairs import Checks, Hypothesis, hypotheses, promise
 from topomerge.fusion.average import difference
@@ -213,3 +214,17 @@ def test_maps_of_unknown_scale(maps):
     grown = tm.extract(1.25 * (FRAMES[2].apply(np.asarray(maps[0].grid.centroids()))).astype(np.float32), name="grown")
     result = tm.atlas([maps[0], maps[3], grown], scale="free")
     assert result.status == "merged" and result.transforms[2].scale == pytest.approx(0.8, rel=0.02)
+
+
+def test_a_slice_fills_no_room_with_what_stands_in_it(maps):
+    """Its furniture becomes walls as high as the room; where another map saw the floor, only that it saw something is kept."""
+    west = maps[0].grid.cell_bounds(maps[0].grid.cells)[0] + 0.05
+    cut = west[(west[:, 2] > 0.5) & (west[:, 2] < 0.65)]
+    flat = tm.extract(cut.astype(np.float32), name="slice")
+    assert extruded(flat.grid) and not any(extruded(m.grid) for m in maps)
+    lower = Sim3(0.0, (0.0, 0.0, float(maps[0].storeys["floor"][0] - flat.storeys["floor"][0])))
+    joined = join_many([maps[0], flat], [(0, Sim3()), (1, lower)])
+    assert len(joined.rooms) == len(maps[0].rooms) and abs(len(joined.grid) - len(maps[0].grid)) < 0.02 * len(joined.grid)
+    assert ((joined.provenance & 2) > 0).sum() > 0.5 * len(flat.grid) and (joined.provenance == 2).sum() < 0.02 * len(joined.grid)
+    first = join_many([flat, maps[0]], [(0, Sim3()), (1, lower.inverse())])
+    assert len(first.rooms) == len(joined.rooms) and np.bitwise_or.reduce(first.provenance) == 0b11

@@ -86,8 +86,7 @@ class AtlasResult:
         Raises:
             InputError: more maps together than provenance can tell apart.
         """
-        members = self.components[component]
-        return join_many((self.maps[k] for k in members), [self.transforms[k] for k in members])
+        return join_many(self.maps, [(k, self.transforms[k]) for k in self.components[component]])
 
     def words(self) -> str:
         """What came out, in a sentence or two."""

@@ -12,7 +12,8 @@ import numpy as np
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
-from topomerge.fusion.fuse import join, rooms_in_common
+from topomerge.fusion.atlas_join import join_many
+from topomerge.fusion.fuse import rooms_in_common
 from topomerge.fusion.registration import Registration, _order, register
 from topomerge.fusion.result import STEPS, MergeResult, RoomMatch
 from topomerge.fusion.verify import model
@@ -70,7 +71,7 @@ def merge(
     pose = found.transform
     if pose is None or not (believed or force):
         return replace(result, seconds=clock.all())
-    joined = join(a, b, pose)
+    joined = join_many((a, b), [(0, Sim3()), (1, pose)])
     matches = tuple(_matches(a, b, found))
     return replace(result, transforms={1: pose}, matches=matches, map=joined, seconds=clock.all())
 
