@@ -69,12 +69,21 @@ def test_the_folder_of_a_merge(run: Run) -> None:
     assert "refused" in run("export", "merged", "--to", "geojson")[2]
 
 
+def test_the_folder_of_an_atlas(run: Run) -> None:
+    Path("atlas").mkdir()
+    Path("a.tmap").rename("atlas/map_0.tmap")
+    assert run("export", "atlas", "--to", "ply", "-o", "out/")[0] == 0 and names("out") == ["atlas.ply"]
+    Path("atlas/map_3.tmap").write_bytes(Path("atlas/map_0.tmap").read_bytes())
+    status, _, err = run("export", "atlas", "--to", "ply")
+    assert status == 1 and "atlas/map_0.tmap, atlas/map_3.tmap" in err
+
+
 BAD = [
     (("a.tmap", "--to", "shp", "-o", "x"), "choose from graphml, geojson"),
     (("a.tmap", "--to", ",", "-o", "x"), "names no format"),
     (("no.tmap", "--to", "ply", "-o", "x"), "no.tmap: no such file"),
     (("cloud.npy", "--to", "ply", "-o", "x"), "topomerge extract cloud.npy -o cloud.tmap"),
-    ((".", "--to", "ply", "-o", "x"), "holds no map.tmap"),
+    ((".", "--to", "ply", "-o", "x"), "holds no joined map"),
     (("a.tmap", "--to", "ply,ros", "-o", "cloud.npy"), "is a file"),
     (("a.tmap", "--to", "ros", "-o", "cloud.npy/x"), "can't be made"),
     (("a.tmap", "--to", "ply", "-o", "a.tmap"), "is the input"),
@@ -143,7 +152,7 @@ def test_view_opens_reports(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
 BAD_VIEWS = [
     (("no.html",), "no such file"),
     (("cloud.npy",), "can't be shown"),
-    (("sub",), "holds neither report.html nor map.tmap"),
+    (("sub",), "holds no report.html"),
     (("sub/page.html", "-o", "x.html"), "is for the report of a .tmap"),
     (("a.tmap", "-o", "a.tmap"), "is the input"),
     (("a.tmap", "--serve", "70000"), "port"),

@@ -62,13 +62,16 @@ def _export_options(args: argparse.Namespace, names: list[str]) -> dict[str, Any
 
 
 def _map_file(given: str) -> Path:
-    """The .tmap that a user means, who may have named the folder of a merge."""
+    """The .tmap that a user means, who may have named the folder of a merge or of an atlas."""
     path = Path(given)
     if path.is_dir():
-        if not (path / "map.tmap").is_file():
-            refused = " (its merge was refused: merge again with --force)" if (path / "merge.json").is_file() else ""
-            raise InputError(f"{path}: holds no map.tmap{refused}; give a .tmap or the folder of a merge")
-        return path / "map.tmap"
+        joined = [path / "map.tmap"] if (path / "map.tmap").is_file() else sorted(path.glob("map_*.tmap"))
+        if len(joined) == 1:
+            return joined[0]
+        if joined:
+            raise InputError(f"{path}: holds {len(joined)} joined maps; give one of {', '.join(str(p) for p in joined)}")
+        refused = " (its merge was refused: merge again with --force)" if (path / "merge.json").is_file() else ""
+        raise InputError(f"{path}: holds no joined map{refused}; give a .tmap, or the folder of a merge or an atlas")
     if not path.exists():
         raise InputError(f"{path}: no such file")
     if path.suffix.lower() != ".tmap":
@@ -81,7 +84,7 @@ def _place(args: argparse.Namespace, names: list[str], source: Path) -> tuple[Pa
     from topomerge.io.exports import FORMATS
 
     several = len(names) > 1 or FORMATS[names[0]].folder
-    stem = source.parent.resolve().name if source.name == "map.tmap" and Path(args.input).is_dir() else source.stem
+    stem = source.parent.resolve().name if Path(args.input).is_dir() else source.stem
     if args.output is None:
         return source.parent / stem, True
     path = Path(args.output)
@@ -130,7 +133,7 @@ def _page(args: argparse.Namespace, scratch: str | None = None) -> Path:
         if page.is_file() and args.output is None:
             return page
         if not (path / "map.tmap").is_file():
-            raise InputError(f"{path}: holds neither report.html nor map.tmap; give the folder of a merge, a .tmap or an .html")
+            raise InputError(f"{path}: holds no report.html; give the folder of a merge or an atlas, a .tmap or an .html")
         path = path / "map.tmap"
     elif not path.exists():
         raise InputError(f"{path}: no such file")
@@ -178,7 +181,7 @@ EXPORT = Command(
     "write a map for other tools: GIS, BIM, robots, graphs",
     "topomerge export merged/ --to geojson,indoorgml,ros -o exported/",
     (
-        option("input", metavar="MAP", help="a .tmap, or the folder of a merge"),
+        option("input", metavar="MAP", help="a .tmap, or the folder of a merge or an atlas"),
         option(
             "--to",
             required=True,
@@ -211,7 +214,7 @@ VIEW = Command(
     "show a report in the browser",
     "topomerge view merged/",
     (
-        option("input", metavar="PATH", help="folder of a merge, a .tmap (its report is made) or an .html"),
+        option("input", metavar="PATH", help="folder of a merge or an atlas, a .tmap (its report is made) or an .html"),
         option("-o", "--output", metavar="A.html", default=None, help="of a .tmap: keep the report here"),
         option("--no-open", dest="open", action="store_false", default=True, help="only print where it is"),
         option(
@@ -225,5 +228,5 @@ VIEW = Command(
         ),
     ),
     paths=("input", "output"),
-    description="Show the report of a merge or of a map in the browser.",
+    description="Show the report of a merge, an atlas or a map in the browser.",
 )
