@@ -47,7 +47,8 @@ class Node:
         heads: of the attention.
         edges: use the features of edges.
         told: attention sums them, too (`gat.GatLayer`).
-        doors: layers over the pairs of doors of each room; needs `edges`.
+        doors: layers over pairs of doors; needs `edges`.
+        near: pairs are all doors within 12 m (`embedding.door_layout`), not only those of one room.
         skip: add what goes into a layer to what comes out.
         jump: what the last layer says, or all of them joined or their maximum (jumping knowledge: Xu et al. 2018).
         width: of edges.
@@ -59,6 +60,7 @@ class Node:
     edges: bool = True
     told: bool = True
     doors: int = 0
+    near: bool = False
     skip: bool = True
     jump: str = "cat"
     width: int = 32

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 POINTS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}
 TENSORS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> tensor of the graph that it reads
-GRAPH = ("edge_index", "edge_attr", "door_index", "door_attr")
+GRAPH = ("edge_index", "edge_attr")
 
 
 class Table(nn.Module):
@@ -78,7 +78,15 @@ class Embedder(nn.Module):
     @property
     def tensors(self) -> tuple[str, ...]:
         """Names of the tensors that the network reads."""
-        return (*dict.fromkeys(needed(part) for part in self.network.geometry.parts), *GRAPH)
+        return (*dict.fromkeys(needed(part) for part in self.network.geometry.parts), *GRAPH, *self.pairs)
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Names of the tensors that tell of pairs of doors, if the network reads any."""
+        node = self.network.node
+        if not node.doors or node.kind == "none":
+            return ()
+        return ("near_index", "near_attr") if node.near else ("door_index", "door_attr")
 
     @property
     def temperature(self) -> Tensor:
@@ -86,14 +94,19 @@ class Embedder(nn.Module):
         return self.log_temperature.exp().clamp(0.02, 1.0)
 
     def forward(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        rooms = self.node(self.geometry(tensors), *(tensors[name] for name in GRAPH))
+        pairs = [tensors[name] for name in self.pairs] or [None, None]
+        rooms = self.node(self.geometry(tensors), *(tensors[name] for name in GRAPH), *pairs)
         return nn.functional.normalize(self.project(rooms), dim=1), self.dustbin(rooms)[:, 0]
 
     def fit_scales(self, graphs: Iterable[Mapping[str, Any]]) -> None:
         """Take the statistics of all inputs from the graphs of the training set."""
         graphs = list(graphs)
         tables = [(needed(name), part.scale) for name, part in self.geometry.parts.items() if isinstance(part, Table)]
-        tables += [(name, s) for name, s in (("edge_attr", self.node.edges), ("door_attr", self.node.pairs)) if s is not None]
+        tables += [
+            (name, s)
+            for name, s in zip(("edge_attr", *self.pairs[1:]), (self.node.edges, self.node.pairs), strict=False)
+            if s is not None
+        ]
         for name, scale in tables:
             scale.fit(torch.cat([graph[name] for graph in graphs]))
 

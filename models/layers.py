@@ -62,6 +62,13 @@ def segment_mean(values: Tensor, index: Tensor, count: int | Tensor) -> Tensor:
     return segment_sum(values, index, count) / segment_sum(ones, index, count).clamp(min=1)
 
 
+def segment_max(values: Tensor, index: Tensor, count: int | Tensor) -> Tensor:
+    """(count, W) largest of values (n, W) of 0 and more likewise."""
+    zeros = torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device)
+    out: Tensor = zeros.scatter_reduce(0, index[:, None].expand(-1, values.shape[1]), values, "amax")
+    return out
+
+
 def segment_softmax(scores: Tensor, index: Tensor, count: int | Tensor) -> Tensor:
     """(n, H) softmax of scores (n, H) among the rows with the same index.
 

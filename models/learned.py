@@ -12,6 +12,7 @@ from topomerge.models.embedder import Embedder, match_scores
 from topomerge.models.weights import read_embedder
 from torch import Tensor
 
+from topomerge.embedding.door_layout import door_layout
 from topomerge.embedding.graph import to_graph
 from topomerge.embedding.point_features import point_features, point_spectra
 from topomerge.types import Array, TopometricMap
@@ -73,7 +74,13 @@ class Learned:
         tensors = {}
         for name in self.network.tensors:
             have = getattr(data, name, None) if hasattr(data, name) else None
-            tensors[name] = torch.from_numpy(EXTRAS[name](data.room_points.numpy())) if have is None else have
+            if have is not None:
+                tensors[name] = have
+            elif name in EXTRAS:
+                tensors[name] = torch.from_numpy(EXTRAS[name](data.room_points.numpy()))
+            elif "near_index" not in tensors:  # both at once
+                layout = door_layout(*(getattr(data, n).numpy() for n in ("edge_index", "pos", "edge_pos")))
+                tensors |= {n: torch.from_numpy(a) for n, a in zip(("near_index", "near_attr"), layout, strict=True)}
         if not len(data.x):
             return torch.zeros((0, self.network.network.size)), torch.zeros(0)
         embedding, dustbin = self.network(tensors)

@@ -10,7 +10,7 @@ from topomerge.models.layers import Standardise
 from topomerge.models.sage import SageLayer
 from torch import Tensor, nn
 
-EDGE, PAIR = 11, 3  # widths of edge_attr and door_attr (`embedding.graph`)
+EDGE, PAIR, NEAR = 11, 3, 5  # widths of edge_attr and door_attr (`embedding.graph`), and of near_attr (`embedding.door_layout`)
 
 
 class NodeEncoder(nn.Module):
@@ -30,8 +30,9 @@ class NodeEncoder(nn.Module):
             self.edges = Standardise(EDGE)
             self.edge = nn.Sequential(nn.Linear(EDGE, told), nn.LayerNorm(told), nn.ReLU())
         if settings.doors and settings.kind != "none":
-            self.pairs = Standardise(PAIR)
-            self.doors = nn.ModuleList(DoorLayer(told, PAIR) for _ in range(settings.doors))
+            pair = NEAR if settings.near else PAIR
+            self.pairs = Standardise(pair)
+            self.doors = nn.ModuleList(DoorLayer(told, pair) for _ in range(settings.doors))
         count = 0 if settings.kind == "none" else settings.layers
         if settings.kind == "gat":
             layers: list[nn.Module] = [GatLayer(width, told, settings.heads, settings.told) for _ in range(count)]
@@ -42,13 +43,15 @@ class NodeEncoder(nn.Module):
         self.drop = nn.Dropout(dropout)
         self.out = width * (count + 1) if settings.jump == "cat" else width
 
-    def forward(self, rooms: Tensor, edge_index: Tensor, edge_attr: Tensor, door_index: Tensor, door_attr: Tensor) -> Tensor:
+    def forward(
+        self, rooms: Tensor, edge_index: Tensor, edge_attr: Tensor, pair_index: Tensor | None, pair_attr: Tensor | None
+    ) -> Tensor:
         edges = None
         if self.edges is not None and self.edge is not None:
             edges = self.edge(self.edges(edge_attr))
             for layer in self.doors:
-                assert self.pairs is not None
-                edges = layer(edges, door_index, self.pairs(door_attr))
+                assert self.pairs is not None and pair_index is not None and pair_attr is not None
+                edges = layer(edges, pair_index, self.pairs(pair_attr), pair_attr[:, 0])
         found = [rooms]
         for layer, norm in zip(self.layers, self.norms, strict=True):
             told = self.drop(torch.relu(norm(layer(found[-1], edge_index, edges))))

@@ -14,6 +14,7 @@ from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 
 WIDTHS = {"x": (16,), "engineered": (12,), "shapedna": (32,), "room_points": (512, 3), "edge_attr": (11,), "door_attr": (3,)}
+WIDTHS |= {"near_attr": (5,)}
 OPSET = 18
 
 
@@ -32,7 +33,7 @@ class Positional(nn.Module):
 def sample(network: Embedder, rooms: int = 6, edges: int = 10, doors: int = 12, seed: int = 0) -> dict[str, Tensor]:
     """Random tensors of the shapes that a network reads."""
     generator = torch.Generator().manual_seed(seed)
-    count = {"edge_attr": edges, "door_attr": doors}
+    count = {"edge_attr": edges, "door_attr": doors, "near_attr": doors}
     out = {}
     for name in network.tensors:
         if name in WIDTHS:
@@ -54,7 +55,7 @@ def save_onnx(network: Embedder, path: str | Path) -> None:
     except ImportError as error:
         raise InputError("ONNX needs onnx and onnxscript: pip install topomerge[onnx]") from error
     dims = {name: torch.export.Dim(name, min=2) for name in ("rooms", "edges", "doors")}
-    first = {"edge_attr": "edges", "door_attr": "doors"}
+    first = {"edge_attr": "edges", "door_attr": "doors", "near_attr": "doors"}
     shapes = tuple(
         {1: dims["edges" if name == "edge_index" else "doors"]} if name not in WIDTHS else {0: dims[first.get(name, "rooms")]}
         for name in network.tensors

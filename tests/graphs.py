@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from topomerge.embedding.door_layout import door_layout
 from topomerge.io import archive
 from topomerge.training.packed import GraphPair
+
+LATER = ("engineered", "shapedna", "near_index", "near_attr")  # reckoned when a set is read
 
 
 def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Tensor]:
@@ -19,6 +22,9 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
     index = torch.cat([ends, ends.flip(0)], dim=1)
     here = index[0]
     doors = torch.nonzero((here[:, None] == here[None]) & ~torch.eye(len(here), dtype=torch.bool)).T
+    middle, door = 8 * torch.rand((rooms, 3), generator=g), 8 * torch.rand((ends.shape[1], 3), generator=g)
+    middle[:, 2] = door[:, 2] = 1.0
+    near = [torch.from_numpy(array) for array in door_layout(index.numpy(), middle.numpy(), door.repeat(2, 1).numpy())]
     size = 1 + 3 * torch.rand((rooms, 1, 3), generator=g)
     return {
         "x": 10 * torch.rand((rooms, 16), generator=g),
@@ -29,7 +35,10 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
         "edge_attr": torch.randn((index.shape[1], 11), generator=g),
         "door_index": doors,
         "door_attr": torch.randn((doors.shape[1], 3), generator=g),
-        "pos": torch.rand((rooms, 3), generator=g),
+        "near_index": near[0],
+        "near_attr": near[1],
+        "pos": middle,
+        "edge_pos": door.repeat(2, 1),
     }
 
 
@@ -43,10 +52,16 @@ def turned(tensors: dict[str, torch.Tensor], angle: float) -> dict[str, torch.Te
 def shuffled(tensors: dict[str, torch.Tensor], seed: int = 0) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
     """The same map with rooms and edges in another order; and where each new room was."""
     g = torch.Generator().manual_seed(seed)
-    rooms, edges = (torch.randperm(n, generator=g) for n in (len(tensors["x"]), tensors["edge_index"].shape[1]))
+    rooms, edges = torch.randperm(len(tensors["x"]), generator=g), torch.randperm(len(tensors["edge_attr"]) // 2, generator=g)
+    edges = torch.cat([edges, edges + len(edges)])  # an edge and its way back stand half of all apart
     new_room, new_edge = rooms.argsort(), edges.argsort()
     out = {name: tensors[name][rooms] for name in ("x", "engineered", "shapedna", "room_points", "pos")}
     out |= {"edge_index": new_room[tensors["edge_index"][:, edges]], "edge_attr": tensors["edge_attr"][edges]}
+    out |= {
+        "edge_pos": tensors["edge_pos"][edges],
+        "near_index": new_edge[tensors["near_index"]],
+        "near_attr": tensors["near_attr"],
+    }
     return out | {"door_index": new_edge[tensors["door_index"]], "door_attr": tensors["door_attr"]}, rooms
 
 
@@ -71,7 +86,7 @@ def write_set(folder: Path, name: str, pairs: int) -> Path:
         one = pair(k)
         arrays = {}
         for side, g, true, iou in zip("ab", (one.a, one.b), one.true, one.iou, strict=True):
-            tensors = {n: t for n, t in g.items() if n not in ("engineered", "shapedna")}
+            tensors = {n: t for n, t in g.items() if n not in LATER}
             arrays |= {f"{side}.{n}": t.numpy() for n, t in tensors.items()}
             arrays[f"{side}.room_points"] = g["room_points"].numpy().astype(np.float32) / 1000
             arrays |= {f"{side}.true_room": true.numpy().astype(np.int32), f"{side}.true_iou": iou.numpy()}

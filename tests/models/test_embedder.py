@@ -13,7 +13,7 @@ from topomerge.models.config import GEOMETRY, Geometry, Network, Node, check, ne
 from topomerge.models.embedder import Embedder, match_scores
 from topomerge.models.layers import Standardise, segment_softmax
 from topomerge.models.learned import Learned, load_embedder
-from topomerge.models.nodes import EDGE, PAIR
+from topomerge.models.nodes import EDGE, NEAR, PAIR
 from topomerge.models.pointnet import farthest, nearest
 from topomerge.models.voxelcnn import crop
 from topomerge.models.weights import read_embedder, save_embedder
@@ -21,6 +21,7 @@ from topomerge.models.yaw import turn
 
 from tests.graphs import graph, shuffled, turned
 from tests.scenes_map import building
+from topomerge.embedding.door_layout import LAYOUT_FEATURES, REACH, door_layout
 from topomerge.embedding.graph import DOOR_FEATURES, EDGE_FEATURES, ROOM_FEATURES, to_graph
 from topomerge.errors import InputError
 
@@ -30,7 +31,7 @@ NODES = [
     Node("sage", 2, edges=False, skip=False, jump="last"),
     Node("gat", 3, doors=1, jump="max"),
 ]
-NODES += [Node("gat", 2, told=False), Node("gat", 1, edges=False), Node("gat", 4, skip=False)]
+NODES += [Node("gat", 2, told=False), Node("gat", 1, edges=False), Node("gat", 2, doors=2, near=True), Node("gat", 4, skip=False)]
 
 
 def network(*parts: str, node: Node | None = None, **geometry) -> Embedder:
@@ -40,9 +41,10 @@ def network(*parts: str, node: Node | None = None, **geometry) -> Embedder:
 
 def test_widths_are_those_of_the_graph():
     assert (GEOMETRY["scalars"], EDGE, PAIR) == (len(ROOM_FEATURES), len(EDGE_FEATURES), len(DOOR_FEATURES))
+    assert len(LAYOUT_FEATURES) == NEAR
 
 
-@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}")
+@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}{n.near}")
 def test_the_order_of_rooms_does_not_matter(node):
     net, one = network("scalars", "pointnet", node=node), graph()
     other, rooms = shuffled(one)
@@ -74,7 +76,7 @@ def test_the_scale_matters():
             assert (net.geometry(one) - net.geometry(big)).abs().max() > 1e-3, part
 
 
-@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}")
+@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}{n.near}")
 @pytest.mark.parametrize("parts", [("scalars", "engineered", "shapedna"), ("pointnet", "voxelcnn"), ("pointnet_local",)])
 def test_gradients_reach_every_weight(parts, node):
     net = network(*parts, node=node).train()
@@ -89,7 +91,8 @@ def test_gradients_reach_every_weight(parts, node):
 def test_rooms_without_doors_and_maps_without_rooms():
     one = graph(3)
     bare = {**one, "edge_index": one["edge_index"][:, :0], "edge_attr": one["edge_attr"][:0]}
-    bare |= {"door_index": one["door_index"][:, :0], "door_attr": one["door_attr"][:0]}
+    for name in ("door", "near"):
+        bare |= {f"{name}_index": one[f"{name}_index"][:, :0], f"{name}_attr": one[f"{name}_attr"][:0]}
     for node in NODES:
         embedding, _ = network(node=node)(bare)
         assert torch.isfinite(embedding).all()
@@ -194,12 +197,31 @@ def test_a_pickle_under_another_name_is_not_run(tmp_path):
 
 def test_an_embedder_of_maps():
     map = building(2, 2)
-    describe = Learned(network("scalars", "engineered", "shapedna", "pointnet"))
+    describe = Learned(network("scalars", "engineered", "shapedna", "pointnet", node=Node("gat", doors=1, near=True)))
     rows = describe(map)
     assert rows.shape == (len(map.rooms), 64) and rows.dtype == np.float64 and np.array_equal(rows, describe(map))
     assert np.array_equal(rows, describe.graph(to_graph(map))[0]) and describe.matchability(map).shape == (len(map.rooms),)
     ours, theirs = describe.probabilities(map, map)
     assert np.allclose(ours.sum(axis=1), 1) and ours.shape == (len(map.rooms), len(map.rooms) + 1) and np.allclose(ours, theirs)
+
+
+def test_layout_of_doors_by_hand():
+    """Room 0 at the origin with a door to the east, to room 1, and one to the north, to room 2; a far one leads from 2 to 3."""
+    index = np.array([[0, 0, 2, 1, 2, 3], [1, 2, 3, 0, 0, 2]])
+    middle = np.array([[0, 0, 1], [4, 0, 1], [0, 4, 1], [0, 40, 1]], float)
+    door = np.array([[2, 0, 1], [0, 2, 1], [0, 30, 1]] * 2, float)
+    pairs, told = door_layout(index, middle, door)
+    known = {(int(e), int(f)): row for (e, f), row in zip(pairs.T, told, strict=True)}
+    assert sorted(known) == [(0, 1), (0, 4), (1, 0), (1, 3), (3, 1), (3, 4), (4, 0), (4, 3)]  # none is its own way back, none far
+    half = np.sqrt(0.5)
+    assert np.allclose(known[0, 1], [np.sqrt(8), 0, half, -half, 1])  # out to the east, then back and to the left
+    assert np.allclose(known[1, 0], [np.sqrt(8), 0, -half, -half, 1])
+    assert np.allclose(known[0, 4][:4], known[0, 1][:4]) and known[0, 4][4] == 0  # the same door, left from room 2
+    c, s = np.cos(1.1), np.sin(1.1)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    again = door_layout(index, middle @ turn.T + 7, door @ turn.T + 7)
+    assert np.array_equal(again[0], pairs) and np.allclose(again[1], told, atol=1e-6) and told[:, 0].max() <= REACH
+    assert door_layout(np.zeros((2, 0), int), middle, np.zeros((0, 3)))[1].shape == (0, 5)
 
 
 def test_check_takes_the_defaults():
@@ -213,7 +235,7 @@ def test_onnx_agrees(parts, tmp_path):
     pytest.importorskip("onnxscript")
     from topomerge.models.onnx import sample, save_onnx
 
-    net = network(*parts, node=Node("gat", doors=1))
+    net = network(*parts, node=Node("gat", doors=1, near=True))
     save_onnx(net, tmp_path / "a.onnx")
     session = runtime.InferenceSession(tmp_path / "a.onnx", providers=["CPUExecutionProvider"])
     for rooms, edges, doors in ((6, 10, 12), (23, 50, 140), (1, 0, 0)):

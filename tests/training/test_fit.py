@@ -29,8 +29,8 @@ from topomerge.training.table import write_table
 from topomerge.training.validate import embed, validate
 
 ROOT = Path(__file__).parent.parent.parent
-NAMES = ("x", "room_points", "edge_index", "edge_attr", "door_index", "door_attr")
-SMALL = Network(Geometry(["scalars"], width=16), Node("gat", 1, heads=2, doors=1, width=8), size=16)
+NAMES = ("x", "room_points", "edge_index", "edge_attr", "door_index", "door_attr", "near_index", "near_attr")
+SMALL = Network(Geometry(["scalars"], width=16), Node("gat", 1, heads=2, doors=1, near=True, width=8), size=16)
 
 
 def quiet(text: str) -> None:
@@ -53,14 +53,15 @@ def settings(cache, tmp_path) -> Training:
 
 def test_a_set_is_packed_once(cache):
     said: list[str] = []
-    pairs = load_pairs(cache / "some.jsonl", ["engineered", "shapedna"], said.append)
+    pairs = load_pairs(cache / "some.jsonl", ["engineered", "shapedna", "near"], said.append)
     again = load_pairs(cache / "some.jsonl", ["engineered"], said.append, limit=4)
     assert len(pairs) == 10 and len(again) == 4 and sum("packing" in text for text in said) <= 1
     for k, one in enumerate(pairs):
         made = pair(k)
         assert torch.equal(one.matches, made.matches) and one.about["building"] == f"b{k}"
         for name in NAMES:
-            assert torch.equal(one.b[name], made.b[name]), name
+            side = "a" if name.startswith("near") else "b"  # the order of pairs of doors is that of the edges
+            assert torch.equal(getattr(one, side)[name], getattr(made, side)[name]), name
         assert torch.isfinite(one.a["shapedna"]).all() and one.a["engineered"].shape == (7, 12)
     file = next((cache / "packed").glob("some-*[0-9a-f].npz"))
     assert len(load_pairs(file)) == 10
@@ -89,6 +90,8 @@ def test_lost_rooms_take_their_doors_and_matches_along():
     assert 2 <= len(kept) < 9 and torch.equal(out["x"], some["x"][kept]) and out["room_points"].shape == (len(kept), 16, 3)
     assert out["edge_index"].max() < len(kept) and len(out["edge_attr"]) == out["edge_index"].shape[1]
     assert torch.equal(out["edge_index"][0][out["door_index"][0]], out["edge_index"][0][out["door_index"][1]])
+    near = out["near_index"]
+    assert len(out["near_attr"]) == near.shape[1] and near.max() < len(out["edge_attr"])
     for k in range(out["edge_index"].shape[1]):  # each edge is one of the old ones, with its features
         old = (some["edge_attr"] == out["edge_attr"][k]).all(dim=1).nonzero()[0, 0]
         assert torch.equal(some["edge_index"][:, old], kept[out["edge_index"][:, k]])
@@ -134,7 +137,7 @@ def test_a_run_is_a_folder(settings, tmp_path):
     )
     assert any((tmp_path / "a" / "tb").rglob("events*")) and list((tmp_path / "a" / "tb").rglob("tensors.tsv"))
     assert load_embedder(tmp_path / "a").about["data"] == "some" and load_embedder(tmp_path / "a" / "last")
-    assert "| a | scalars | gat 1 | doors | infonce |" in write_table(tmp_path).read_text()
+    assert "| a | scalars | gat 1 | near doors | infonce |" in write_table(tmp_path).read_text()
 
 
 def weights(folder: Path) -> bytes:

@@ -16,6 +16,7 @@ from topomerge.training.settings import Augment
 LENGTHS, AREAS, VOLUMES = (1, 3, 4, 7, 12, 13), (0,), (2,)  # columns of x that are m, m2, m3 (`embedding.graph.ROOM_FEATURES`)
 EDGE_LENGTHS = (0, 1, 5, 6, 7, 8)  # columns of edge_attr that are m
 MM = 0.001
+DOOR_NOISE = 0.05  # m, of the distance between two doors
 CLEAR = 0.4  # IoU of an extracted room and the true one
 
 
@@ -48,7 +49,7 @@ def make_batch(
         links[one.matches[:, 0], one.matches[:, 1]] = True
         kept = [torch.arange(len(t)) for t in one.true]
         for k, graph in enumerate((one.a, one.b)):
-            some = {name: graph[name] for name in {*names, *INDICES}}
+            some = {name: graph[name] for name in {*names, "edge_index"}}
             if augment is not None:
                 assert generator is not None
                 some, kept[k] = changed(some, len(one.true[k]), augment, generator)
@@ -71,7 +72,10 @@ def make_batch(
 def join(graphs: Sequence[Graph], rooms: Sequence[int], names: Sequence[str]) -> Graph:
     """Graphs as one, in which no edge leads from one to another."""
     out = {name: torch.cat([g[name] for g in graphs]) for name in names if name not in INDICES}
-    for name, counts in (("edge_index", rooms), ("door_index", [g["edge_index"].shape[1] for g in graphs])):
+    edges = [g["edge_index"].shape[1] for g in graphs]
+    for name, counts in (("edge_index", rooms), ("door_index", edges), ("near_index", edges)):
+        if name not in names:
+            continue
         starts = torch.tensor([0, *counts]).cumsum(0).tolist()
         out[name] = torch.cat([g[name] + start for g, start in zip(graphs, starts[:-1], strict=True)], dim=1)
     return out
@@ -108,11 +112,13 @@ def changed(graph: Graph, rooms: int, augment: Augment, generator: torch.Generat
     open_ = (uniform(half) >= augment.edges * uniform(1)).repeat(2)
     edges = keep[index[0]] & keep[index[1]] & open_
     number, edge_number = keep.cumsum(0) - 1, edges.cumsum(0) - 1
-    doors = edges[graph["door_index"][0]] & edges[graph["door_index"][1]]
-    of = {"edge_attr": edges, "door_attr": doors}
-    out = {name: tensor[of.get(name, keep)] for name, tensor in graph.items() if name not in INDICES}
-    out["edge_index"] = number[index[:, edges]]
-    out["door_index"] = edge_number[graph["door_index"][:, doors]]
+    of = {"edge_attr": edges}
+    out = {"edge_index": number[index[:, edges]]}
+    for name in ("door", "near"):
+        if f"{name}_index" in graph:
+            of[f"{name}_attr"] = edges[graph[f"{name}_index"]].all(dim=0)
+            out[f"{name}_index"] = edge_number[graph[f"{name}_index"][:, of[f"{name}_attr"]]]
+    out |= {name: tensor[of.get(name, keep)] for name, tensor in graph.items() if name not in INDICES}
     scale = float((augment.scale * normal(1)).exp())
     if "x" in out:
         out["x"] = _resized(out["x"], scale, augment.jitter * normal(*out["x"].shape))
@@ -120,6 +126,10 @@ def changed(graph: Graph, rooms: int, augment: Augment, generator: torch.Generat
         factor = torch.ones_like(out["edge_attr"])
         factor[:, EDGE_LENGTHS] = scale * (augment.jitter * normal(len(factor), len(EDGE_LENGTHS))).exp()
         out["edge_attr"] = out["edge_attr"] * factor
+    for name in ("door_attr", "near_attr"):
+        if name in out:  # the first column is the distance between two doors
+            noise = DOOR_NOISE * normal(len(out[name]))
+            out[name] = torch.cat([(out[name][:, :1] * scale + noise[:, None]).clamp(min=0), out[name][:, 1:]], dim=1)
     if "room_points" in out:
         out["room_points"] = _points(out["room_points"], scale, augment, generator)
     return out, torch.nonzero(keep)[:, 0]

@@ -242,6 +242,7 @@ def _fabric(settings: Training) -> Any:
 def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], list[GraphPair]]:
     """Pairs to train on, and to watch; a set is packed by one process while the others wait."""
     extras = [part for part in settings.network.geometry.parts if part in EXTRAS]
+    extras += ["near"] if settings.network.node.near else []
     with fabric.rank_zero_first():
         train = load_pairs(_manifest(settings, settings.data), extras, say, settings.limit)
         watched = load_pairs(_manifest(settings, settings.validation), extras, say) if settings.validation else []

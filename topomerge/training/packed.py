@@ -18,15 +18,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from topomerge.embedding.door_layout import door_layout
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array
 
-FORMAT = 2
+FORMAT = 3
 CHUNK = 100  # pairs; descriptors that take long are kept chunk by chunk
-TABLES = ("x", "edge_attr", "door_attr", "pos")  # positions are for figures, no network reads them
-INDICES = ("edge_index", "door_index")
-COUNTS = {"edge_attr": "edges", "edge_index": "edges", "door_attr": "doors", "door_index": "doors"}  # of the others: rooms
+TABLES = ("x", "edge_attr", "door_attr", "pos", "edge_pos")  # no network reads positions: they depend on the frame
+INDICES = ("edge_index", "door_index", "near_index")
+STORED = INDICES[:2]
+COUNTS = {
+    "edge_attr": "edges",
+    "edge_pos": "edges",
+    "edge_index": "edges",
+    "door_attr": "doors",
+    "door_index": "doors",
+}  # of the others: rooms
 EXTRAS = ("engineered", "shapedna")
 WIDTHS = {"engineered": 12, "shapedna": 32}
 Graph = dict[str, Tensor]
@@ -58,7 +66,7 @@ def load_pairs(
 
     Args:
         manifest: or a packed file itself.
-        extras: descriptors that are wanted, too: of `EXTRAS`.
+        extras: what is wanted, too: of `EXTRAS`, or `near`, the layout of doors.
         limit: of the first pairs only; 0: all.
 
     Raises:
@@ -66,7 +74,7 @@ def load_pairs(
     """
     path = Path(manifest)
     if path.suffix == ".npz":
-        return _unpacked(archive.read(path, "packed set"), {})[: limit or None]
+        return _with_layout(_unpacked(archive.read(path, "packed set"), {})[: limit or None], extras)
     rows = _rows(path)
     names = [str(row["file"]) for row in rows]
     digest = hashlib.sha256(json.dumps([FORMAT, names]).encode()).hexdigest()[:12]
@@ -77,8 +85,16 @@ def load_pairs(
         say(f"packing {len(names)} pairs")
         archive.write(_packed([archive.read(path.parent / "pairs" / name, "cached pair") for name in names], rows), whole)
     arrays = archive.read(whole, "packed set")
-    pairs = _unpacked(arrays, {name: _extra(name, arrays, whole, say, limit) for name in extras})
-    return pairs[: limit or None]
+    tables = {name: _extra(name, arrays, whole, say, limit) for name in extras if name in EXTRAS}
+    return _with_layout(_unpacked(arrays, tables)[: limit or None], extras)
+
+
+def _with_layout(pairs: list[GraphPair], extras: Sequence[str]) -> list[GraphPair]:
+    if "near" in extras:
+        for graph in (g for pair in pairs for g in (pair.a, pair.b)):
+            found = door_layout(*(graph[name].numpy() for name in ("edge_index", "pos", "edge_pos")))
+            graph["near_index"], graph["near_attr"] = (torch.from_numpy(array) for array in found)
+    return pairs
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
@@ -97,7 +113,7 @@ def _packed(pairs: list[dict[str, Array]], rows: list[dict[str, Any]]) -> dict[s
     """All maps behind each other, a0 b0 a1 b1 ..., with how many rooms, edges and pairs of doors each has."""
     sides = [{n[2:]: v for n, v in pair.items() if n.startswith(f"{s}.")} for pair in pairs for s in "ab"]
     out = {name: np.concatenate([side[name] for side in sides]).astype(np.float32) for name in TABLES}
-    out |= {name: np.concatenate([side[name] for side in sides], axis=1).astype(np.int32) for name in INDICES}
+    out |= {name: np.concatenate([side[name] for side in sides], axis=1).astype(np.int32) for name in STORED}
     points = np.concatenate([np.round(side["room_points"] * 1000).clip(-32767, 32767).astype(np.int16) for side in sides])
     out["room_points"] = points
     for name, of in (("rooms", "x"), ("edges", "edge_attr"), ("doors", "door_attr")):
@@ -117,13 +133,13 @@ def _short(row: dict[str, Any]) -> dict[str, Any]:
 
 def _unpacked(arrays: dict[str, Array], extras: dict[str, Array]) -> list[GraphPair]:
     counts = {name: arrays[name].tolist() for name in ("rooms", "edges", "doors")}
-    tensors = {name: torch.from_numpy(arrays[name]) for name in (*TABLES, *INDICES, "room_points")}
+    tensors = {name: torch.from_numpy(arrays[name]) for name in (*TABLES, *STORED, "room_points")}
     tensors |= {name: torch.from_numpy(values) for name, values in extras.items()}
     split = {}
     for name, tensor in tensors.items():
-        split[name] = tensor.split(counts[COUNTS.get(name, "rooms")], dim=1 if name in INDICES else 0)
+        split[name] = tensor.split(counts[COUNTS.get(name, "rooms")], dim=1 if name in STORED else 0)
     maps = range(len(counts["rooms"]))
-    graphs = [{name: parts[i].long() if name in INDICES else parts[i] for name, parts in split.items()} for i in maps]
+    graphs = [{name: parts[i].long() if name in STORED else parts[i] for name, parts in split.items()} for i in maps]
     true = torch.from_numpy(arrays["true"]).long().split(counts["rooms"])
     matches = torch.from_numpy(arrays["matches"]).long().split(arrays["partners"].tolist())
     told = json.loads(arrays["about"].tobytes())

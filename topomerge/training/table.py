@@ -63,7 +63,13 @@ def _best(run: Path) -> dict[str, Any] | None:
         "run": run.name,
         "geometry": "+".join(geometry["parts"]),
         "node": node["kind"] if node["kind"] == "none" else f"{node['kind']} {node['layers']}",
-        "edges": "–" if node["kind"] == "none" or not node["edges"] else "doors" if node["doors"] else "yes",
+        "edges": "–"
+        if node["kind"] == "none" or not node["edges"]
+        else "near doors"
+        if node["doors"] and node["near"]
+        else "doors"
+        if node["doors"]
+        else "yes",
         "loss": told["loss"]["kind"],
         "seed": told["seed"],
         **{name: best[f"val/{name}"] for name in SHOWN},
