@@ -63,7 +63,7 @@ def test_a_set_is_packed_once(cache):
             side = "a" if name.startswith("near") else "b"  # the order of pairs of doors is that of the edges
             assert torch.equal(getattr(one, side)[name], getattr(made, side)[name]), name
         assert torch.isfinite(one.a["shapedna"]).all() and one.a["engineered"].shape == (7, 12)
-    file = next((cache / "packed").glob("some-*[0-9a-f].npz"))
+    file = min((cache / "packed").glob("some-*.npz"), key=lambda path: len(path.name))  # the others are chunks of descriptors
     assert len(load_pairs(file)) == 10
     with pytest.raises(InputError, match=r"datasets\.build data=none"):
         load_pairs(cache / "none.jsonl")
