@@ -24,7 +24,7 @@ QUICK = ("cli.md",)  # pages whose examples need no scans; those of all others a
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the examples find in their folder: two scans of an office."""
     folder = tmp_path_factory.mktemp("workshop")
-    small = ["--building", "office", "--seed", "7", "--rooms", "8", "--overlap", "0.5", "--quiet"]
+    small = ["--building", "office", "--seed", "5", "--rooms", "8", "--overlap", "0.7", "--quiet"]
     assert cli.main(["simulate", *small, "-o", str(folder / "pair")]) == 0
     for name, other in (("a.ply", "scan.ply"), ("b.ply", "other.ply")):
         shutil.move(folder / "pair" / name, folder / other)

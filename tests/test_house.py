@@ -108,6 +108,10 @@ def test_every_package_is_shipped():
             assert ".".join((name, *parts)) in listed, f"{init.parent} is not in pyproject's list of packages"
         for path in (ROOT / folder).rglob("*.py"):
             assert (path.parent / "__init__.py").exists(), f"{path.parent} has no __init__.py"
+        for path in (ROOT / folder).rglob("*.*"):  # folders of data are packages to setuptools, too, and told apart by nothing
+            parts = path.parent.relative_to(ROOT / folder).parts
+            if path.is_file() and "__pycache__" not in parts:
+                assert ".".join((name, *parts)) in listed, f"{path.parent} is not in pyproject's list of packages"
 
 
 def test_nothing_is_unpickled():
