@@ -14,7 +14,7 @@ import pytest
 import shapely
 
 import topomerge
-from tests.io.export_maps import AT, GRID, flat, nothing, rectangles, two_floors, without_doors
+from tests.io.export_maps import AT, GRID, flat, nothing, rectangles, stair_scene, two_floors, without_doors
 from tests.io.indoorgml_structure import CORE, GML, check, is_closed, positions, volume
 from tests.io.test_export_plans import with_areas, write
 from tests.scenes import corridor
@@ -118,6 +118,13 @@ def test_ifc_holds_storeys_spaces_and_doors(tmp_path, at):
         assert (matrix @ (0.5, 0, 0, 1))[:3] == pytest.approx(edge["centre"])
         assert {b.RelatingSpace.Name for b in door.ProvidesBoundaries} == {f"room {r}" for r in edge["rooms"]}
     assert len(model.by_type("IfcStair")) == 1 and len(model.by_type("IfcWall")) > 0
+    geometry = importlib.import_module("ifcopenshell.geom")
+    settings = geometry.settings()
+    settings.set("use-world-coords", True)
+    plate = np.array(geometry.create_shape(settings, model.by_type("IfcStair")[0]).geometry.verts).reshape(-1, 3)
+    stairs = map.edges[map.edges["kind"] == "stairs"][0]
+    assert plate.min(axis=0) == pytest.approx(stairs["lower"] - (0, stairs["width"] / 2, 0.1), abs=1e-4)
+    assert plate.max(axis=0) == pytest.approx(stairs["upper"] + (0, stairs["width"] / 2, 0), abs=1e-4)
     assert len({e.GlobalId for e in model.by_type("IfcRoot")}) == len(model.by_type("IfcRoot"))
 
 
@@ -158,6 +165,14 @@ def test_a_model_of_a_map_gives_the_map_again(tmp_path):
     apart = np.linalg.norm(first.rooms["centroid"][:, None] - second.rooms["centroid"], axis=2).min(axis=1)
     assert (apart < 0.2).all()
     assert np.sort(second.rooms["area"]) == pytest.approx(np.sort(first.rooms["area"]), rel=0.1)
+
+
+def test_both_storeys_come_again_from_a_model(tmp_path):
+    pytest.importorskip("ifcopenshell")
+    first = topomerge.extract(stair_scene().points())
+    second = topomerge.extract(topomerge.read_points(write(first, "ifc", tmp_path / "a.ifc")))
+    assert [len(m.storeys) for m in (first, second)] == [2, 2]
+    assert np.bincount(second.rooms["storey"]).tolist() == np.bincount(first.rooms["storey"]).tolist()
 
 
 def test_heights_that_nobody_saw(tmp_path):
