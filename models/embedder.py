@@ -94,7 +94,7 @@ class Embedder(nn.Module):
         return self.log_temperature.exp().clamp(0.02, 1.0)
 
     def forward(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        pairs = [tensors[name] for name in self.pairs] or [None, None]
+        pairs: list[Tensor | None] = [tensors[name] for name in self.pairs] or [None, None]
         rooms = self.node(self.geometry(tensors), *(tensors[name] for name in GRAPH), *pairs)
         return nn.functional.normalize(self.project(rooms), dim=1), self.dustbin(rooms)[:, 0]
 

@@ -50,26 +50,26 @@ def logarithm(values: Tensor) -> Tensor:
     return values.sign() * values.abs().log1p()
 
 
-def segment_sum(values: Tensor, index: Tensor, count: int | Tensor) -> Tensor:
+def segment_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
     """(count, W) sums of the rows (n, W) that have each index (n,); 0 where there is none."""
     out: Tensor = torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device).index_add(0, index, values)
     return out
 
 
-def segment_mean(values: Tensor, index: Tensor, count: int | Tensor) -> Tensor:
+def segment_mean(values: Tensor, index: Tensor, count: int) -> Tensor:
     """(count, W) means likewise."""
     ones = torch.ones((values.shape[0], 1), dtype=values.dtype, device=values.device)
     return segment_sum(values, index, count) / segment_sum(ones, index, count).clamp(min=1)
 
 
-def segment_max(values: Tensor, index: Tensor, count: int | Tensor) -> Tensor:
+def segment_max(values: Tensor, index: Tensor, count: int) -> Tensor:
     """(count, W) largest of values (n, W) of 0 and more likewise."""
     zeros = torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device)
     out: Tensor = zeros.scatter_reduce(0, index[:, None].expand(-1, values.shape[1]), values, "amax")
     return out
 
 
-def segment_softmax(scores: Tensor, index: Tensor, count: int | Tensor) -> Tensor:
+def segment_softmax(scores: Tensor, index: Tensor, count: int) -> Tensor:
     """(n, H) softmax of scores (n, H) among the rows with the same index.
 
     Scores are bounded, not shifted by the largest one of each index: exp of 30 is far from overflow, and the graph is simpler.

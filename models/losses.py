@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from topomerge.models.embedder import Embedder
 from torch import Tensor, nn
 
 from topomerge.errors import InputError
@@ -142,7 +143,7 @@ class Objective(nn.Module):
         network: an `Embedder`.
     """
 
-    def __init__(self, network: nn.Module, settings: LossSettings) -> None:
+    def __init__(self, network: Embedder, settings: LossSettings) -> None:
         super().__init__()
         check(settings)
         self.network, self.settings = network, settings

@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -169,7 +169,7 @@ class Run:
         self.optimizer.step()
         return {name: float(value.detach()) for name, value in losses.items()}
 
-    def batches(self) -> Iterator[Batch]:
+    def batches(self) -> Generator[Batch, None, None]:
         """Those of this epoch from the state's step on, each made while the one before it is worked on."""
         settings, state = self.settings, self.state
         shuffle = torch.Generator().manual_seed(mixed(settings.seed, state.epoch))

@@ -93,7 +93,7 @@ def figure(network: Embedder, pair: GraphPair, a: tuple[Any, Any], b: tuple[Any,
     for graph, place in zip((pair.a, pair.b), places, strict=True):
         for i, j in graph["edge_index"].T.tolist():
             axes.plot(*place[[i, j]].T, color="0.8", lw=1, zorder=0)
-        axes.scatter(*place.T, s=4 * graph["x"][:, 0].numpy(), color="0.6", zorder=1)
+        axes.scatter(place[:, 0], place[:, 1], s=4 * graph["x"][:, 0].numpy(), color="0.6", zorder=1)
     for i, j in found | true:
         color = "tab:green" if (i, j) in found & true else "tab:red" if (i, j) in found else "0.6"
         axes.plot(*np.stack([places[0][i], places[1][j]]).T, color=color, lw=1.2, ls="-" if (i, j) in found else ":", zorder=2)

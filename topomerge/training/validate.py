@@ -53,7 +53,7 @@ def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu")
         rows, columns = match_scores(a, b, bin_a, bin_b, temperature)
         certain = certainty(rows.exp().numpy(), columns.exp().numpy())
         counts += [pair_counts(assign_certain(certain, least), matches) for least in LEAST]
-    return scores(*(np.concatenate(of) for of in (ranks, twins, clear)), counts)
+    return scores(np.concatenate(ranks), np.concatenate(twins), np.concatenate(clear), counts)
 
 
 def scores(ranks: Array, twins: Array, clear: Array, counts: Array) -> dict[str, float]:
