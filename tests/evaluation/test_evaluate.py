@@ -83,6 +83,20 @@ def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
         claim(tmp_path / "other", told(settings))
 
 
+def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
+    for name, weights in (("a", b"one"), ("b", b"two")):
+        (tmp_path / name / "best").mkdir(parents=True)
+        (tmp_path / name / "best" / "weights.safetensors").write_bytes(weights)
+    runs = [str(tmp_path / name) for name in "ab"]
+    settings = Evaluation(SMALL, run=runs, methods=["assignment", "mutual"], folder=str(tmp_path))
+    assert [v.name for v in variants(settings)] == ["a", "b"] and folder_of(settings).name == "two-a-b"
+    assert next(variants(settings)).methods == ("assignment", "mutual")
+    before = told(settings)
+    assert before["run"]["a"] != before["run"]["b"]
+    (tmp_path / "b" / "best" / "weights.safetensors").write_bytes(b"three")
+    assert difference(before, told(settings)).startswith("run.b")
+
+
 def test_the_first_difference_is_told() -> None:
     assert difference({"a": {"b": 1}}, {"a": {"b": 1}}) == ""
     assert difference({"a": {"b": 1}}, {"a": {"b": 2}}) == "a.b: 1 there, 2 now"

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from topomerge.datasets.kept import KeptPair, twins
 
+from topomerge.errors import InputError
 from topomerge.evaluation.groups import calibration, draws, gain, value
+from topomerge.evaluation.predict import mutual
 from topomerge.evaluation.score import match_counts, merge_counts, overlap_bin, pose_error, rank_counts, ranks_of, within
 from topomerge.types import Sim3, TrueRoom
 
@@ -161,3 +163,18 @@ def test_twins() -> None:
     assert twins(np.array([0, 1, 2, -1]), np.array([0, 1, 2]), rooms, rooms).tolist() == [True, True, False, False]
     assert twins(np.array([0, 2]), np.array([0, 2]), rooms, rooms).tolist() == [False, False]  # b does not hold room 1
     assert twins(np.array([0]), np.array([0]), rooms, rooms, same=False).tolist() == [True]  # another building
+
+
+def test_mutual_matches() -> None:
+    class Learned:
+        def probabilities(self, a: object, b: object) -> tuple[np.ndarray, np.ndarray]:
+            rows = np.array([[0.9, 0.05, 0.05], [0.6, 0.3, 0.1], [0.1, 0.2, 0.7]])  # of 3 rooms of a: two rooms of b, none
+            columns = np.array([[0.7, 0.2, 0.05, 0.05], [0.1, 0.5, 0.1, 0.3]])  # of 2 rooms of b: three rooms of a, none
+            return rows, columns
+
+    maps: Any = (None, None)
+    rooms, probability = mutual(Learned(), maps)
+    assert rooms.tolist() == [[0, 0]]  # room 1 of a likes room 0 best, which likes room 0; room 2 has no partner
+    assert probability == pytest.approx([np.sqrt(0.9 * 0.7)])
+    with pytest.raises(InputError, match="mutual needs"):
+        mutual(object(), maps)

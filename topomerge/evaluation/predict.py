@@ -48,7 +48,10 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
         arrays[f"{v.name}/a"], arrays[f"{v.name}/b"] = a.astype(np.float32), b.astype(np.float32)
         arrays[f"{v.name}/cost"] = descriptor_costs(a, b).astype(np.float32)
         for method in v.methods:
-            arrays |= {f"{v.name}/{method}/{key}": value for key, value in matched(v, method, maps, (a, b)).items()}
+            arrays |= {
+                f"{v.name}/{method}/{key}": value
+                for key, value in matched(v, method, maps, (a, b), kept.about["scale_free"]).items()
+            }
     told["merge"] = {v.name: merged(maps, rows[v.name][0], kept) for v in some if merges(v, settings)}
     arrays["told"] = np.frombuffer(json.dumps(plain(told)).encode(), np.uint8)
     archive.write(arrays, target)
@@ -60,18 +63,16 @@ def merges(variant: Variant, settings: Evaluation) -> bool:
     return settings.merge and (bool(variant.run) or (variant.descriptor in settings.mergers and variant.k == 0))
 
 
-def matched(variant: Variant, method: str, maps: Maps, rows: tuple[Array, Array]) -> dict[str, Array]:
-    """`rooms` (M, 2), `probability` (M,) and `seconds` of a method."""
+def matched(variant: Variant, method: str, maps: Maps, rows: tuple[Array, Array], free: bool = False) -> dict[str, Array]:
+    """`rooms` (M, 2), `probability` (M,) and `seconds` of a method; `free`: the second map has a scale of its own."""
     began = time.process_time()
     if method == "mutual":
         rooms, probability = mutual(trained(variant.run), maps) if variant.run else (np.zeros((0, 2), int), np.zeros(0))
     else:
-        found = match(*maps, given(maps, rows), "assignment" if method == "full" else method, largest_cost=LARGEST.get(method))
+        name, largest = ("assignment", np.inf) if method == "full" else (method, None)
+        found = match(*maps, given(maps, rows), name, scale_free=free, largest_cost=largest)
         rooms, probability = found.rooms, found.probability
     return {"rooms": rooms.astype(np.int32), "probability": probability, "seconds": np.array(time.process_time() - began)}
-
-
-LARGEST = {"full": np.inf}
 
 
 def given(maps: Maps, rows: tuple[Array, Array]) -> Descriptor:
