@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from topomerge.datasets.floorplans import Refusal
 from topomerge.datasets.pairs import Pair
+from topomerge.datasets.script import print_lines
 from topomerge.datasets.wall_fit import residual
 
 from topomerge.errors import InputError
@@ -117,13 +118,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--table", metavar="FOLDER", type=Path, required=True, help="the folder with the data sets")
     parser.add_argument("--sources", nargs="*", choices=SOURCES, help="only these")
     options = parser.parse_args(arguments)
-    try:
-        for line in table(iter_real_pairs(options.table, options.sources)):
-            print(line, flush=True)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+    return print_lines(_table(options.table, options.sources))
+
+
+def _table(folder: Path, sources: Sequence[str] | None) -> Iterator[str]:
+    yield from table(iter_real_pairs(folder, sources))
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from topomerge.datasets.script import print_lines
 from topomerge.datasets.walk import fill
 
 from topomerge.errors import InputError
@@ -223,25 +224,21 @@ MAP_COLUMNS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print both tables."""
-    from topomerge.datasets import realism_sources as sources
-
     parser = argparse.ArgumentParser(prog="python -m topomerge.datasets.realism", description=__doc__)
     parser.add_argument("--fast", action="store_true", help="three kinds of buildings, one of each, and few plans")
     parser.add_argument("--data", type=Path, default=os.environ.get("TOPOMERGE_DATA"), help="folder of the real data")
     options = parser.parse_args(arguments)
-    try:
-        if not options.data:
-            raise InputError("name the folder of the real data: --data, or TOPOMERGE_DATA")
-        folder = Path(options.data)
-        for line in lines("rooms and doors", ROOM_COLUMNS, sources.plan_rows(folder, options.fast)):
-            print(line, flush=True)
-        print()
-        for line in lines("surfaces", MAP_COLUMNS, sources.map_rows(folder, options.fast)):
-            print(line, flush=True)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+    return print_lines(_tables(options.data, options.fast))
+
+
+def _tables(folder: str | Path | None, fast: bool) -> Iterator[str]:
+    from topomerge.datasets import realism_sources as sources
+
+    if not folder:
+        raise InputError("name the folder of the real data: --data, or TOPOMERGE_DATA")
+    yield from lines("rooms and doors", ROOM_COLUMNS, sources.plan_rows(Path(folder), fast))
+    yield ""
+    yield from lines("surfaces", MAP_COLUMNS, sources.map_rows(Path(folder), fast))
 
 
 if __name__ == "__main__":

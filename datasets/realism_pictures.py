@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ import numpy as np
 from topomerge.datasets.buildings import make_building
 from topomerge.datasets.realism_sources import DRAWN, real_clouds
 from topomerge.datasets.scanner import scan
+from topomerge.datasets.script import print_lines
 from topomerge.datasets.session import session
 
 from topomerge.errors import InputError
@@ -111,15 +112,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("out", type=Path, help="folder of the pictures")
     parser.add_argument("--data", type=Path, default=os.environ.get("TOPOMERGE_DATA"), help="folder of the real data")
     options = parser.parse_args(arguments)
-    try:
-        if not options.data or not options.out.is_dir():
-            raise InputError("name the folder of the real data (--data, or TOPOMERGE_DATA) and one for the pictures that exists")
-        for path in draw(Path(options.data), options.out):
-            print(path)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+    return print_lines(_pictures(options.data, options.out))
+
+
+def _pictures(folder: str | Path | None, out: Path) -> Iterator[Path]:
+    if not folder or not out.is_dir():
+        raise InputError("name the folder of the real data (--data, or TOPOMERGE_DATA) and one for the pictures that exists")
+    yield from draw(Path(folder), out)
 
 
 if __name__ == "__main__":
