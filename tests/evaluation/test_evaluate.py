@@ -58,13 +58,14 @@ def test_a_wrong_key_is_named() -> None:
         (["descriptors.engineered.name=deep"], "descriptors.engineered.name 'deep'"),
         (["run=[runs/nowhere]"], "runs/nowhere"),
         (["mergers=[x]"], "mergers: 'x'"),
+        (["only=[]"], "nothing to evaluate"),
     ):
         with pytest.raises(InputError, match=said):
             check(compose("evaluate", Evaluation, words))
 
 
 def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
-    settings = Evaluation(SMALL, folder=str(tmp_path), descriptors={"engineered": {"name": "engineered"}})
+    settings = Evaluation(SMALL, folder=str(tmp_path), descriptors={"engineered": {"name": "engineered"}}, only=["engineered"])
     folder = folder_of(settings)
     assert folder == tmp_path / "two"
     claim(folder, told(settings))
@@ -144,7 +145,13 @@ def test_clouds_are_degraded_as_asked() -> None:
 def test_two_simulated_pairs_from_beginning_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     descriptors = {"engineered": {"name": "engineered"}, "shape": {"name": "shapedna", "values": 8, "spacing": 0.5}}
     settings = Evaluation(
-        SMALL, folder=str(tmp_path / "eval"), cache=str(tmp_path / "cache"), descriptors=descriptors, k=[0, 1], rounds=50
+        SMALL,
+        folder=str(tmp_path / "eval"),
+        cache=str(tmp_path / "cache"),
+        descriptors=descriptors,
+        only=list(descriptors),
+        k=[0, 1],
+        rounds=50,
     )
     first = evaluate(settings, command="python evaluate.py")
     assert first.ranks and first.matches and first.merges and "recall@1" in first.summary

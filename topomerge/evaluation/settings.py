@@ -43,6 +43,7 @@ class Evaluation:
         limit: only the first so many pairs; 0: all.
         jobs: processes.
         descriptors: name -> options of `embedder`, its `name` among them.
+        only: those of them that are evaluated.
         k: steps of context of these; context: how it is put together.
         methods: "full" (every room that can have a partner gets one: the thesis' assignment), "assignment" (dear pairs stay
             alone), "growing" (the thesis'), "consistent" (one transform must explain the matches), "mutual" (each other's
@@ -64,6 +65,7 @@ class Evaluation:
     limit: int = 0
     jobs: int = 1
     descriptors: dict[str, dict[str, Any]] = field(default_factory=dict)
+    only: list[str] = field(default_factory=list)
     k: list[int] = field(default_factory=lambda: [0])
     context: list[str] = field(default_factory=lambda: ["join"])
     methods: list[str] = field(default_factory=lambda: ["full", "assignment", "growing", "consistent"])
@@ -104,11 +106,11 @@ def check(settings: Evaluation) -> None:
                 raise InputError(f"{key}: unknown {value!r}; {', '.join(known)} are possible")
     if any(k < 0 for k in settings.k) or settings.limit < 0 or settings.rounds < 1 or settings.jobs < 1:
         raise InputError("k and limit must be 0 or more, rounds and jobs 1 or more")
-    for name in settings.mergers:
-        if name not in settings.descriptors and not settings.run:
-            raise InputError(f"mergers: {name!r} is none of the descriptors {', '.join(settings.descriptors)}")
-    if not settings.descriptors and not settings.run:
-        raise InputError("nothing to evaluate: name descriptors, or run=runs/x")
+    for name in (*settings.only, *settings.mergers):
+        if name not in settings.descriptors:
+            raise InputError(f"only, mergers: {name!r} is none of the descriptors {', '.join(settings.descriptors)}")
+    if not settings.only and not settings.run:
+        raise InputError("nothing to evaluate: name descriptors with only=[...], or run=runs/x")
     for run in settings.run:
         if not Path(run).exists():
             raise InputError(f"run={run}: no such folder or file; name a run that was trained")
@@ -116,7 +118,7 @@ def check(settings: Evaluation) -> None:
 
 def variants(settings: Evaluation) -> Iterator[Variant]:
     """Everything that describes rooms: each descriptor at each k (with k = 0 there is one context), then each run."""
-    for name in settings.descriptors:
+    for name in settings.only:
         for k in settings.k:
             for how in settings.context if k else settings.context[:1]:
                 methods = tuple(m for m in settings.methods if m != "mutual" and (m != "consistent" or k in settings.slow_k))
@@ -144,6 +146,9 @@ def told(settings: Evaluation) -> dict[str, Any]:
     known = {k: v for k, v in asdict(settings).items() if k in keys}
     known["data"].pop("trained")
     known["data"].pop("folder")
+    known["descriptors"] = {name: settings.descriptors[name] for name in settings.only}
+    if not settings.run:
+        known["methods"] = [m for m in settings.methods if m != "mutual"]
     runs = {run_name(run): digest_of(Path(run)) for run in settings.run}
     found: dict[str, Any] = plain({"format": FORMAT, **known, "run": runs})
     return found
