@@ -29,6 +29,8 @@ from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
 
 EDGE = 0.1  # m
 COMMON = 0.2  # m, columns by which the area in common is measured
+ELSEWHERE = 99.0  # m: nothing is shown by both
+SHOWN = 200  # points of a room that a map shows
 BELOW = 0.15  # m: what is that far below a floor is the storey below's ceiling
 STEP = 0.08  # m along a ray
 LONGEST = 120.0  # s a pair
@@ -138,6 +140,30 @@ def common_area(pair: Pair, a: VoxelGrid, b: VoxelGrid, free: tuple[VoxelGrid | 
     return float(len(both) * COMMON**2)
 
 
+def differs(pair: Pair) -> float | None:
+    """Of a twin wing: by how much, m, the outlines of the rooms that both maps show differ at most when one lies on the other.
+
+    Where that is little, nobody can tell the wings apart.
+    """
+    if pair.kind != "twin-wing":
+        return None
+    labels = [c.labels if c.labels is not None else np.zeros(0, int) for c in (pair.a, pair.b)]
+    seen = [np.bincount(k[k >= 0], minlength=len(pair.a.rooms)) >= SHOWN for k in labels]
+    both = np.flatnonzero(np.logical_and.reduce(seen))
+    if not len(both):
+        return ELSEWHERE
+    outlines = [[np.asarray(c.rooms[i].polygon)[:, :2] for i in both] for c in (pair.a, pair.b)]
+    turned = [_misfit(np.concatenate(outlines[0]), np.concatenate([p[::k] for p in outlines[1]])) for k in (1, -1)]
+    return min(turned)
+
+
+def _misfit(a: Array, b: Array) -> float:
+    """Largest distance of points that belong to each other, after turning and moving b."""
+    p, q = a - a.mean(axis=0), b - b.mean(axis=0)
+    turn = np.angle(((p @ (1, 1j)) * np.conj(q @ (1, 1j))).sum())
+    return float(np.abs(p @ (1, 1j) - np.exp(1j * turn) * (q @ (1, 1j))).max())
+
+
 def arrays_of(pair: Pair, told: dict[str, object]) -> dict[str, Array]:
     """What is cached of a pair."""
     grids = [grid_of(c) for c in (pair.a, pair.b)]
@@ -153,7 +179,7 @@ def arrays_of(pair: Pair, told: dict[str, object]) -> dict[str, Array]:
             out[f"{side}.free"] = empty.cells.astype(np.int16)
     out["truth"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
     known = {k: getattr(pair, k) for k in ("sensors", "kind", "building", "overlap")}
-    told = {**told, **known, "common": common}
+    told = {**told, **known, "common": common, "differs": differs(pair)}
     out["about"] = np.frombuffer(json.dumps(told, sort_keys=True, default=str).encode(), np.uint8)
     return out
 

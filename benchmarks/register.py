@@ -1,8 +1,8 @@
 """Registration of whole maps beside KISS-Matcher and Open3D: what is merged right and wrong, and how fast.
 
 ``python benchmarks/register.py [split] [limit] [methods]``: cached simulated pairs (``merge_pairs.py``; split ``train`` for
-development, ``test`` for final runs only), or ``real`` for the real pairs of TOPOMERGE_DATA. Methods: ours, ours_cells, kiss02,
-kiss03, fpfh, fgr (comma-separated; default all). Resumable: a line of JSON a pair and method in
+development, ``test`` for final runs only), or ``real`` for the real pairs of TOPOMERGE_DATA. Methods: ours, kiss02, kiss03,
+fpfh, fgr (comma-separated; default all). Resumable: a line of JSON a pair and method in
 ``cache/merge/results_<split>.jsonl``; the first `limit` pairs are run (0: none, only the table). Peers get the means of the
 points of 0.1 m cells and a voxel size.
 
@@ -30,24 +30,14 @@ from topomerge.fusion.evidence import cell_middles
 from topomerge.fusion.registration import register
 from topomerge.types import Array, Sim3, VoxelGrid
 
+SCALELESS = ("halmstad",)  # no metres per pixel are known
 Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, how much
 
 
 def ours(pair: GridPair) -> Answer:
-    """`register` with cells and the middles of their points."""
-    return registered(pair, pair.a, pair.b)
-
-
-def ours_cells(pair: GridPair) -> Answer:
-    """`register` with cells only: what a map has whose points are gone."""
-    bare = [VoxelGrid(g.cells, g.origin, g.edge, g.shape) for g in (pair.a, pair.b)]
-    return registered(pair, bare[0], bare[1])
-
-
-def registered(pair: GridPair, a: VoxelGrid, b: VoxelGrid) -> Answer:
-    """`register`; the scale is free where the truth says that it must be."""
-    scale = "free" if pair.truth is not None and abs(pair.truth.scale - 1) > 0.03 else "fixed"
-    found = register(a, b, free=pair.free, scale=scale)
+    """`register` with cells only, as maps have them; the scale is free where that of the source is unknown."""
+    a, b = (VoxelGrid(g.cells, g.origin, g.edge, g.shape) for g in (pair.a, pair.b))
+    found = register(a, b, free=pair.free, scale="free" if pair.about["source"] in SCALELESS else "fixed")
     return found.transform, found.accepted, found.probability
 
 
@@ -105,7 +95,7 @@ def fgr(pair: GridPair, voxel: float = 0.3) -> Answer:
 
 
 METHODS: dict[str, Callable[[GridPair], Answer]] = {
-    "ours": ours, "ours_cells": ours_cells, "kiss02": kiss(0.2), "kiss03": kiss(0.3), "fpfh": fpfh, "fgr": fgr,
+    "ours": ours, "kiss02": kiss(0.2), "kiss03": kiss(0.3), "fpfh": fpfh, "fgr": fgr,
 }  # fmt: skip
 
 
@@ -126,6 +116,7 @@ def real_pairs() -> Iterator[GridPair]:
             a, b = grid_of(pair.a), grid_of(pair.b)
             free = tuple(free_of(c, g) if c.poses is not None else c.free for c, g in ((pair.a, a), (pair.b, b)))
             about = {"sensors": list(pair.sensors), "kind": pair.kind, "building": pair.building, "source": pair.source}
+            about["overlap"] = pair.overlap
             common = common_area(pair, a, b, (free[0], free[1]))
             yield GridPair(name, a, b, (free[0], free[1]), pair.truth, common, about)
 
@@ -151,7 +142,7 @@ def run(split: str, limit: int, methods: list[str], target: Path) -> None:
             except Exception as failure:  # a peer that fails has not merged
                 print(f"{pair.name} {method}: {failure}", flush=True)
                 pose, believed, how = None, False, 0.0
-            about = {k: pair.about[k] for k in ("sensors", "kind", "building", "source")}
+            about = {k: pair.about.get(k) for k in ("sensors", "kind", "building", "source", "overlap", "differs")}
             row = {"name": pair.name, "method": method, "common": pair.common, **about, "seconds": time.process_time() - began}
             row |= {"believed": believed, "probability": how, "err": None if pose is None else error(pose, pair)}
             row["scale"] = None if pose is None or pair.truth is None else pose.scale / pair.truth.scale

@@ -119,10 +119,11 @@ def _shares(walls: Array, conflict: float, main: float) -> dict[str, float]:
 
 def _overhead(judge: Judge, pose: Sim3) -> dict[str, float]:
     """Pieces of what hangs from ceilings (lamps, beams, ducts) that hang in the other map, too, and of all that both maps would
-    show: it stays when furniture moves, and no storey has that of another."""
-    found, back = np.zeros(2), pose.inverse()
+    show: it stays when furniture moves, and no storey has that of another. Counted for the map that shows less: the other one may
+    look higher."""
+    found, back = np.zeros((2, 2)), pose.inverse()
     for v, w in pairs_at(judge.a, judge.b, pose.translation[2], pose.scale):
-        for here, there, move in ((w, v, pose), (v, w, back)):
+        for side, (here, there, move) in enumerate(((w, v, pose), (v, w, back))):
             rows = np.argwhere(here.hung == 2)
             if not len(rows):
                 continue
@@ -132,17 +133,21 @@ def _overhead(judge: Judge, pose: Sim3) -> dict[str, float]:
             around = np.stack([there.hung[cells[:, 0] + i, cells[:, 1] + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
             known = (around > 0).sum(axis=0) > 4
             met = (around[:, known] == 2).any(axis=0)
-            found += np.array([met.sum(), known.sum()]) * here.plan.cell**2 / 2 / HANGING
-    return {"hanging": float(found[1]), "hanging_met": float(found[0])}
+            found[side] += np.array([met.sum(), known.sum()]) * here.plan.cell**2 / HANGING
+    met, every = found[found[:, 1].argmin()].tolist()
+    return {"hanging": every, "hanging_met": met}
 
 
 def _furniture(judge: Judge, pose: Sim3) -> dict[str, float]:
-    """How many pieces of furniture stand in place, of how many, and how many would by chance: where all is moved by `RING`."""
-    found = np.zeros((9, 2))
+    """How many pieces of furniture stand in place, of how many, and how many would by chance: where all is moved by `RING`.
+
+    Counted for the map that shows less of it: a tablet that looks up sees no desks, and missing desks are no evidence then.
+    """
+    found = np.zeros((9, 2, 2))
     steps = [(0.0, 0.0)] + [(RING * np.cos(t), RING * np.sin(t)) for t in np.arange(8) * np.pi / 4]
     x, y, z = pose.translation
     for k, (dx, dy) in enumerate(steps):
-        tally = judge.tally(Sim3(pose.yaw, (x + dx, y + dy, z), pose.scale)).sum(axis=0)
-        found[k] = tally[6:8] / 2 / OBJECT
+        found[k] = judge.tally(Sim3(pose.yaw, (x + dx, y + dy, z), pose.scale))[:, 6:8] / OBJECT
+    found = found[:, found[0, :, 0].argmin()]
     share = found[1:, 1].sum() / max(found[1:, 0].sum(), 1e-6)
     return {"pieces": float(found[0, 0]), "in_place": float(found[0, 1]), "by_chance": float(share * found[0, 0])}

@@ -247,9 +247,9 @@ def plausibility(f: Features) -> float:
     return _logit(model()["pose"], vector(f))
 
 
-def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[float, float, float]:
-    """How far the first of ranked hypotheses is ahead: in log odds; in log odds without the amounts, of those that explain a
-    share of what it does; and its share of the odds of all.
+def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[float, float, float, float]:
+    """How far the first of ranked hypotheses is ahead, named `LEAD`: in log odds; in log odds without the amounts, of those that
+    explain a share of what it does; in log odds of its share of the odds of all; and that share.
 
     A shift by one room along a row of rooms explains less, but nothing speaks against it: it is as good.
     """
@@ -257,11 +257,13 @@ def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[
     quality = vectors[:, QUALITY] @ (weights / scales)[QUALITY]
     rival = vectors[1:, 1] >= vectors[0, 1] + np.log(RIVAL)
     ahead = float(quality[0] - quality[1:][rival].max()) if rival.any() else MARGIN_CAP
-    return margin, float(np.clip(ahead, -2.0, MARGIN_CAP)), float(1 / np.exp(scores - scores[0]).sum())
+    share = float(1 / np.exp(scores - scores[0]).sum())
+    alone = float(np.clip(np.log(share / (1 - share + 1e-3)), -2.0, MARGIN_CAP))
+    return margin, float(np.clip(ahead, -2.0, MARGIN_CAP)), alone, share
 
 
 def probability(ranked: Sequence[Ranked], closer: Features) -> tuple[float, list[float]]:
-    """Probability that the first of ranked hypotheses is right: that the best one is, times its share of all odds; and of each.
+    """Probability that the first of ranked hypotheses is right, at most its share of the odds of all; and of each of them.
 
     Args:
         closer: what `closer.closer` found about the first one.
@@ -269,25 +271,27 @@ def probability(ranked: Sequence[Ranked], closer: Features) -> tuple[float, list
     pose = model()["pose"]
     vectors = np.array([vector(f) for _, f, _ in ranked])
     scores = np.array([s for _, _, s in ranked])
-    margin, ahead, _ = lead(scores, vectors, np.array(pose["weight"]), np.array(pose["scale"]))
-    seen = np.concatenate([vectors[0], [margin, ahead], closer_vector(closer)])[: len(model()["names"])]
-    shares = np.exp(scores - scores[0])
-    every = shares / shares.sum() / (1 + np.exp(-_logit(model()["winner"], seen)))
-    return float(every[0]), every.tolist()
+    leads = lead(scores, vectors, np.array(pose["weight"]), np.array(pose["scale"]))
+    odds = _logit(model()["winner"], np.concatenate([vectors[0], leads[:3], closer_vector(closer)]))
+    shares = np.exp(scores - scores[0]) / np.exp(scores - scores[0]).sum()
+    first = min(1 / (1 + np.exp(-odds)), leads[3])
+    every = first * shares / shares[0]
+    return float(first), every.tolist()
 
 
 def _logit(fitted: Mapping[str, Any], x: Array) -> float:
     return float(np.dot((x - fitted["mean"]) / fitted["scale"], fitted["weight"]) + fitted["bias"])
 
 
+LEAD = ("margin", "ahead", "alone")
 CLOSER = (
     "tall", "crossing", "worst_ratio", "squares", "bad_squares", "in_place", "out_of_place", "kept", "moved_walls", "hanging",
-    "fallen",
+    "fallen", "held",
 )  # fmt: skip
 
 
 def closer_vector(f: Features) -> Array:
-    """(11,) what the model of the best hypothesis sees of `closer.closer`, named `CLOSER`."""
+    """(12,) what the model of the best hypothesis sees of `closer.closer`, named `CLOSER`."""
     gain, pieces = max(f["in_place"] - f["by_chance"], 0.0), max(f["pieces"] - f["by_chance"], 0.0)
     return np.array(
         [
@@ -302,6 +306,7 @@ def closer_vector(f: Features) -> Array:
             np.log(f["moved_walls"] + 0.004),
             np.log1p(f["hanging_met"]),
             np.log1p(f["hanging"] - f["hanging_met"]),
+            f["hanging_met"] / (f["hanging"] + 1.0),
         ]
     )
 
