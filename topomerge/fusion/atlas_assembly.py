@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from topomerge.fusion.atlas_pairs import Check, Checks, Hypothesis, alike, place
+from topomerge.fusion.atlas_pairs import Check, Checks, Hypothesis, alike
 from topomerge.fusion.pose_graph import Measured, optimise
 from topomerge.types import Sim3
 
@@ -73,14 +73,15 @@ class Assembler:
     def build(self) -> Assembly:
         """The most probable assembly without contradictions."""
         banned: set[tuple[int, int]] = set()
-        for _ in range(self.count + 1):
+        while True:  # ends: each time one more pair is banned
             found = self._grown(banned)
             self._exchange(found)
-            weak = [link for link in self._heard(found) if link.log_odds < self.limit]
+            links = self._heard(found)
+            weak = [link for link in links if link.log_odds < self.limit]
             if not weak:
                 break
             banned.add(min(weak, key=lambda link: link.log_odds).maps)
-        found.links = self._heard(found)
+        found.links = links
         found.thrown = self._thrown(found)
         return found
 
@@ -158,8 +159,7 @@ class Assembler:
 
     def agrees(self, i: int, j: int, p: Sim3, q: Sim3) -> bool:
         """Are two poses T_ij one, where the maps overlap?"""
-        a, b = (self.checks.maps.prepared(k).views for k in (i, j))
-        return alike(p, q, place(a, b, p).mean(axis=0))
+        return alike(p, q, self.checks.place(i, j, p).mean(axis=0))
 
     def _heard(self, found: Assembly) -> list[Link]:
         """The links as they are seen now that everything is in its place."""
@@ -248,9 +248,8 @@ class Assembler:
                     check = Check(held[i, j], 0.0, True, {"walls": 1.0})
                 if check.overlap and ((i, j) in held or self._voice(i, j, poses[i].inverse() @ poses[j])[0] > 0):
                     pose = self.checks.fine(i, j, check.pose) if fine else check.pose
-                    a, b = (self.checks.maps.prepared(k).views for k in (i, j))
                     weight = float(np.clip(check.features["walls"], 0.5, HEAVY))
-                    yield Measured((i, j), pose, place(a, b, pose), weight)
+                    yield Measured((i, j), pose, self.checks.place(i, j, pose), weight)
 
 
 def across(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Sim3:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,6 +26,7 @@ CONFLICT = 0.3  # m2 of walls on free floor, below which it may be noise
 USUAL, STEEP = 0.12, 30.0  # share of the walls on free floor that true poses seldom exceed; log odds against, of each 1 above
 SPAN = 1.0  # m, least half width of the place by which a pose is measured
 LIMIT = 7.0  # log odds
+T = TypeVar("T")
 SAMPLE = 4000  # columns
 
 
@@ -103,31 +105,26 @@ class Checks:
         self.maps, self.scaled = maps, scaled
         self._known: dict[tuple[int, int], list[tuple[Sim3, Check]]] = {}
         self._fine: dict[tuple[int, int], list[tuple[Sim3, Sim3]]] = {}
+        self._places: dict[tuple[int, int], list[tuple[Sim3, Array]]] = {}
+
+    def place(self, i: int, j: int, pose: Sim3) -> Array:
+        """`place` of maps i and j (i < j) under T_ij."""
+        a, b = self.maps.prepared(i), self.maps.prepared(j)
+        return _once(self._places, (i, j), pose, b.middle, lambda: place(a.views, b.views, pose))
 
     def fine(self, i: int, j: int, pose: Sim3) -> Sim3:
         """T_ij after the fine registration (i < j); as it was where a map is a slice, which has no planes."""
         a, b = self.maps.prepared(i), self.maps.prepared(j)
         if any(v.plan.sliced for v in (*a.views, *b.views)):
             return pose
-        known = self._fine.setdefault((i, j), [])
-        for other, found in known:
-            if alike(pose, other, b.middle, SAME):
-                return found
-        known.append((pose, fine(a, b, pose, self.scaled)[0]))
-        return known[-1][1]
+        return _once(self._fine, (i, j), pose, b.middle, lambda: fine(a, b, pose, self.scaled)[0])
 
     def __call__(self, i: int, j: int, pose: Sim3) -> Check:
         """What maps i and j say to T_ij."""
         if j < i:
             turned = self(j, i, pose.inverse())
             return Check(turned.pose.inverse(), turned.log_odds, turned.overlap, turned.features)
-        known = self._known.setdefault((i, j), [])
-        middle = self.maps.prepared(j).middle
-        for other, check in known:
-            if alike(pose, other, middle, SAME):
-                return check
-        known.append((pose, self._judged(i, j, pose)))
-        return known[-1][1]
+        return _once(self._known, (i, j), pose, self.maps.prepared(j).middle, lambda: self._judged(i, j, pose))
 
     def _judged(self, i: int, j: int, pose: Sim3) -> Check:
         a, b = self.maps.prepared(i).views, self.maps.prepared(j).views
@@ -141,6 +138,18 @@ class Checks:
                 moved, features = candidate.pose, again
         overlap = features["free"] >= OVERLAP[0] or features["walls"] >= OVERLAP[1]
         return Check(moved, speaks(features) if overlap else 0.0, overlap, features)
+
+
+def _once(
+    memory: dict[tuple[int, int], list[tuple[Sim3, T]]], pair: tuple[int, int], pose: Sim3, at: Array, make: Callable[[], T]
+) -> T:
+    """What was made for a pair under a pose that is the same, or what is made now."""
+    known = memory.setdefault(pair, [])
+    for other, found in known:
+        if alike(pose, other, at, SAME):
+            return found
+    known.append((pose, make()))
+    return known[-1][1]
 
 
 def speaks(f: Mapping[str, float]) -> float:
