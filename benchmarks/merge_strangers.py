@@ -1,6 +1,6 @@
 """False merges: maps of different buildings put together, of the cached pairs of a split (``merge_pairs.py``).
 
-``python benchmarks/merge_strangers.py [split] [pairs]``; resumable: a line of JSON a pair in ``cache/merge/strangers_<split>.jsonl``.
+``python benchmarks/merge_strangers.py [split] [pairs]``; resumable: one line of JSON a pair in ``cache/merge/strangers_*.jsonl``.
 None of them may be believed. Each map is prepared once and tried with several others.
 """
 
