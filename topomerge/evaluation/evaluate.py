@@ -21,6 +21,7 @@ from topomerge.evaluation.settings import Evaluation, check, difference, folder_
 from topomerge.evaluation.tables import (
     BY,
     Table,
+    beside,
     curves,
     grouped,
     long_rows,
@@ -150,7 +151,7 @@ def short(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Eva
     """The tables that go into the documentation."""
     if any(m["change"] for m in matches):
         return [curves(ranks, matches, merges, settings)]
-    tables = [ranking(ranks, settings), matching(matches, settings), grouped(ranks, matches, "seen", settings)] if ranks else []
+    tables = [ranking(ranks, settings), beside(matches, settings), grouped(ranks, matches, "seen", settings)] if ranks else []
     return [*tables, *([merging(merges, "area", settings)] if merges else [])]
 
 

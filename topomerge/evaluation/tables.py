@@ -116,6 +116,21 @@ def matching(matches: Sequence[Row], settings: Evaluation) -> Table:
     return Table("Matches of rooms, in pairs that share some", head, rows, 2)
 
 
+def beside(matches: Sequence[Row], settings: Evaluation) -> Table:
+    """Precision, recall and F1 of the methods beside each other, a line a descriptor: the thesis' table, with recall."""
+    methods = list(dict.fromkeys(m["method"] for m in matches))
+    rows = []
+    for name, some in _variants(shares(matches)[0]).items():
+        cells = []
+        for method in methods:
+            these = [r for r in some if r["method"] == method]
+            both = " / ".join(cell(value(these, m, settings.rounds), False) for m in ("precision", "recall"))
+            cells += [both if these else "–", cell(value(these, "F1", settings.rounds))]
+        rows.append([name, *cells])
+    head = ["descriptor", *(text for m in methods for text in (f"{m}: P / R", f"{m}: F1"))]
+    return Table("Matches of rooms by each method, in pairs that share some", head, rows)
+
+
 def shares(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
     """Rows of pairs that share rooms, and of those that share none."""
     return [r for r in rows if r["units"]], [r for r in rows if not r["units"]]
