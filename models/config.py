@@ -16,6 +16,7 @@ GEOMETRY = {  # part -> width of the rows it reads; 0: it reads the points
     "pointnet_local": 0,
     "voxelcnn": 0,
 }
+WIDEST = 4096  # more is a mistake, or a file that was made to take all memory
 NODES = ("none", "sage", "gat")
 JUMPS = ("last", "cat", "max")
 
@@ -83,10 +84,10 @@ def check(network: Network) -> None:
         InputError: names the key.
     """
     geometry, node = network.geometry, network.node
-    if not geometry.parts or len(set(geometry.parts)) < len(geometry.parts):
+    if not geometry.parts or len(set(map(str, geometry.parts))) < len(geometry.parts):
         raise InputError("geometry.parts must be one or more, each once")
     for part in geometry.parts:
-        if part not in GEOMETRY:
+        if not isinstance(part, str) or part not in GEOMETRY:
             raise InputError(f"geometry.parts: unknown {part!r}; {', '.join(GEOMETRY)} are possible")
     if node.kind not in NODES:
         raise InputError(f"node.kind: unknown {node.kind!r}; {', '.join(NODES)} are possible")
@@ -100,8 +101,10 @@ def check(network: Network) -> None:
         raise InputError(f"geometry.yaws must be even where canonical is set (an axis has two ends), not {geometry.yaws}")
     least = {"geometry.width": geometry.width, "geometry.yaws": geometry.yaws, "node.heads": node.heads, "size": network.size}
     for key, value in least.items() | {("node.width", node.width)}:
-        if value < 1:
-            raise InputError(f"{key} must be 1 or more, not {value}")
+        if not 1 <= value <= WIDEST:
+            raise InputError(f"{key} must be 1 to {WIDEST}, not {value}")
+    if not 0 <= node.doors <= 4:
+        raise InputError(f"node.doors must be 0 to 4, not {node.doors}")
     if geometry.width % node.heads:
         raise InputError(f"geometry.width must be a multiple of node.heads: {geometry.width} and {node.heads}")
     if not 0 <= network.dropout < 1:

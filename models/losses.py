@@ -27,7 +27,7 @@ class LossSettings:
     dustbin: weight of the choice between the other map's rooms and no partner at all.
     margin: of the triplets, in distances between unit vectors.
     temperature: of NT-Xent; that of InfoNCE is learned.
-    faint: weight of rooms of which one of the maps saw little (`Truth.clear`).
+    faint: weight of rooms of which one of the maps has a part only (not `Truth.clear`).
     """
 
     kind: str = "infonce"
@@ -47,8 +47,7 @@ class Truth:
         side: (N,) 0 for a, 1 for b.
         same: (N, N) bool, the two are one true room, in the two maps of a pair.
         piece: (N, N) bool, the two are of one true room in one map.
-        clear: (N,) bool, most of a room was seen, and so of one of its partners if it has any: one that was only looked into
-            says little about what it is.
+        clear: (N,) bool, both maps have most of the room; or it has no partner, and its map has most of it.
     """
 
     pair: Tensor

@@ -76,7 +76,10 @@ def read_embedder(folder: str | Path) -> tuple[Embedder, dict[str, Any]]:
         raise InputError(f"{folder / WEIGHTS}: {error.strerror or error}; copy both files of an embedder") from error
     if hashlib.sha256(weights).hexdigest() != told["sha256"]:
         raise InputError(f"{folder / WEIGHTS}: cut off, damaged, or not the weights that {SETTINGS} is about; copy both again")
-    network = Embedder(network_from(told["network"]))
+    try:
+        network = Embedder(network_from(told["network"]))
+    except InputError as error:
+        raise InputError(f"{folder / SETTINGS}: {str(error)[:300]}; export it again") from error
     try:
         state = load(weights)
         network.load_state_dict(state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,7 +18,8 @@ LENGTHS, AREAS, VOLUMES = (1, 3, 4, 7, 12, 13), (0,), (2,)  # columns of x that 
 EDGE_LENGTHS = (0, 1, 5, 6, 7, 8)  # columns of edge_attr that are m
 MM = 0.001
 DOOR_NOISE = 0.05  # m, of the distance between two doors
-CLEAR = 0.4  # IoU of an extracted room and the true one
+GLIMPSED, AREA = 15, 0  # columns of x
+ALIKE = 1.5  # areas of two views of a room that both saw most of it differ by less than this factor
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def make_batch(
             side.append(torch.full((len(kept[k]),), k))
             true.append(one.true[k][kept[k]])
         links = links[kept[0]][:, kept[1]]
-        clear += _clear(links, one.iou[0][kept[0]] >= CLEAR, one.iou[1][kept[1]] >= CLEAR)
+        clear += seen_well(links, one.a["x"][kept[0]], one.b["x"][kept[1]])
         i, j = torch.nonzero(links, as_tuple=True)
         matches.append(torch.stack([start + i, start + len(kept[0]) + j]))
         start += len(kept[0]) + len(kept[1])
@@ -81,9 +83,21 @@ def join(graphs: Sequence[Graph], rooms: Sequence[int], names: Sequence[str]) ->
     return out
 
 
-def _clear(links: Tensor, a: Tensor, b: Tensor) -> list[Tensor]:
-    """Was most of each room seen, and of a partner if it has any?"""
-    return [a & ((links & b).any(dim=1) | ~links.any(dim=1)), b & ((links.T & a).any(dim=1) | ~links.any(dim=0))]
+def seen_well(links: Tensor, a: Tensor, b: Tensor) -> list[Tensor]:
+    """Which rooms were entered by both walks and have nearly the same area in both maps: (R_a,) and (R_b,) bool.
+
+    Of the others that have a partner, one map holds a part only, so that little can be said about their shape. A room that has
+    no partner counts if it was entered.
+
+    Args:
+        links: (R_a, R_b) bool, the two are one true room.
+        a, b: the rooms' `x`.
+    """
+    visited = [x[:, GLIMPSED] == 0 for x in (a, b)]
+    areas = [x[:, AREA].clamp(min=0.1).log() for x in (a, b)]
+    alike = (areas[0][:, None] - areas[1][None]).abs() <= math.log(ALIKE)
+    good = links & alike & visited[0][:, None] & visited[1][None]
+    return [good.any(dim=k) | (~links.any(dim=k) & visited[1 - k]) for k in (1, 0)]
 
 
 def _truth(pair: Tensor, side: Tensor, true: Tensor, clear: Tensor, matches: Tensor) -> Truth:

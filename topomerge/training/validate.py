@@ -11,7 +11,7 @@ from torch import Tensor
 
 from topomerge.matching.scores import assign_certain, certainty, has_twin, pair_counts, partner_ranks
 from topomerge.models.embedder import Embedder, match_scores
-from topomerge.training.batches import CLEAR, make_batch
+from topomerge.training.batches import make_batch, seen_well
 from topomerge.training.packed import GraphPair
 from topomerge.types import Array
 
@@ -43,12 +43,14 @@ def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu")
     ranks, twins, clear, counts = [], [], [], np.zeros((len(LEAST), 4), int)
     for pair, (a, bin_a), (b, bin_b) in zip(pairs, found[::2], found[1::2], strict=True):
         similarity, matches = (a @ b.T).numpy(), pair.matches.numpy()
-        good = [(iou >= CLEAR).numpy() for iou in pair.iou]
-        sides = ((similarity, matches, pair.b, good), (similarity.T, matches[:, ::-1], pair.a, good[::-1]))
-        for one, truth, other, (mine, theirs) in sides:
+        links = torch.zeros(similarity.shape, dtype=torch.bool)
+        links[pair.matches[:, 0], pair.matches[:, 1]] = True
+        good = [which.numpy() for which in seen_well(links, pair.a["x"], pair.b["x"])]
+        sides = ((similarity, matches, pair.b), (similarity.T, matches[:, ::-1], pair.a))
+        for (one, truth, other), well in zip(sides, good, strict=True):
             rooms, rank = partner_ranks(one, truth)
             ranks.append(rank)
-            clear.append(np.array([mine[i] and theirs[truth[truth[:, 0] == i, 1]].any() for i in rooms], bool))
+            clear.append(well[rooms])
             twins.append(has_twin(other["x"][:, SIZES].numpy(), truth, rooms))
         rows, columns = match_scores(a, b, bin_a, bin_b, temperature)
         certain = certainty(rows.exp().numpy(), columns.exp().numpy())
@@ -57,7 +59,7 @@ def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu")
 
 
 def scores(ranks: Array, twins: Array, clear: Array, counts: Array) -> dict[str, float]:
-    """Ranks (n,), whether each room has a twin (n,), and whether most of it was seen by both (n,); the sums of `pair_counts`
+    """Ranks (n,), whether each room has a twin (n,), and whether both maps saw it well (n,); the sums of `pair_counts`
     for each of `LEAST`."""
     found, right, wanted, got = counts.T
     precision, recall = right / np.maximum(found, 1), got / np.maximum(wanted, 1)
