@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import shutil
+import tarfile
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from tests import samples
 from tests.scenes_map import building
+from topomerge.errors import InputError
 
 MOST = 5_000_000  # points that are taken of a file; the rest of a large surface is no danger, as it comes in portions
+
+
+PARTNERS = {"plan.yaml": "plan.pgm", "embedder.safetensors": "embedder.json", "embedder.json": "embedder.safetensors"}
 
 
 def read_cloud(path: Path) -> int:
@@ -39,12 +47,50 @@ def read_map(path: Path) -> int:
     return len(found.rooms)
 
 
-READERS: dict[str, Callable[[Path], int]] = {".tmap": read_map}  # by suffix; all others are clouds
+def read_plans(path: Path) -> int:
+    """Read a file of floor plans of a data set."""
+    from topomerge.datasets.floorplans import Refusal, iter_plans
+
+    found = [plan for _, plan in iter_plans(path)]
+    refused = [plan.reason for plan in found if isinstance(plan, Refusal)]
+    if len(refused) == len(found):
+        raise InputError(f"{path}: {'; '.join(refused)[:300]}")
+    return len(found) - len(refused)
+
+
+def read_atlas(path: Path) -> int:
+    """Read the listing of an atlas."""
+    from topomerge.fusion.atlas_store import read_atlas
+
+    return len(read_atlas(path.parent).entries)
+
+
+def read_embedder(path: Path) -> int:
+    """Read an embedder whose settings or weights are damaged. Its checksum is made to fit: whoever means harm can do that."""
+    from topomerge.models.weights import read_embedder
+
+    settings = path.with_name("embedder.json")
+    if path.suffix == ".safetensors":
+        told = json.loads(settings.read_text())
+        settings.write_text(json.dumps({**told, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}))
+    return len(list(read_embedder(path.parent)[0].parameters()))
+
+
+READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others are clouds
+    "plan.xml": read_plans,
+    "plan.building.yaml": read_plans,
+    "plan.vectormap.json": read_plans,
+    "plans.tar.xz": read_plans,
+    "atlas.json": read_atlas,
+    "embedder.json": read_embedder,
+    "embedder.safetensors": read_embedder,
+    ".tmap": read_map,
+}
 
 
 def reader(path: Path) -> Callable[[Path], int]:
     """What reads a file of this name."""
-    return READERS.get(path.suffix, read_cloud)
+    return READERS.get(path.name) or READERS.get(path.suffix, read_cloud)
 
 
 def write_corpus(folder: Path) -> dict[str, Path]:
@@ -66,10 +112,46 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     save_map(building(2, 2), found["map.tmap"])
     found["plain.npz"] = folder / "plain.npz"
     np.savez(found["plain.npz"], points=samples.box_points(50), poses=np.eye(4)[None], pose_of=np.zeros(50, np.int32))
+    return found | write_plans(folder) | write_embedder(folder) | write_atlas(folder)
+
+
+def write_plans(folder: Path) -> dict[str, Path]:
+    """Plans of four data sets."""
+    from tests.datasets import plan_files
+
+    found = {name: folder / name for name in ("plan.xml", "plan.building.yaml", "plan.vectormap.json", "plans.tar.xz")}
+    plan_files.campus(found["plan.xml"])
+    plan_files.rmf(found["plan.building.yaml"])
+    plan_files.amrl(found["plan.vectormap.json"])
+    with tarfile.open(found["plans.tar.xz"], "w:xz") as archive:
+        archive.add(plan_files.r2v(folder / "flat.txt"), "flat.txt")
     return found
+
+
+def write_embedder(folder: Path) -> dict[str, Path]:
+    """A network that was not trained; nothing where torch is missing."""
+    if find_spec("torch") is None or find_spec("safetensors") is None:
+        return {}
+    import torch
+    from topomerge.models.config import Geometry, Network, Node
+    from topomerge.models.embedder import Embedder
+    from topomerge.models.weights import SETTINGS, WEIGHTS, save_embedder
+
+    torch.manual_seed(0)
+    save_embedder(Embedder(Network(Geometry(width=8), Node("sage", 1), size=8)), folder)
+    return {name: folder / name for name in (SETTINGS, WEIGHTS)}
+
+
+def write_atlas(folder: Path) -> dict[str, Path]:
+    """The listing of an atlas of one map."""
+    from topomerge.fusion.atlas_store import add
+
+    add(folder / "atlas", [("house", building(2, 2))])
+    shutil.copy(folder / "atlas" / "atlas.json", folder / "atlas.json")
+    return {"atlas.json": folder / "atlas.json"}
 
 
 def beside(name: str, corpus: Path, folder: Path) -> None:
     """Put what a file of this name needs into the folder where its mutants are written."""
-    if name == "plan.yaml":
-        shutil.copy(corpus / "plan.pgm", folder / "plan.pgm")
+    if name in PARTNERS:
+        shutil.copy(corpus / PARTNERS[name], folder / PARTNERS[name])

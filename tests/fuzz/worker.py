@@ -37,7 +37,7 @@ def attempt(path: Path) -> tuple[str, str]:
         return "fault", f"{type(error).__name__}: {error}"[:500]
     if "does not fit into memory" in message:
         return "fault", message
-    if "\n" in message or str(path) not in message or len(message) > 1000:
+    if "\n" in message or str(path.parent) not in message or len(message) > 1000:
         return "fault", f"a poor message: {message[:300]!r}"
     return "refused", message
 

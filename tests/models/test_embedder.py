@@ -245,3 +245,19 @@ def test_onnx_agrees(parts, tmp_path):
         found = session.run(None, {name: tensor.numpy() for name, tensor in tensors.items()})
         for one, other in zip(found, wanted, strict=True):
             assert np.abs(one - other.numpy()).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ({"size": 10**9}, "size must be 1 to 4096"),
+        ({"node": {"kind": "gat", "doors": 10**12}}, "node.doors must be 0 to 4"),
+        ({"geometry": {"parts": [["scalars"]]}}, "unknown"),
+    ],
+)
+def test_settings_that_would_take_all_memory_or_fail_oddly_are_refused(tmp_path, told, said):
+    save_embedder(network(), tmp_path)
+    settings = json.loads((tmp_path / "embedder.json").read_text())
+    (tmp_path / "embedder.json").write_text(json.dumps({**settings, "network": told}))
+    with pytest.raises(InputError, match=rf"embedder\.json: .*{said}"):
+        read_embedder(tmp_path)
