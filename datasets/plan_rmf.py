@@ -46,6 +46,7 @@ KINDS = {  # words in the names of waypoints
 }
 USUAL = {"hotel": "hotel", "clinic": "ward", "office": "office"}  # kind of most rooms, by the building's name
 MAX_BYTES = 20 << 20
+DEEPEST = 50  # a plan has 6
 
 Level = dict[str, Any]
 
@@ -58,8 +59,10 @@ def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """
     if path.stat().st_size > MAX_BYTES:
         raise InputError(f"absurd size: {path.stat().st_size} bytes for one building")
+    text, loader = path.read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        site = yaml.load(path.read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        _check_depth(text, loader)
+        site = yaml.load(text, loader)
     except yaml.YAMLError as error:
         raise InputError(f"damaged YAML: {' '.join(str(error).split())[:120]}") from error
     if not isinstance(site, dict) or not isinstance(site.get("levels"), dict) or not site["levels"]:
@@ -70,6 +73,15 @@ def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     order = sorted(site["levels"], key=lambda name: float(site["levels"][name].get("elevation", 0)))
     for k, name in enumerate(order):
         yield f"{stem}/{name}", partial(sketch, site, order, k, stem)
+
+
+def _check_depth(text: bytes, loader: Any) -> None:
+    """The C loader calls itself for every list within a list, and ends the process where there are too many."""
+    depth = 0
+    for event in yaml.parse(text, loader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise InputError(f"damaged YAML: more than {DEEPEST} lists within each other")
 
 
 def sketch(site: dict[str, Any], order: list[str], k: int, stem: str = "") -> Sketch:

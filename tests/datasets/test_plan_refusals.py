@@ -58,6 +58,12 @@ def test_xml_with_entities_is_not_read(tmp_path: Path) -> None:
     assert reason(tmp_path / "a.xml").startswith("not a campus plan")
 
 
+@pytest.mark.parametrize("mark", ["[", "{", "- "])
+def test_yaml_that_is_nested_without_end_does_not_end_the_process(tmp_path: Path, mark: str) -> None:
+    (tmp_path / "a.building.yaml").write_text("levels:\n  " + mark * 100_000)
+    assert reason(tmp_path / "a.building.yaml").startswith("damaged YAML")
+
+
 def test_yaml_refusals(tmp_path: Path) -> None:
     path = tmp_path / "a.building.yaml"
     assert reason(write.rmf(path, system="wgs84")).startswith("wrong version")
