@@ -17,6 +17,7 @@ import numpy as np
 import shapely
 from topomerge.datasets.pairs import Pair
 
+from topomerge.embedding.graph import ROOM_FEATURES
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.io.maps import load_map, save_map
@@ -26,6 +27,7 @@ from topomerge.matching.topdown import top_down
 from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
 
 TWIN_AREA, TWIN_SIDE = 0.05, 0.25  # share, m: rooms that differ by less are near-identical
+GLIMPSED = ROOM_FEATURES.index("glimpsed")
 COLUMN = 0.2  # m, columns by which the area in common is measured
 BELOW = 0.15  # m: what is that far below a floor is the ceiling of the storey below
 STOREY = 1.0  # m between two storeys, at least
@@ -43,6 +45,7 @@ class KeptPair:
         true: of each map, (R,) true room of each extracted one, -1 none.
         one: of each map, (R,) is it the one that is assigned to the true room?
         twin: of each map, (R,) does the other map hold a near-identical room, another than its true partner?
+        glimpsed: of each map, (R,) was it looked into only?
         transform: T_ab; None where there is none.
         anchor: (3,) a point of b in the middle of what both maps saw: drift bends maps, and no pose is right everywhere.
         about: sensors, source, building, overlap, kind, common (m2 that both saw), rooms ("labelled" or "laid"), ...
@@ -54,6 +57,7 @@ class KeptPair:
     true: tuple[Array, Array]
     one: tuple[Array, Array]
     twin: tuple[Array, Array]
+    glimpsed: tuple[Array, Array]
     transform: Sim3 | None
     anchor: Array
     about: dict[str, Any]
@@ -81,12 +85,14 @@ def load_kept(path: Path) -> KeptPair:
         raise InputError(f"{path}: its maps were not kept; build it with data.maps=true")
     about = json.loads(data["about"].tobytes())
     true, one, twin = ((data[f"a.{name}"], data[f"b.{name}"]) for name in ("true_room", "true_one", "twin"))
+    glimpsed = (data["a.x"][:, GLIMPSED] > 0.5, data["b.x"][:, GLIMPSED] > 0.5)
     laid = about["rooms"] == "laid"
     matches = data["laid" if laid else "matches"]
     if laid:  # no labels: the rooms that lie over each other stand for true ones
         true = _rooms_of_matches(matches, tuple(len(t) for t in true))
         one = (true[0] >= 0, true[1] >= 0)
-    return KeptPair(path.stem, path.parent, matches, true, one, twin, sim3_of(data["transform"]), data["anchor"], about)
+    pose = sim3_of(data["transform"])
+    return KeptPair(path.stem, path.parent, matches, true, one, twin, glimpsed, pose, data["anchor"], about)
 
 
 def load_set(manifest: Path) -> list[KeptPair]:

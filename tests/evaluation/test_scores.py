@@ -25,6 +25,7 @@ def kept(**changes: Any) -> KeptPair:
         "true": (np.array([0, 1, 1, 2, -1]), np.array([1, 0, 2, 3])),
         "one": (np.array([True, True, False, True, False]), np.ones(4, bool)),
         "twin": (np.array([False, False, False, True, False]), np.zeros(4, bool)),
+        "glimpsed": (np.array([False, False, True, False, False]), np.array([True, False, False, False])),
         "transform": Sim3(0.3, (1.0, 2.0, 0.0)),
         "anchor": np.array([5.0, 0.0, 0.0]),
         "about": {"kind": "overlap", "common": 100.0, "sensors": ["tls", "depth"], "rooms": "labelled"},
@@ -67,6 +68,7 @@ def test_rank_counts_of_both_directions() -> None:
     assert found["five"] == 7
     assert found["reciprocal"] == pytest.approx(3 + 2 + 1 / 4 + 1 / 5)
     assert found["queries_twin"] == 1 and found["first_twin"] == 0
+    assert (found["queries_whole"], found["first_whole"]) == (4, 2)  # rooms 0 and 3 of a, 1 and 2 of b, both entered
 
 
 def test_poses() -> None:

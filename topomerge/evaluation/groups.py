@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from topomerge.evaluation.score import GROUPS, Row
+from topomerge.evaluation.score import GROUPS, WHOLE, Row
 from topomerge.types import Array
 
 LEVELS = [2.5, 97.5]  # percent
@@ -37,6 +37,7 @@ RATIOS: dict[str, Ratio] = {
     **{f"recall@1{g}": (f"first{g}", f"queries{g}") for g in GROUPS},
     **{f"recall@5{g}": (f"five{g}", f"queries{g}") for g in GROUPS},
     **{f"MRR{g}": (f"reciprocal{g}", f"queries{g}") for g in GROUPS},
+    f"recall@1{WHOLE}": (f"first{WHOLE}", f"queries{WHOLE}"),
     "strict recall": ("strict_right", "strict_units"),
     "right poses": ("near", "mergeable"),
     "merged": ("merged", "mergeable"),

@@ -24,6 +24,7 @@ NEAR, FINE = (0.5, 5.0), (0.1, 1.0)  # m, degrees
 SHARED = 80.0  # m2 in common, from which on maps should be merged
 AREAS = (("<40", 40.0), ("40-80", 80.0), ("80-200", 200.0), (">200", np.inf))  # m2
 OVERLAPS = ((0.0, "0"), (0.175, "0.1"), (0.375, "0.25"), (0.625, "0.5"), (1.0, "0.75"))  # share: up to, name
+WHOLE = "_whole"
 GROUPS = ("", "_twin", "_single")  # rooms that have a near-identical one in the other map, and those that have none
 
 
@@ -138,15 +139,17 @@ def ranks_of(cost: Array, matches: Array) -> tuple[Array, Array]:
 
 def rank_counts(kept: KeptPair, cost: Array) -> Row:
     """`queries`: rooms of either map with a true partner in the other; `first`, `five`: whose partner ranks first, within five;
-    `reciprocal`: sum of 1 / rank; each also with and without a twin."""
-    rank, twin = [], []
+    `reciprocal`: sum of 1 / rank; each also with and without a twin, and (`_whole`) where neither room was looked into only."""
+    rank, twin, whole = [], [], []
     for side, c, m in ((0, cost, kept.matches), (1, cost.T, kept.matches[:, ::-1])):
         rooms, found = ranks_of(c, m)
         rank.append(found)
         twin.append(kept.twin[side][rooms])
-    r, t = np.concatenate(rank), np.concatenate(twin).astype(bool)
+        entered = m[~kept.glimpsed[side][m[:, 0]] & ~kept.glimpsed[1 - side][m[:, 1]], 0]
+        whole.append(np.isin(rooms, entered))
+    r, t, w = np.concatenate(rank), np.concatenate(twin).astype(bool), np.concatenate(whole)
     out: Row = {"pairs": 1}
-    for name, some in zip(GROUPS, (t | True, t, ~t), strict=True):
+    for name, some in zip((*GROUPS, WHOLE), (t | True, t, ~t, w), strict=True):
         out[f"queries{name}"] = int(some.sum())
         out[f"first{name}"] = int((r[some] == 1).sum())
         out[f"five{name}"] = int((r[some] <= 5).sum())

@@ -22,11 +22,12 @@ BY = {
     "source": "Source",
     "seen": "Sources that trained something, and those that did not",
 }
-RANKING = ("recall@1", "recall@1_single", "recall@1_twin", "recall@5", "MRR")
+RANKING = ("recall@1", "recall@1_single", "recall@1_twin", "recall@1_whole", "recall@5", "MRR")
 MATCHING = ("precision", "recall", "F1", "F1_single", "F1_twin", "strict recall")
 MERGING = ("right poses", "merged", "merged finely", "refused")
 NAMES = {
-    "recall@1": "recall@1", "recall@1_single": "without twin", "recall@1_twin": "with twin", "recall@5": "recall@5", "MRR": "MRR",
+    "recall@1": "recall@1", "recall@1_single": "without twin", "recall@1_twin": "with twin",
+    "recall@1_whole": "entered", "recall@5": "recall@5", "MRR": "MRR",
     "precision": "precision", "recall": "recall", "F1": "F1", "F1_single": "F1 without twin", "F1_twin": "F1 with twin",
     "strict recall": "recall one to one", "right poses": "best pose right", "merged": "merged right", "refused": "right, refused",
     "merged finely": "within 0.1 m, 1°",
