@@ -97,11 +97,11 @@ def _settings(path: Path) -> dict[str, Any]:
         told = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}; give a run's folder, or one of export-embedder") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: damaged or cut off ({' '.join(str(error).split())[:80]})") from error
     if not isinstance(told, dict) or told.get("class") != CLASS:
         found = told.get("class") if isinstance(told, dict) else None
-        raise InputError(f"{path}: is of class {found!r}, not {CLASS}")
+        raise InputError(f"{path}: is of class {str(found)[:60]!r}, not {CLASS}")
     if told.get("format") != FORMAT:
         raise InputError(f"{path}: has format {told.get('format')!r}, this program reads {FORMAT}; export it again")
     if not all(isinstance(told.get(key), kind) for key, kind in (("network", dict), ("sha256", str), ("about", dict))):

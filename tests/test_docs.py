@@ -93,7 +93,7 @@ def test_every_command_in_the_docs_exists() -> None:
     for page in pages():
         for example in examples(page):
             for command in commands(example) if example.kind == "console" else ():
-                for words in re.findall(r"(?:^|&& |\| )topomerge ([^|&>]*)", command):
+                for words in re.findall(r"(?:^|&& |\| )topomerge ([^|&>#]*)", command):
                     name, *rest = words.split()
                     flags = {w.partition("=")[0] for w in rest if w.startswith("-")} - {"-v", "--help", "-h"}
                     assert name.startswith("-") or flags <= known[name], f"{page.name}:{example.line}: {command}"

@@ -216,3 +216,31 @@ def test_pipes_and_devices_are_not_waited_for(worker: Worker, tmp_path: Path) ->
 
     os.mkfifo(tmp_path / "a.ply")
     harmless(worker, tmp_path / "a.ply")
+
+
+ELSEWHERE = ["../precious.txt", "{elsewhere}/precious.txt", "maps/../../precious.txt", "link/precious.txt", 5]
+
+
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_an_atlas_of_a_stranger_deletes_and_writes_nothing_elsewhere(tmp_path: Path, name: object) -> None:
+    """What looks like a change that was interrupted names files of other folders."""
+    from tests.scenes_map import building
+    from topomerge.errors import InputError
+    from topomerge.fusion.atlas_folder import GONE, NEXT
+    from topomerge.fusion.atlas_store import add, read_atlas
+
+    folder = tmp_path / "atlas"
+    add(folder, [("house", building(2, 2))])
+    (tmp_path / "precious.txt").write_text("mine")
+    (folder / "link").symlink_to(tmp_path)
+    (folder / NEXT).mkdir()
+    (folder / NEXT / GONE).write_text(json.dumps([str(name).format(elsewhere=tmp_path) if isinstance(name, str) else name]))
+    with pytest.raises(InputError, match="can't be finished"):
+        read_atlas(folder)
+    assert (tmp_path / "precious.txt").read_text() == "mine"
+    (folder / NEXT / GONE).unlink()
+    (folder / NEXT / "link").mkdir()
+    (folder / NEXT / "link" / "precious.txt").write_text("theirs")
+    with pytest.raises(InputError, match="can't be finished"):
+        read_atlas(folder)
+    assert (tmp_path / "precious.txt").read_text() == "mine"

@@ -63,6 +63,14 @@ def finished(folder: Path) -> None:
             _finish(folder)
 
 
+def _inside(folder: Path, name: str) -> Path:
+    """A file of the atlas; an atlas of a stranger must not reach for files elsewhere, by its names or by links."""
+    path = folder / name
+    if not path.parent.resolve().is_relative_to(folder.resolve()):
+        raise ValueError(f"{name[:100]!r} lies elsewhere")
+    return path
+
+
 def _finish(folder: Path) -> None:
     """Move the files of a change that counts to their places, and delete those that it has no more."""
     source = folder / NEXT
@@ -72,13 +80,13 @@ def _finish(folder: Path) -> None:
         listed = source / GONE
         gone: Sequence[str] = json.loads(listed.read_text(encoding="utf-8")) if listed.exists() else []
         for path in sorted(p for p in source.rglob("*") if p.is_file() and p != listed):
-            target = folder / path.relative_to(source)
+            target = _inside(folder, str(path.relative_to(source)))
             target.parent.mkdir(parents=True, exist_ok=True)
             path.replace(target)
         for name in gone:
-            (folder / name).unlink(missing_ok=True)
+            _inside(folder, name).unlink(missing_ok=True)
         shutil.rmtree(source)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{folder}: a change that was interrupted can't be finished ({error}); is it writable?") from error
 
 
