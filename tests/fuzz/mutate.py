@@ -211,8 +211,21 @@ def in_json(data: bytes, rng: Rng) -> bytes:
     return data[:8] + struct.pack("<II", 20 + len(text) + len(rest), len(text)) + data[16:20] + text + rest
 
 
+def in_step(data: bytes, rng: Rng) -> bytes:
+    """References of a STEP file turned to other entities, or statements changed for those of another kind."""
+    out = data
+    for _ in range(int(rng.integers(1, 4))):
+        found = list(re.finditer(rb"#\d+|IFC[A-Z0-9]+", out))
+        if len(found) < 2:
+            return general(data, rng)
+        a, b = (found[int(i)] for i in rng.integers(0, len(found), 2))
+        if a[0][:1] == b[0][:1]:
+            out = out[: a.start()] + b[0] + out[a.end() :]
+    return out
+
+
 SPECIAL: dict[str, Callable[[bytes, Rng], bytes]] = {
-    ".npz": in_zip, ".tmap": in_zip, ".e57": in_pages, ".png": in_png, ".glb": in_json, ".gltf": in_json, ".json": in_json
+    ".npz": in_zip, ".tmap": in_zip, ".e57": in_pages, ".png": in_png, ".glb": in_json, ".gltf": in_json, ".json": in_json, ".ifc": in_step
 }  # fmt: skip
 
 

@@ -244,3 +244,40 @@ def test_an_atlas_of_a_stranger_deletes_and_writes_nothing_elsewhere(tmp_path: P
     with pytest.raises(InputError, match="can't be finished"):
         read_atlas(folder)
     assert (tmp_path / "precious.txt").read_text() == "mine"
+
+
+def model_with(folder: Path, pattern: str, other: str) -> str:
+    """A building model of which the first statement of a kind (a regular expression for its name) is replaced."""
+    pytest.importorskip("ifcopenshell")
+    samples.write_ifc(folder / "good.ifc")
+    good, statement = (folder / "good.ifc").read_text(), rf"#(\d+)={pattern}\(.*?\);"
+    text, found = re.subn(statement, lambda m: other.replace("#N", f"#{m[1]}"), good, count=1)
+    assert found
+    return text
+
+
+@pytest.mark.parametrize(
+    ("pattern", "other"),
+    [
+        ("IFCPOLYLINE", "#N=IFCPOLYLINE(());"),
+        ("IFCPOLYLINE", "#N=IFCPOLYLINE((#9001,#9002));"),
+        ("IFCEXTRUDEDAREASOLID", "#N=IFCBOOLEANRESULT(.UNION.,#N,#N);"),
+        ("IFCEXTRUDEDAREASOLID", "#N=IFCBOOLEANRESULT(.UNION.,#9001,#9001);\n#9001=IFCBOOLEANRESULT(.UNION.,#N,#N);"),
+        ("IFCLOCALPLACEMENT", "#N=IFCLOCALPLACEMENT(#N,#3);"),
+    ],
+)
+def test_models_that_end_the_library(worker: Worker, tmp_path: Path, pattern: str, other: str) -> None:
+    assert "damaged" in refused(worker, tmp_path / "a.ifc", model_with(tmp_path, pattern, other))
+
+
+def test_models_that_are_nested_too_deep(worker: Worker, tmp_path: Path) -> None:
+    for depth, state in ((100, "read"), (100_000, "refused")):
+        chain = "".join(f"#{9000 + i}=IFCLOCALPLACEMENT(#{9001 + i},#3);\n" for i in range(depth))
+        text = model_with(tmp_path, "IFCLOCALPLACEMENT", f"#N=IFCLOCALPLACEMENT(#9000,#3);\n{chain}")
+        (tmp_path / "a.ifc").write_text(text)
+        assert worker.ask(str(tmp_path / "a.ifc"))[0] == state, depth
+
+
+def test_names_in_a_model_are_no_references(worker: Worker, tmp_path: Path) -> None:
+    text = model_with(tmp_path, "IFCWALL", "#N=IFCWALL('0sf3ISLQz5hRzC9sJf$1AN',$,'wall #N; it''s #N',$,$,$,#72,$,$);")
+    read(worker, tmp_path / "a.ifc", text)

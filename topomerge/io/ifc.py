@@ -16,6 +16,7 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io.mesh import sample
 from topomerge.io.piece import Options, Piece, damaged
+from topomerge.io.step import check_references
 from topomerge.types import Array, TrueRoom
 
 # What has a shape but is not built, or is cut out of something else.
@@ -29,10 +30,13 @@ def read(path: Path, options: Options) -> Iterator[Piece]:
     import ifcopenshell
 
     _check_ends(path)
+    check_references(path)
     try:
         model = ifcopenshell.open(str(path))
     except ifcopenshell.Error as error:
         raise damaged(path, "an IFC model", error) from error
+    if not all(line.Points for line in model.by_type("IfcPolyline")):  # the library divides by their number
+        raise damaged(path, "an IFC model", "a line without points")
     built = [p for p in model.by_type("IfcProduct") if p.Representation and _is_built(p, options.doors)]
     if not built:
         raise InputError(f"{path}: has no building elements with a shape; export it with its geometry")
@@ -43,6 +47,8 @@ def read(path: Path, options: Options) -> Iterator[Piece]:
         shapes[element] = vertices, faces
         if number % 50 == 0:
             yield Piece(np.empty((0, 3)), done=0.05 + 0.75 * number / len(built))
+    if not shapes:
+        raise InputError(f"{path}: none of its {len(built)} building elements has a usable shape; export it with its geometry")
     first = 0
     for _, (vertices, faces) in sorted(shapes.items()):  # threads hand the elements over in any order
         yield Piece(vertices, done=0.8)
