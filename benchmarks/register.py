@@ -121,18 +121,18 @@ def real_pairs() -> Iterator[GridPair]:
             yield GridPair(name, a, b, (free[0], free[1]), pair.truth, common, about)
 
 
-def simulated_pairs(split: str) -> Iterator[GridPair]:
-    """The cached pairs of a split."""
-    for path in sorted((Path("cache/merge") / split).glob("*.npz")):
-        yield load(path, mean=True)
+def simulated_pairs(split: str, limit: int, skip: set[str]) -> Iterator[GridPair]:
+    """The first cached pairs of a split, but for those named."""
+    for path in sorted((Path("cache/merge") / split).glob("*.npz"))[:limit]:
+        if path.stem not in skip:
+            yield load(path, mean=True)
 
 
 def run(split: str, limit: int, methods: list[str], target: Path) -> None:
     """Run what is missing."""
     done = {(r["name"], r["method"]) for r in map(json.loads, target.read_text().splitlines())} if target.exists() else set()
-    for i, pair in enumerate(real_pairs() if split == "real" else simulated_pairs(split)):
-        if i >= limit:
-            return
+    whole = {name for name, _ in done if all((name, m) in done for m in methods)}
+    for pair in real_pairs() if split == "real" else simulated_pairs(split, limit, whole):
         for method in methods:
             if (pair.name, method) in done:
                 continue

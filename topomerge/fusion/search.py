@@ -52,6 +52,12 @@ class View:
         return _distance(self.plan.wall, self.plan.cell)
 
     @cached_property
+    def field(self) -> tuple[Array, Array]:
+        """`to_wall` with a rim of `REACH`, and the corner of it, m: poses are drawn back from beyond the outer walls, too."""
+        rim = int(np.ceil(REACH / self.plan.cell))
+        return _distance(np.pad(self.plan.wall, rim), self.plan.cell), self.plan.origin - rim * self.plan.cell
+
+    @cached_property
     def to_any(self) -> Array:
         """(H, W) float32 m to anything that stands."""
         return _distance(self.plan.wall | self.plan.clutter, self.plan.cell)
@@ -297,7 +303,7 @@ def _refined(v: View, w: View, group: Sequence[Candidate], scaled: bool) -> list
         walls = walls[np.random.default_rng(0).permutation(len(walls))[:SAMPLE]]
     middle = walls.mean(axis=0)
     start = np.array([[*c.pose.apply(np.array([[*middle, 0.0]]))[0, :2], c.pose.yaw, np.log(c.pose.scale)] for c in group])
-    poses, score = align.refine(walls - middle, v.to_wall, v.plan.origin, v.plan.cell, start, np.array(SIGMAS), 5, scaled)
+    poses, score = align.refine(walls - middle, *v.field, v.plan.cell, start, np.array(SIGMAS), 5, scaled)
     out = []
     for candidate, (x, y, yaw, size), value in zip(group, poses, score, strict=True):
         turned = Sim3(wrapped(yaw), (0.0, 0.0, 0.0), float(np.exp(size)))

@@ -1,0 +1,189 @@
+"""The section "Merging" of docs/results.md from what `register.py` and `merge_strangers.py` left in ``cache/merge``.
+
+``python benchmarks/merge_results.py docs/results.md``
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from calibrate_merge import ALIKE, THRESHOLD, kind_of, right
+
+from topomerge.io.atomic import replacing
+from topomerge.metrics import bootstrap
+
+Row = dict[str, Any]
+CACHE = Path("cache/merge")
+NAMES = {
+    "ours": "topomerge", "kiss02": "KISS-Matcher 0.2 m", "kiss03": "KISS-Matcher 0.3 m", "fpfh": "FPFH + RANSAC", "fgr": "FGR",
+}  # fmt: skip
+BINS = ("40-80", "80-200", ">200")
+
+
+def rows_of(name: str) -> list[Row]:
+    """Lines of a file of results; none where there is no such file."""
+    path = CACHE / name
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def good(row: Row, limits: tuple[float, float] = (0.5, 5.0)) -> bool:
+    """Right within m and degrees."""
+    return bool(right(row["err"], row["sensors"], limits))
+
+
+def share(rows: Sequence[Row], hit: Callable[[Row], bool]) -> str:
+    """Mean with its interval over buildings."""
+    if not rows:
+        return "-"
+    mean, low, high = bootstrap([float(hit(r)) for r in rows], [r["building"] for r in rows])
+    return f"{100 * mean:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def line(cells: Sequence[object]) -> str:
+    """A line of a table in Markdown."""
+    return "| " + " | ".join(str(c) for c in cells) + " |"
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    return "\n".join([line(heads), "|" + "---|" * len(heads), *(line(r) for r in rows)])
+
+
+def measures(rows: Sequence[Row]) -> list[object]:
+    """Number, right, fine, believed among the right ones, believed and wrong, seconds."""
+    true = [r for r in rows if good(r)]
+    wrong = sum(r["believed"] and r["answered"] and not good(r) for r in rows)
+    seconds = float(np.median([r["seconds"] for r in rows]))
+    shares = share(rows, good), share(rows, lambda r: good(r, (0.1, 1.0))), share(rows, lambda r: good(r) and r["believed"])
+    return [len(rows), len(true), *shares, wrong, f"{seconds:.1f}"]
+
+
+HEADS = ("pairs", "right", "right %", "within 0.1 m, 1° %", "right and believed %", "believed, wrong", "s")
+
+
+def by(rows: Sequence[Row], key: Callable[[Row], str], groups: Sequence[str], name: str) -> str:
+    """A line a group and method."""
+    out = []
+    for group in groups:
+        for method, title in NAMES.items():
+            mine = [r for r in rows if r["method"] == method and key(r) == group]
+            if mine:
+                out.append([group, title, *measures(mine)])
+    return table([name, "method", *HEADS], out)
+
+
+def same_pairs(rows: Sequence[Row], method: str) -> str:
+    """Our own beside a peer on the pairs that the peer was run on."""
+    names = {r["name"] for r in rows if r["method"] == method} & {r["name"] for r in rows if r["method"] == "ours"}
+    pairs = [r for r in rows if r["name"] in names and kind_of(r) in BINS]
+    out = []
+    for group in BINS:
+        for m in ("ours", method):
+            mine = [r for r in pairs if r["method"] == m and kind_of(r) == group]
+            if mine:
+                out.append([f"{group} m²", NAMES[m], *measures(mine)])
+    return table(["in common", "method", *HEADS], out)
+
+
+def negatives(rows: Sequence[Row], strangers: Sequence[Row]) -> str:
+    """Pairs that must not merge, by kind."""
+    groups: dict[str, list[Row]] = {}
+    for r in rows:
+        kind = kind_of(r)
+        if r["method"] == "ours" and kind.startswith("none") and not good(r):
+            alike = r["kind"] == "twin-wing" and r.get("differs") is not None and r["differs"] < ALIKE
+            name = {"overlap": "same building, no room in common", "twin-wing": "twin wing"}.get(r["kind"], r["kind"])
+            groups.setdefault(name + (", alike where both look" if alike else ""), []).append(r)
+    if strangers:
+        groups["strangers: maps of different pairs"] = list(strangers)
+    out = []
+    for name, mine in sorted(groups.items()):
+        most = np.round(sorted((r["probability"] for r in mine), reverse=True)[:3], 2).tolist()
+        out.append([name, len(mine), sum(r["believed"] for r in mine), ", ".join(map(str, most))])
+    every = [r for mine in groups.values() for r in mine]
+    out.append(["**all**", len(every), sum(r["believed"] for r in every), ""])
+    return table(["kind", "pairs", "believed", "highest probabilities"], out)
+
+
+def reliability(rows: Sequence[Row], strangers: Sequence[Row]) -> str:
+    """How often what is told is so, and the expected calibration error."""
+    p = np.array([r["probability"] for r in (*rows, *strangers)])
+    y = np.array([good(r) for r in rows] + [False] * len(strangers))
+    which = np.minimum((p * 10).astype(int), 9)
+    out, gap = [], 0.0
+    for k in range(10):
+        mine = which == k
+        if mine.any():
+            gap += mine.mean() * abs(p[mine].mean() - y[mine].mean())
+            out.append([f"{k / 10:.1f} to {k / 10 + 0.1:.1f}", int(mine.sum()), f"{p[mine].mean():.2f}", f"{y[mine].mean():.2f}"])
+    return table(["told", "pairs", "mean", "right"], out) + f"\n\nExpected calibration error {gap:.3f} over {len(p)} pairs."
+
+
+def real(rows: Sequence[Row]) -> str:
+    """Real pairs by source."""
+    out = []
+    for name in sorted({_group(r) for r in rows}):
+        mine = [r for r in rows if _group(r) == name]
+        scale = [abs(r["scale"] - 1) for r in mine if r["scale"] and good(r)]
+        believed = [r for r in mine if r["believed"]]
+        wrong = [r["name"].split("/")[1] for r in mine if not good(r)]
+        out.append([
+            name, len(mine), sum(map(good, mine)), sum(good(r) for r in believed), sum(not good(r) for r in believed),
+            f"{100 * max(scale, default=0.0):.1f} %", f"{np.median([r['seconds'] for r in mine]):.1f}", ", ".join(wrong),
+        ])  # fmt: skip
+    return table(["pairs", "number", "right", "right and believed", "wrong and believed", "scale off by", "s", "not right"], out)
+
+
+def put(path: Path, text: str) -> None:
+    """Replace what stands between the marks, or add the section at the end."""
+    begin, end = "<!-- merging:begin -->", "<!-- merging:end -->"
+    whole = path.read_text(encoding="utf-8")
+    if begin not in whole:
+        whole = f"{whole.rstrip()}\n\n## Merging\n\n{begin}\n{end}\n"
+    before, rest = whole.split(begin, 1)
+    with replacing(path) as beside:
+        beside.write_text(f"{before}{begin}\n{text}\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")
+
+
+def _group(row: Row) -> str:
+    return f"{row['source']} {' to '.join(sorted(set(row['sensors']), reverse=True))}"
+
+
+def section() -> str:
+    """The whole section."""
+    rows, strangers = rows_of("results_test.jsonl"), rows_of("strangers_test.jsonl")
+    mine = [r for r in rows if r["method"] == "ours"]
+    large = [r for r in mine if kind_of(r) in ("80-200", ">200")]
+    buildings = len({r["building"] for r in mine})
+    sensors = sorted({"-".join(sorted(r["sensors"])) for r in large})
+    kept = share(large, lambda r: good(r) and r["believed"])
+    parts = [
+        "`python benchmarks/merge_pairs.py test 175; python benchmarks/register.py test 1000; "
+        "python benchmarks/merge_strangers.py test 350; python benchmarks/merge_results.py docs/results.md`",
+        f"{len(mine)} simulated pairs of {buildings} test buildings, in 0.1 m cells, every sixth with much moved furniture, "
+        "every eighth with glass walls. Right: within 0.5 m and 5° in the middle of what both maps saw (slices: horizontally); "
+        f"believed: probability {THRESHOLD} or more. In brackets 95 % intervals over buildings. Seconds of processor. "
+        "KISS-Matcher believes what it calls valid; Open3D has no verdict, so that all its answers count as believed.",
+        by(mine, kind_of, ("<40", *BINS), "m² in common"),
+        f"Sharing 80 m² or more: {len(large)} pairs, right {share(large, good)} %, right and believed {kept} %; by sensors:",
+        by(large, lambda r: "-".join(sorted(r["sensors"])), sensors, "sensors"),
+    ]
+    for method in ("kiss02", "kiss03", "fpfh", "fgr"):
+        if any(r["method"] == method for r in rows):
+            parts += [f"Beside {NAMES[method]}, on the same pairs:", same_pairs(rows, method)]
+    parts += ["### Pairs that must not merge", negatives(mine, strangers)]
+    parts += ["### Is what it tells so?", reliability(mine, strangers)]
+    parts += ["### Real pairs", real(rows_of("results_real.jsonl"))]
+    return "\n\n".join(parts)
+
+
+if __name__ == "__main__":
+    text = section()
+    print(text)
+    if len(sys.argv) > 1:
+        put(Path(sys.argv[1]), text)
