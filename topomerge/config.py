@@ -33,6 +33,13 @@ def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schem
     return typed(given, schema)
 
 
+def register(name: str, schema: type[Any]) -> None:
+    """Let `configs/<name>.yaml` begin with `<name>_schema`: then every field of the dataclass is a key with its default."""
+    from hydra.core.config_store import ConfigStore
+
+    ConfigStore.instance().store(f"{name}_schema", schema)
+
+
 def typed(given: Any, schema: type[Schema]) -> Schema:
     """What Hydra composed, as a dataclass.
 

@@ -245,6 +245,8 @@ def test_typos_name_their_key(tmp_path):
     for word in ("epoch=3", "network.node.layer=3", "loss.kinds=triplet", "epochs=many", "data.pears=3", "geometry=pointnets"):
         with pytest.raises(InputError, match=word.split("=")[0].split(".")[-1]):
             from_words([word])
+    assert from_words(["network.geometry.width=32", "network.node.layers=1", "loss.easy=0.5"]).network.geometry.width == 32
+    assert from_words() == replace(Training(), network=from_words().network)  # the defaults have one home
     assert from_words(["data=procedural", "data.pairs=3"]).data == "procedural"
     path = tmp_path / "run.json"
     for text, said in (

@@ -121,7 +121,16 @@ def from_words(words: Sequence[str] = ()) -> Training:
     """
     from topomerge.config import compose
 
-    return composed(compose("train", with_recipe(), words))
+    return composed(compose("train", known(), words))
+
+
+def known() -> type[Training]:
+    """`with_recipe`, of which Hydra has been told the keys and defaults."""
+    from topomerge.config import register
+
+    schema = with_recipe()
+    register("train", schema)
+    return schema
 
 
 def with_recipe() -> type[Training]:
