@@ -1,133 +1,38 @@
 """Train the judge of doors (topomerge/extraction/judge.py) on simulated scans of training buildings.
 
-    python benchmarks/train_judge.py gather --scans 400      # cache/judge/*.npz, about 4 s of a core each; goes on where it was
-    python benchmarks/train_judge.py fit                     # writes topomerge/extraction/judge.json, prints the cross-validation
+    python benchmarks/training_plans.py --of judge --scans 300       # cache/plans/*.npz
+    python benchmarks/train_judge.py                                 # topomerge/extraction/judge.json; tells how right it is
 
-A scan is cut into regions as the extraction does. Two neighbouring regions are an example: 1 where most of them lie in different
+A plan is cut into regions as the extraction does. Two neighbouring regions are an example: 1 where most of them lie in different
 true rooms. Regions of one true room are then merged, as a perfect judge would, and what remains gives more examples: the judge is
-asked about half-merged rooms, too. Procedural buildings and, with TOPOMERGE_DATA set, real plans; never one of the evaluation
-split.
+asked about half-merged rooms, too. The network of the plans (`train_plan_network.py`) is trained first: the judge hears it.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import shapely
-from topomerge.datasets import splits
-from topomerge.datasets.building import Building
-from topomerge.datasets.buildings import KINDS, make_building
-from topomerge.datasets.difficulty import Difficulty
-from topomerge.datasets.erect import erect
-from topomerge.datasets.floorplans import Refusal, iter_plans
-from topomerge.datasets.scanner import scan
-from topomerge.datasets.walk import part
+from training_plans import files_of, load
 
-from topomerge.errors import InputError
-from topomerge.extraction.extract import PRESETS, navigable_volume
 from topomerge.extraction.passages import FEATURES, clearance_of, features, find_passages, regions_of
-from topomerge.extraction.plan import Plan, storey_plan
-from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
-from topomerge.extraction.voxels import voxelise
-from topomerge.types import Array, PointCloud
+from topomerge.extraction.plan import Plan
+from topomerge.extraction.segment import segment, without_furniture
+from topomerge.types import Array
 
-CACHE = Path("cache/judge")
 WEIGHTS = Path("topomerge/extraction/judge.json")
-SEED = 100_000  # of the first building; training seeds end at 799,999
-MOST_ROOMS = 16
 PURE = 0.7  # share of a region in its true room; regions between rooms are no example
-EDGES = (0.1, 0.1, 0.1, 0.08, 0.15)  # m
-LEVEL = 0.6  # m between a storey and the true floor
-
-
-def gather(scans: int) -> None:
-    """Examples of so many scans, a file each."""
-    CACHE.mkdir(parents=True, exist_ok=True)
-    plans = real_plans()
-    for seed in range(SEED, SEED + scans):
-        path = CACHE / f"{seed}.npz"
-        if path.exists():
-            continue
-        try:
-            x, y, source = examples(seed, plans)
-        except InputError as error:
-            print(f"{seed}: {error}", flush=True)
-            continue
-        np.savez(CACHE / "new.npz", x=x, y=y, source=source)
-        os.replace(CACHE / "new.npz", path)
-        print(f"{seed}: {len(y)} examples, {np.mean(y) if len(y) else 0:.2f} of them doors", flush=True)
-
-
-def real_plans() -> dict[str, list[Any]]:
-    """Training plans of apartments, schools and offices, if there are any."""
-    data = os.environ.get("TOPOMERGE_DATA", "")
-    out: dict[str, list[Any]] = {}
-    for source in ("r2v", "campus") if data else ():
-        wanted = set(splits.members("train", source))
-        found = iter_plans(Path(data) / splits.FOLDERS[source], wanted)
-        out[source] = [plan for _, plan in found if not isinstance(plan, Refusal)][:300]
-    return out
-
-
-def examples(seed: int, plans: dict[str, list[Any]]) -> tuple[Array, Array, str]:
-    """(n, 15) features, (n,) is it a door, and where the building is from."""
-    rng = np.random.default_rng(seed)
-    difficulty = draw_difficulty(rng)
-    source = str(rng.choice(["procedural", "r2v", "campus"], p=[0.6, 0.25, 0.15]))
-    if plans.get(source):
-        building = erect([plans[source][rng.integers(len(plans[source]))]], difficulty, rng, f"{source}-{seed}")
-    else:
-        building = make_building(str(rng.choice(KINDS)), seed, int(rng.choice([1, 1, 2])), difficulty)
-    rooms = None if len(building.rooms) <= MOST_ROOMS else part(building, MOST_ROOMS, rng)
-    cloud = scan(building, str(rng.choice(["tls", "depth", "lidar"])), rooms, seed)
-    visited = set(range(len(building.rooms)) if rooms is None else rooms)
-    storeys = plans_and_truth(building, cloud, EDGES[seed % len(EDGES)])
-    found = [regions_and_links(plan, truth, visited) for plan, truth in storeys]
-    x = [row for rows, _ in found for row in rows]
-    return np.array(x).reshape(-1, len(FEATURES)), np.array([y for _, ys in found for y in ys], bool), source
-
-
-def draw_difficulty(rng: np.random.Generator) -> Difficulty:
-    """From tidy to hard, all kinds at once."""
-    wide = {"ceiling_spread": 0.4, "furniture": 2.0, "clutter": 1.0, "glass": 0.2, "lamps": 1.0, "beams": 0.5, "columns": 1.0}
-    drawn = {name: float(rng.uniform(0, most)) for name, most in (wide | {"slopes": 0.5, "curved": 0.4}).items()}
-    ajar = float(rng.uniform(0.4, 0.9))
-    lintels = float(rng.choice([0, 0.5, 0.9, 1.0]))
-    return Difficulty(**drawn, open=ajar, half=float(rng.uniform(0, 1 - ajar)), lintels=lintels)
-
-
-def plans_and_truth(building: Building, cloud: PointCloud, edge: float) -> list[tuple[Plan, Array]]:
-    """The plan of each storey of a scan and the true room of each of its columns, -1 none."""
-    grid = voxelise(cloud.points, edge, [])
-    preset = PRESETS["default"]
-    navigable = navigable_volume(grid, preset)
-    storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, preset.stem_height + preset.body_height))
-    out = []
-    for k, height in enumerate(storeys["floor"]):
-        if not (storey == k).any():
-            continue
-        plan = storey_plan(grid, navigable, storey, k)
-        truth = np.full(plan.wall.shape, -1)
-        middles = (grid.origin[a] + (np.arange(n) + plan.low[a] + 0.5) * edge for a, n in enumerate(truth.shape))
-        x, y = np.meshgrid(*middles, indexing="ij")
-        for i, room in enumerate(building.rooms):
-            if abs(room.floor - height) <= LEVEL:
-                shape = shapely.Polygon(room.polygon)
-                shapely.prepare(shape)
-                truth[shapely.contains_xy(shape, x, y)] = i
-        out.append((plan, truth))
-    return out
 
 
 def regions_and_links(plan: Plan, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
     """Features and answers for the neighbouring regions of one plan, before and while those of one room are merged."""
+    chance = segment(plan)
+    plan = without_furniture(plan, chance)
     clearance = clearance_of(plan)
-    region = regions_of(clearance)
+    region = regions_of(plan, chance)
     count, rooms = int(region.max(initial=-1)) + 1, int(truth.max(initial=-1)) + 1
     votes = np.zeros((count, rooms + 1))
     known = region >= 0
@@ -137,7 +42,7 @@ def regions_and_links(plan: Plan, truth: Array, visited: set[int]) -> tuple[list
     area = votes.sum(axis=1) * plan.edge**2
     peak = np.zeros(count)
     np.maximum.at(peak, region[known], clearance[known])
-    links = dict(find_passages(plan, clearance, region))
+    links = dict(find_passages(plan, clearance, region, chance))
     x: list[Array] = []
     y: list[bool] = []
 
@@ -163,11 +68,12 @@ def regions_and_links(plan: Plan, truth: Array, visited: set[int]) -> tuple[list
 
 def fit(hidden: int = 16) -> None:
     """Train on all examples and write the weights; before that, print what three-fold cross-validation over scans says."""
-    files = sorted(CACHE.glob("[0-9]*.npz"))
-    parts = [np.load(f) for f in files]
-    x = np.concatenate([p["x"] for p in parts])
-    y = np.concatenate([p["y"] for p in parts]).astype(np.float32)
-    scan_of = np.repeat(np.arange(len(parts)), [len(p["y"]) for p in parts])
+    scans = [load(f) for f in files_of("judge")]
+    found = [[regions_and_links(e.plan, e.room, set(e.visited.tolist())) for e in scan] for scan in scans]
+    parts = [([x for xs, _ in of for x in xs], [y for _, ys in of for y in ys]) for of in found]
+    x = np.concatenate([np.array(xs).reshape(-1, len(FEATURES)) for xs, _ in parts])
+    y = np.concatenate([ys for _, ys in parts]).astype(np.float32)
+    scan_of = np.repeat(np.arange(len(parts)), [len(ys) for _, ys in parts])
     low, high = np.quantile(x, [0.005, 0.995], axis=0)
     x = np.clip(x, low, high)
     mean, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
@@ -218,8 +124,4 @@ def forward(z: Array, layers: list[tuple[Array, Array]]) -> Array:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("step", choices=["gather", "fit"])
-    parser.add_argument("--scans", type=int, default=400)
-    arguments = parser.parse_args()
-    gather(arguments.scans) if arguments.step == "gather" else fit()
+    fit()

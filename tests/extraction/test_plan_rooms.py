@@ -12,6 +12,7 @@ from topomerge.extraction.judge import door_probability
 from topomerge.extraction.partition import merge_regions
 from topomerge.extraction.passages import FEATURES, clearance_of, features, find_passages, regions_of
 from topomerge.extraction.plan import storey_plan
+from topomerge.extraction.segment import segment
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
 from topomerge.types import Array, PointCloud, TopometricMap
@@ -167,8 +168,9 @@ def test_passages_measure_the_door() -> None:
     _, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, 1.75))
     plan = storey_plan(grid, navigable, storey, 0)
     clearance = clearance_of(plan)
-    region = regions_of(clearance)
-    found = find_passages(plan, clearance, region)
+    chance = segment(plan)
+    region = regions_of(plan, chance)
+    found = find_passages(plan, clearance, region, chance)
     x = grid.origin[0] + (plan.low[0] + 0.5) * grid.edge
     at_the_door = [p for p in found.values() if abs(x + p.place[0] * grid.edge - 4.0) < 0.3]
     assert len(at_the_door) == 1

@@ -20,7 +20,7 @@ FILE = "judge.json"
 
 
 def door_probability(x: Array) -> Array:
-    """(n,) probability that a door parts the two sides of each narrowing, from its (n, 11) features."""
+    """(n,) probability that a door parts the two sides of each narrowing, from its (n, 17) features."""
     weights = _weights()
     h = (np.clip(x, weights["low"], weights["high"]) - weights["mean"]) / weights["scale"]
     layers = weights["layers"]

@@ -11,7 +11,7 @@ import numpy as np
 from topomerge.extraction.passages import Passage, features
 from topomerge.types import Array
 
-Judge = Callable[[Array], Array]  # (n, 11) features -> (n,) probability that a door parts the two
+Judge = Callable[[Array], Array]  # (n, 17) features -> (n,) probability that a door parts the two
 Pair = tuple[int, int]
 
 

@@ -20,6 +20,7 @@ from topomerge.types import Array
 PROMINENCE = 0.1  # m: lower peaks of the clearance are noise of the walls
 AROUND = 1.2  # m: what lies so near to a narrowing is looked at
 LINTEL = 0.2  # m below the ceiling
+BARRIER = 0.5  # probability of a wall, a doorway or a shut door: what is more likely one parts regions
 
 FEATURES = (
     "width",  # m, at the narrowest
@@ -35,6 +36,8 @@ FEATURES = (
     "step",  # m between the two ceilings
     "jamb",  # m by which the wall goes on in line with the narrowing, on the shorter side, up to 1
     "longer_jamb",
+    "doorway",  # probability of a doorway along the opening, by the network of the plans (segment.py)
+    "boundary",  # of a wall, a doorway or a shut door
     "small",  # log of the smaller side's area, m2
     "large",
 )
@@ -47,7 +50,7 @@ class Passage:
     place: tuple[int, int]  # element of the plan
     width: float  # m
     across: tuple[float, float]  # unit vector from jamb to jamb
-    measured: tuple[float, ...]  # the features 3 to 12
+    measured: tuple[float, ...]  # the features 3 to 14
 
 
 def clearance_of(plan: Plan) -> Array:
@@ -55,15 +58,32 @@ def clearance_of(plan: Plan) -> Array:
     return np.asarray(edt.edt(plan.inside.view(np.uint8), black_border=True, parallel=1), np.float64) * plan.edge
 
 
-def regions_of(clearance: Array) -> Array:
-    """(nx, ny) int64 basin of each open column, -1 elsewhere."""
+def regions_of(plan: Plan, chance: Array) -> Array:
+    """(nx, ny) int64 basin of each open column, -1 elsewhere.
+
+    What the network takes for a wall or a doorway parts basins as walls do: openings as wide as the room have no narrowing, and
+    sparse scans have holes in their walls. Its columns then go to the nearest basin.
+
+    Args:
+        chance: (nx, ny, 5) what probably stands in each column, see `segment.CLASSES`.
+    """
+    barrier = plan.inside & (chance[..., 1:4].sum(axis=-1) > BARRIER)
+    clearance = edt.edt((plan.inside & ~barrier).view(np.uint8), black_border=True, parallel=1) * plan.edge
     order = np.argsort(-clearance, axis=None, kind="stable")
     order = order[clearance.ravel()[order] > 0]
-    return np.asarray(watershed(clearance, order, PROMINENCE))
+    region = np.asarray(watershed(np.asarray(clearance, np.float64), order, PROMINENCE))
+    if not barrier.any() or not (region >= 0).any():
+        return region
+    nearest = ndimage.distance_transform_edt(region < 0, return_distances=False, return_indices=True)
+    return np.where(barrier, region[tuple(nearest)], region)
 
 
-def find_passages(plan: Plan, clearance: Array, region: Array) -> dict[tuple[int, int], Passage]:
-    """The widest connection of each pair of neighbouring regions."""
+def find_passages(plan: Plan, clearance: Array, region: Array, chance: Array) -> dict[tuple[int, int], Passage]:
+    """The widest connection of each pair of neighbouring regions.
+
+    Args:
+        chance: (nx, ny, 5) what probably stands in each column, see `segment.CLASSES`.
+    """
     meet = contacts(region, clearance)
     if not len(meet):
         return {}
@@ -75,14 +95,23 @@ def find_passages(plan: Plan, clearance: Array, region: Array) -> dict[tuple[int
     thick = ndimage.binary_dilation(plan.wall, np.ones((3, 3)))  # walls are not quite straight
     nearest = ndimage.distance_transform_edt(plan.inside, return_distances=False, return_indices=True)
     low = plan.clear < plan.ceiling - LINTEL  # nan: no
+    layers = low, np.ascontiguousarray(chance[..., 2]), chance[..., 1:4].sum(axis=-1)
     return {
-        (int(a), int(b)): _passage(plan, clearance, region, nearest, thick, low, int(a), int(b), int(at))
+        (int(a), int(b)): _passage(plan, clearance, region, nearest, thick, layers, int(a), int(b), int(at))
         for a, b, at in meet[first]
     }
 
 
 def _passage(
-    plan: Plan, clearance: Array, region: Array, nearest: Array, thick: Array, low: Array, a: int, b: int, at: int
+    plan: Plan,
+    clearance: Array,
+    region: Array,
+    nearest: Array,
+    thick: Array,
+    layers: tuple[Array, Array, Array],
+    a: int,
+    b: int,
+    at: int,
 ) -> Passage:
     x, y = divmod(at, plan.wall.shape[1])
     e, here = plan.edge, float(clearance[x, y])
@@ -100,9 +129,9 @@ def _passage(
     opens = sorted(max(float(side.max(initial=narrow)), narrow) - narrow for side in (across[:steps], across[steps + 1 :]))
     length = float(((across > 0) & (across <= narrow + 0.15)).sum()) * e
     lintel, seen, step, growth = _above(plan, clearance, region, a, b, x, y)
-    cover = crossing.cover(low, mx, my, dx, dy, half, half, int(0.3 / e))
+    cover, doorway, boundary = (float(crossing.cover(v, mx, my, dx, dy, half, half, int(0.3 / e))) for v in layers)
     width = min((2 * half + 1) * e, 2 * here + 2 * e)
-    return Passage((x, y), width, (dx, dy), (growth, *opens, length, lintel, cover, seen, step, *jambs))
+    return Passage((x, y), width, (dx, dy), (growth, *opens, length, lintel, cover, seen, step, *jambs, doorway, boundary))
 
 
 def _above(plan: Plan, clearance: Array, region: Array, a: int, b: int, x: int, y: int) -> tuple[float, float, float, float]:
@@ -127,7 +156,7 @@ def _above(plan: Plan, clearance: Array, region: Array, a: int, b: int, x: int, 
 
 
 def features(passage: Passage, peaks: tuple[float, float], areas: tuple[float, float]) -> Array:
-    """(15,) what speaks for a door, see `FEATURES`; the sides are given by their greatest clearance (m) and their area (m2)."""
+    """(17,) what speaks for a door, see `FEATURES`; the sides are given by their greatest clearance (m) and their area (m2)."""
     half = passage.width / 2
     sides = half / max(min(peaks), half), half / max(max(peaks), half)
     small, large = (float(np.log(max(a, 0.1))) for a in sorted(areas))

@@ -14,6 +14,7 @@ from topomerge.extraction.partition import Pair, merge_regions
 from topomerge.extraction.passages import clearance_of, find_passages, regions_of
 from topomerge.extraction.plan import Plan, storey_plan
 from topomerge.extraction.rooms import Floor
+from topomerge.extraction.segment import Told, segment, without_furniture
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling, lowest_of_column
 from topomerge.kernels.columns import hollow_below
 from topomerge.types import Array, VoxelGrid
@@ -53,13 +54,18 @@ def rooms_of_plans(grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: f
     parts: list[tuple[Array, ...]] = []
     owners: list[Array] = []
     seen: list[Array] = []
+    told: list[Told] = []
     probability: dict[Pair, float] = {}
     rooms = areas = 0
     for k in range(int(storey.max(initial=-1)) + 1):
         if not (level == k).any():
             continue
         plan = storey_plan(coarse, walk, level, k)
-        room, area, owner, doors = _partition(coarse, plan, door, narrow, k > 0)
+        chance = segment(plan)
+        plan = without_furniture(plan, chance)
+        corner = coarse.origin + np.append(plan.low, np.median(plan.base)) * plan.edge
+        told.append(Told(chance, corner[:2], plan.edge, float(corner[2])))
+        room, area, owner, doors = _partition(coarse, plan, chance, door, narrow, k > 0)
         _label_cells(label, grid, plan, np.where(room >= 0, room + rooms, -1), factor)
         parts.append(_cells_of(plan, navigable, storey == k, room, area, factor, k, rooms, areas))
         probability |= {(a + rooms, b + rooms): p for (a, b), p in doors.items()}
@@ -67,19 +73,19 @@ def rooms_of_plans(grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: f
         seen.append(outline_seen(room, plan.inside, plan.wall, plan.edge))
         rooms, areas = rooms + int(room.max(initial=-1)) + 1, areas + len(owner)
     floor = _floor(grid, storeys, parts, owners, label, probability)
-    return replace(floor, completeness=np.concatenate(seen)) if seen else floor
+    return replace(floor, completeness=np.concatenate(seen), told=tuple(told)) if seen else floor
 
 
 def _partition(
-    grid: VoxelGrid, plan: Plan, door: float, narrow: float, above_another: bool
+    grid: VoxelGrid, plan: Plan, chance: Array, door: float, narrow: float, above_another: bool
 ) -> tuple[Array, Array, Array, dict[Pair, float]]:
     """Room and area of each column (numbered from 0), room of each area, and how likely doors part two rooms."""
     clearance = clearance_of(plan)
-    region = regions_of(clearance)
+    region = regions_of(plan, chance)
     if above_another:
         region = _without_ceilings(grid, plan, region)
     found = merge_regions(
-        region, clearance, find_passages(plan, clearance, region), plan.edge, door_probability, door, narrow, LEAST_ROOM
+        region, clearance, find_passages(plan, clearance, region, chance), plan.edge, door_probability, door, narrow, LEAST_ROOM
     )
     size = np.bincount(found.room[region[region >= 0]], minlength=len(found.room)) * plan.edge**2
     widest = np.zeros(len(size))

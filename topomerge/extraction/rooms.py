@@ -8,6 +8,7 @@ import numpy as np
 
 from topomerge.extraction.components import connected_components, spread_labels
 from topomerge.extraction.convolution import moore
+from topomerge.extraction.segment import Told
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.types import Array, VoxelGrid
 
@@ -26,6 +27,7 @@ class Floor:
         body: m, how much wider than its cells a passage is: where they tell where a body's middle may be, the body's width.
         probability: that a door parts two rooms, as far as it is known.
         completeness: (R,) share of each room's outline at which a wall was seen, where the plans tell it.
+        told: what the network says of the storeys' plans.
     """
 
     cells: VoxelGrid
@@ -38,6 +40,7 @@ class Floor:
     body: float = 0.0
     probability: dict[tuple[int, int], float] = field(default_factory=dict)
     completeness: Array | None = None
+    told: tuple[Told, ...] = ()
 
 
 def split_rooms(grid: VoxelGrid, labels: Array, least_volume: float, absorb: bool = False) -> Array:

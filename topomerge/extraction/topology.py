@@ -8,6 +8,7 @@ from scipy import ndimage
 from topomerge.extraction.completeness import GLIMPSED, completeness
 from topomerge.extraction.doors import find_edges
 from topomerge.extraction.rooms import Floor
+from topomerge.extraction.segment import through_wall
 from topomerge.extraction.storeys import ceiling_height, floor_to_ceiling, lowest_of_column
 from topomerge.types import AREA_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid
 
@@ -29,6 +30,8 @@ def topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> Topomet
     above = floor_to_ceiling(grid, floor.cells, body_height)
     rooms = _measure(grid, room, floor, label, above, np.flatnonzero(used))
     edges = find_edges(floor, label, rooms["storey"], above)
+    level = np.isin(edges["kind"], ("door", "opening"))
+    edges = edges[[not (flat and through_wall(floor.told, e["centre"])) for flat, e in zip(level, edges, strict=True)]]
     for edge in edges:
         a, b = np.flatnonzero(used)[edge["rooms"]].tolist()
         edge["confidence"] = floor.probability.get((min(a, b), max(a, b)), 1.0)
