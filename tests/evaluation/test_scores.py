@@ -64,6 +64,7 @@ def test_rank_counts_of_both_directions() -> None:
     cost[3, 2] = 2.0  # right but dear
     found = rank_counts(kept(), cost)
     assert found["queries"] == 4 + 3
+    assert found["chance"] == pytest.approx(4 / 4 + 4 / 5)  # four pairs of rooms, among four of b, and among five of a
     assert found["first"] == 3 + 2  # rooms 0, 1 and 2 of a; rooms 0 and 1 of b
     assert found["five"] == 7
     assert found["reciprocal"] == pytest.approx(3 + 2 + 1 / 4 + 1 / 5)

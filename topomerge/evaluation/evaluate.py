@@ -160,9 +160,14 @@ def _about(ranks: list[Row], merges: list[Row], settings: Evaluation, command: s
     pairs, buildings = len({r["pair"] for r in rows}), len({r["building"] for r in rows})
     first = next(iter({r["variant"]: None for r in ranks}), "")
     queries = [sum(r[f"queries{g}"] for r in ranks if r["variant"] == first) for g in ("", "_twin")]
+    chance = sum(r["chance"] for r in ranks if r["variant"] == first) / max(queries[0], 1)
     text = (
         f"{pairs} pairs of maps, {buildings} buildings"
-        + (f", {queries[0]} rooms with a partner, {queries[1]} of them with a twin" if ranks else "")
+        + (
+            f", {queries[0]} rooms with a partner, {queries[1]} of them with a twin; by chance recall@1 is {chance:.2f}"
+            if ranks
+            else ""
+        )
         + ". In brackets 95 % intervals: whole buildings drawn again. A match is right when both rooms are the same true room; "
         "what should be found are true rooms that both maps have. Twin: a near-identical other room in the other map."
     )

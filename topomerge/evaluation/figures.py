@@ -39,6 +39,11 @@ def _figure(columns: int) -> tuple[Any, Any]:
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
+def _legend(ax: Any) -> None:
+    """Below the axes, where it hides nothing."""
+    ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2, frameon=False)
+
+
 def _of(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
     out: dict[str, list[Row]] = {}
     for row in rows:
@@ -72,7 +77,7 @@ def _reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[
                             str(n), (x, r), fontsize=7, color=line.get_color(), xytext=(3, -9), textcoords="offset points"
                         )
         ax.set(title=title, xlabel="probability told", ylabel="share right", xlim=(0, 1), ylim=(0, 1.02))
-        ax.legend(fontsize=7)
+        _legend(ax)
     return figure
 
 
@@ -99,7 +104,7 @@ def _overlap(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]
             ends = np.array([[max(v.value - v.low, 0), max(v.high - v.value, 0)] for v in values]).T
             ax.errorbar(x, mid, yerr=np.nan_to_num(ends), fmt="o-", ms=4, lw=1, capsize=2, label=name)
         ax.set(title=title, xlabel="share of rooms in common", xticks=range(len(bins)), xticklabels=bins, ylim=(0, 1.02))
-        ax.legend(fontsize=7)
+        _legend(ax)
     return figure
 
 
@@ -131,7 +136,7 @@ def _precision_recall(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequ
                 dot = ax.plot(*v, mark, ms=5, color=color, label=f"{name}, {method}")
                 color = dot[0].get_color()
     ax.set(xlabel="recall of rooms in common", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
-    ax.legend(fontsize=6, ncols=2)
+    _legend(ax)
     return figure
 
 
@@ -155,7 +160,7 @@ def _robustness(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[R
         ax.set(title=change, xlabel=LABELS[change], ylabel="F1", ylim=(0, 1.02))
         if change == "density":
             ax.set_xscale("log")
-        ax.legend(fontsize=6)
+        _legend(ax)
     return figure
 
 

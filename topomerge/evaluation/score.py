@@ -139,16 +139,18 @@ def ranks_of(cost: Array, matches: Array) -> tuple[Array, Array]:
 
 def rank_counts(kept: KeptPair, cost: Array) -> Row:
     """`queries`: rooms of either map with a true partner in the other; `first`, `five`: whose partner ranks first, within five;
-    `reciprocal`: sum of 1 / rank; each also with and without a twin, and (`_whole`) where neither room was looked into only."""
-    rank, twin, whole = [], [], []
+    `reciprocal`: sum of 1 / rank; each also with and without a twin, and (`_whole`) where neither room was looked into only.
+    `chance`: first ones to be expected of a draw."""
+    rank, twin, whole, chance = [], [], [], 0.0
     for side, c, m in ((0, cost, kept.matches), (1, cost.T, kept.matches[:, ::-1])):
         rooms, found = ranks_of(c, m)
         rank.append(found)
         twin.append(kept.twin[side][rooms])
         entered = m[~kept.glimpsed[side][m[:, 0]] & ~kept.glimpsed[1 - side][m[:, 1]], 0]
         whole.append(np.isin(rooms, entered))
+        chance += len(m) / max(c.shape[1], 1)
     r, t, w = np.concatenate(rank), np.concatenate(twin).astype(bool), np.concatenate(whole)
-    out: Row = {"pairs": 1}
+    out: Row = {"pairs": 1, "chance": chance}
     for name, some in zip((*GROUPS, WHOLE), (t | True, t, ~t, w), strict=True):
         out[f"queries{name}"] = int(some.sum())
         out[f"first{name}"] = int((r[some] == 1).sum())
