@@ -225,7 +225,8 @@ def in_step(data: bytes, rng: Rng) -> bytes:
 
 
 SPECIAL: dict[str, Callable[[bytes, Rng], bytes]] = {
-    ".npz": in_zip, ".tmap": in_zip, ".e57": in_pages, ".png": in_png, ".glb": in_json, ".gltf": in_json, ".json": in_json, ".ifc": in_step
+    ".npz": in_zip, ".tmap": in_zip, ".e57": in_pages, ".png": in_png, ".glb": in_json, ".gltf": in_json, ".json": in_json,
+    ".ifc": in_step,
 }  # fmt: skip
 
 

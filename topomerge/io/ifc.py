@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.io.apart import read_apart
 from topomerge.io.mesh import sample
 from topomerge.io.piece import Options, Piece, damaged
 from topomerge.io.step import check_references
@@ -26,11 +28,21 @@ WELD = 1e-3  # m, corners closer than this are one
 
 
 def read(path: Path, options: Options) -> Iterator[Piece]:
-    """The true rooms, then points on every built element, in the order of their ids."""
-    import ifcopenshell
+    """The true rooms, then points on every built element, in the order of their ids.
 
+    The library is in a process of its own: a reference to an entity of another kind can make it break down.
+    """
+    if find_spec("ifcopenshell") is None:
+        raise ImportError("no ifcopenshell", name="ifcopenshell")
     _check_ends(path)
     check_references(path)
+    yield from read_apart("ifc", "an IFC model", path, options)
+
+
+def read_here(path: Path, options: Options) -> Iterator[Piece]:
+    """The same in this process."""
+    import ifcopenshell
+
     try:
         model = ifcopenshell.open(str(path))
     except ifcopenshell.Error as error:
