@@ -214,7 +214,8 @@ def near(mask: Array, reach: float) -> Array:
 
 def storeys_of(cloud: PointCloud, edge: float) -> list[tuple[Plan, Array]]:
     """The plans of a scan as the extraction makes them, and the places (nx, ny, 3) of their columns' floors."""
-    p, known = PRESETS["default"], {"warnings": []}
+    p = PRESETS["default"]
+    known: dict[str, Any] = {"warnings": []}
     grid = _upright(without_gaps(_grid(cloud, edge, known), p.sparse, []), known)
     grid, navigable = _standing(grid, p, known)
     storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, p.stem_height + p.body_height))
