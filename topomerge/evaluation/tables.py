@@ -159,10 +159,13 @@ def merging(merges: Sequence[Row], key: str, settings: Evaluation) -> Table:
     """Share of pairs merged right, refused and merged wrongly, by group."""
     rows = []
     for name, some in _variants(merges).items():
-        for group, these in {"all": some, **(by(some, key) if key else {})}.items():
+        groups = {"all": some, **(by(some, key) if key else {})}
+        if key == "area":
+            groups["≥ 80"] = [r for r in some if r["large"]]
+        for group, these in groups.items():
             pairs, able = len({r["pair"] for r in these}), sum(r["mergeable"] for r in these)
             cells = [cell(value(these, m, settings.rounds), m == "merged") for m in MERGING]
-            false, took = sum(r["false"] for r in these), np.median([r["seconds"] for r in these])
+            false, took = sum(r["false"] for r in these), np.median([r["seconds"] for r in these] or [0.0])
             rows.append([name, group, str(pairs), str(able), *cells, str(false), f"{took:.1f}"])
     head = ["descriptor", key or "pairs", "pairs", "mergeable", *(NAMES[m] for m in MERGING), "merged wrong", "s a pair"]
     title = "Merges: of the pairs that have something in common, within 0.5 m and 5°"
