@@ -15,15 +15,15 @@ from omegaconf import DictConfig
 from topomerge.config import typed
 from topomerge.errors import InputError
 from topomerge.training.fit import fit
-from topomerge.training.settings import Training, composed, known
+from topomerge.training.settings import Training, composed, known, with_recipe
 
-SCHEMA = known()
+known()
 FLAGS = {"--overfit": "overfit=true", "--resume": "resume=true"}
 
 
 def settings_of(config: DictConfig) -> Training:
     """The typed settings of one job; that of a sweep gets a folder of its own."""
-    settings = composed(typed(config, SCHEMA))
+    settings = composed(typed(config, with_recipe()))
     job = HydraConfig.get()
     if job.mode == RunMode.MULTIRUN:
         settings.runs, settings.name = str(job.sweep.dir), str(job.sweep.subdir)

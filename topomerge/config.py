@@ -50,7 +50,8 @@ def typed(given: Any, schema: type[Schema]) -> Schema:
     from omegaconf.errors import OmegaConfBaseException
 
     try:
-        merged: Any = OmegaConf.merge(OmegaConf.structured(schema), given)
+        plain = OmegaConf.to_container(given, resolve=True)  # without types: another process has its own copy of the schema
+        merged: Any = OmegaConf.merge(OmegaConf.structured(schema), plain)
         settings: Schema = OmegaConf.to_object(merged)  # type: ignore[assignment]
     except OmegaConfBaseException as error:
         raise InputError(_one_line(error)) from error
