@@ -17,6 +17,7 @@ from topomerge.datasets.recipe import check as check_recipe
 from topomerge.config import compose
 from topomerge.errors import InputError
 from topomerge.evaluation import predict as predicting
+from topomerge.evaluation.describe import bare
 from topomerge.evaluation.evaluate import claim, evaluate
 from topomerge.evaluation.settings import Evaluation, Pairs, check, difference, folder_of, told, variants
 from topomerge.evaluation.tables import Table, write_section
@@ -96,6 +97,12 @@ def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
     assert before["run"]["a"] != before["run"]["b"]
     (tmp_path / "b" / "best" / "weights.safetensors").write_bytes(b"three")
     assert difference(before, told(settings)).startswith("run.b")
+
+
+def test_comments_do_not_change_code() -> None:
+    text = 'X = 1\n\n\ndef f(x):\n    """Twice."""\n    return x + X\n'
+    assert bare(text) == bare(text.replace('"""Twice."""', "# once more\n    'no'"))
+    assert bare(text) != bare(text.replace("x + X", "x - X"))
 
 
 def test_the_first_difference_is_told() -> None:

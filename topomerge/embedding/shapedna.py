@@ -26,8 +26,8 @@ def shapedna(
         normalise: ``"weyl"``: by the slope of value over number, so that size falls out; ``"first"``: by the first one;
             ``"none"``: 1/m2 of the surface, no unit of the graph.
         spacing: m; the surface is described by one point in each cube of this size, so that walls two cells thick are one.
-        largest: cells of the graph, or points of the surface; of more, coarser ones are taken: the time grows faster than they do,
-            and the smallest eigenvalues hardly change.
+        largest: cells of the graph, or points of the surface; of more, coarser ones are taken: the time grows faster than their
+            number, and the smallest eigenvalues hardly change.
 
     Raises:
         InputError: an option is unknown, or below its least value.
@@ -80,8 +80,8 @@ def thinned(points: Array, spacing: float) -> Array:
 
 
 def _firsts(cells: Array) -> tuple[Array, Array]:
-    """First row of each different cell (n, 3), in the order of x, y, z, and the number of its cell for each row: as `np.unique` of
-    rows, which takes ten times as long."""
+    """First row of each different cell (n, 3), in the order of x, y, z, and the number of its cell for each row: as `np.unique`
+    of rows, which takes ten times as long."""
     low = cells.min(axis=0)
     wide = (np.ptp(cells, axis=0) + 1).astype(np.int64)
     x, y, z = (cells - low).astype(np.int64).T

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import time
@@ -29,12 +30,22 @@ UNTRAINED = (
 
 @cache
 def code(*patterns: str) -> str:
-    """Digest of the code that something comes from: files of the package, by pattern."""
+    """Digest of the code that something comes from: files of the package, by pattern, without comments and docstrings."""
     whole = hashlib.sha256()
     for pattern in patterns:
         for file in sorted(Path(topomerge.__file__).parent.glob(pattern)):
-            whole.update(file.read_bytes())
+            whole.update(bare(file.read_text(encoding="utf-8")).encode() if file.suffix == ".py" else file.read_bytes())
     return whole.hexdigest()[:12]
+
+
+def bare(source: str) -> str:
+    """Python without what it does not do: comments, blank lines, docstrings and other texts that nobody reads."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [b for b in body if not (isinstance(b, ast.Expr) and isinstance(b.value, ast.Constant))]  # type: ignore[attr-defined]
+    return ast.dump(tree)
 
 
 @cache
