@@ -17,7 +17,7 @@ from topomerge.embedding.room_cells import joined, neighbours
 from topomerge.errors import InputError
 from topomerge.types import TopometricMap
 
-FAST = {"engineered": {}, "shapedna": {"values": 8, "spacing": 0.5}, "feather": {}}
+FAST = {"engineered": {}, "shapedna": {"values": 8, "spacing": 0.5}, "feather": {}, "learned": {}}
 
 
 @pytest.fixture(scope="module")
