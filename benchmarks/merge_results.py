@@ -79,12 +79,13 @@ def by(rows: Sequence[Row], key: Callable[[Row], str], groups: Sequence[str], na
 
 def same_pairs(rows: Sequence[Row], method: str) -> str:
     """Our own beside a peer on the pairs that the peer was run on."""
-    names = {r["name"] for r in rows if r["method"] == method} & {r["name"] for r in rows if r["method"] == "ours"}
-    pairs = [r for r in rows if r["name"] in names and kind_of(r) in BINS]
+    names = {r["name"] for r in rows if r["method"] == method}
+    bins = {r["name"]: kind_of(r) for r in rows if r["method"] == "ours" and r["name"] in names}
+    pairs = [r for r in rows if bins.get(r["name"]) in BINS]
     out = []
     for group in BINS:
         for m in ("ours", method):
-            mine = [r for r in pairs if r["method"] == m and kind_of(r) == group]
+            mine = [r for r in pairs if r["method"] == m and bins[r["name"]] == group]
             if mine:
                 out.append([f"{group} m²", NAMES[m], *measures(mine)])
     return table(["in common", "method", *HEADS], out)
@@ -154,6 +155,21 @@ def _group(row: Row) -> str:
     return f"{row['source']} {' to '.join(sorted(set(row['sensors']), reverse=True))}"
 
 
+REAL = (
+    "`python benchmarks/register.py real 100 ours`. Halmstad's scale is free (`--scale free`); the literature's figure for its maps "
+    "to layouts is 80.4 % success, its best alternative 31.9 % (four environments; two of them are here). Nothing was fitted to "
+    "these pairs, but a fault was found on them: poses were not drawn back from beyond a map's outer walls, so that a free scale "
+    "ran away. Before that and the plans' lattice were mended, 17 of the 20 Halmstad pairs (5 of 8 to the drawings), 1 of 3 STRANDS "
+    "and all but one CARMEN pair were right. Drawings are placed right and mostly not believed: no drawing was among the training "
+    "pairs, and they lack the furniture and ceilings that the calibration asks for. Not run in this table: the rest of CARMEN, IFC."
+)
+BEFORE = (
+    "The threshold was chosen on left-out training pairs (79 % of those that share 80 m² believed; 4 of 107 hard negatives). The "
+    "peers' rows are of an earlier run on the same cached pairs, not of this one. 74 of the pairs had been run once before the "
+    "fault named under *Real pairs* was mended."
+)
+
+
 def section() -> str:
     """The whole section."""
     rows, strangers = rows_of("results_test.jsonl"), rows_of("strangers_test.jsonl")
@@ -169,16 +185,17 @@ def section() -> str:
         "every eighth with glass walls. Right: within 0.5 m and 5° in the middle of what both maps saw (slices: horizontally); "
         f"believed: probability {THRESHOLD} or more. In brackets 95 % intervals over buildings. Seconds of processor. "
         "KISS-Matcher believes what it calls valid; Open3D has no verdict, so that all its answers count as believed.",
+        BEFORE,
         by(mine, kind_of, ("<40", *BINS), "m² in common"),
         f"Sharing 80 m² or more: {len(large)} pairs, right {share(large, good)} %, right and believed {kept} %; by sensors:",
         by(large, lambda r: "-".join(sorted(r["sensors"])), sensors, "sensors"),
     ]
     for method in ("kiss02", "kiss03", "fpfh", "fgr"):
         if any(r["method"] == method for r in rows):
-            parts += [f"Beside {NAMES[method]}, on the same pairs:", same_pairs(rows, method)]
+            parts += [f"Beside {NAMES[method]}, on the pairs that it was run on:", same_pairs(rows, method)]
     parts += ["### Pairs that must not merge", negatives(mine, strangers)]
     parts += ["### Is what it tells so?", reliability(mine, strangers)]
-    parts += ["### Real pairs", real(rows_of("results_real.jsonl"))]
+    parts += ["### Real pairs", REAL, real(rows_of("results_real.jsonl"))]
     return "\n\n".join(parts)
 
 
