@@ -201,6 +201,7 @@ def test_an_embedder_of_maps():
     rows = describe(map)
     assert rows.shape == (len(map.rooms), 64) and rows.dtype == np.float64 and np.array_equal(rows, describe(map))
     assert np.array_equal(rows, describe.graph(to_graph(map))[0]) and describe.matchability(map).shape == (len(map.rooms),)
+    assert describe(building(1, 1)).shape == (len(building(1, 1).rooms), 64)
     ours, theirs = describe.probabilities(map, map)
     assert np.allclose(ours.sum(axis=1), 1) and ours.shape == (len(map.rooms), len(map.rooms) + 1) and np.allclose(ours, theirs)
 

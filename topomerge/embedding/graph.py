@@ -84,7 +84,8 @@ def from_arrays(arrays: Mapping[str, Array]) -> Data:
     import torch
     from torch_geometric.data import Data
 
-    values: dict[str, Any] = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
+    # Copies: of a map with one room, views of its table count as contiguous with steps that torch refuses.
+    values: dict[str, Any] = {name: torch.from_numpy(np.array(array, order="C")) for name, array in arrays.items()}
     return Data(**values, num_nodes=len(arrays["x"]))
 
 
