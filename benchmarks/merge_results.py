@@ -156,17 +156,18 @@ def _group(row: Row) -> str:
 
 
 REAL = (
-    "`python benchmarks/register.py real 100 ours`. Halmstad's scale is free (`--scale free`); the literature's figure for its maps "
-    "to layouts is 80.4 % success, its best alternative 31.9 % (four environments; two of them are here). Nothing was fitted to "
-    "these pairs, but a fault was found on them: poses were not drawn back from beyond a map's outer walls, so that a free scale "
-    "ran away. Before that and the plans' lattice were mended, 17 of the 20 Halmstad pairs (5 of 8 to the drawings), 1 of 3 STRANDS "
-    "and all but one CARMEN pair were right. Drawings are placed right and mostly not believed: no drawing was among the training "
-    "pairs, and they lack the furniture and ceilings that the calibration asks for. Not run in this table: the rest of CARMEN, IFC."
+    "`python benchmarks/register.py real 100 ours`. Halmstad's scale is free (`--scale free`); the literature's figure for "
+    "its maps to layouts is 80.4 % success, its best alternative 31.9 % (four environments; two of them are here). Nothing "
+    "was fitted to these pairs, but a fault was found on them: poses were not drawn back from beyond a map's outer walls, "
+    "so that a free scale ran away. Before that and the plans' lattice were mended, 17 of the 20 Halmstad pairs (5 of 8 to "
+    "the drawings), 1 of 3 STRANDS and all but one CARMEN pair were right. Drawings are placed right and mostly not "
+    "believed: no drawing was among the training pairs, and they lack the furniture and ceilings that the calibration asks "
+    "for. Not run in this table: the rest of CARMEN, IFC."
 )
 BEFORE = (
-    "The threshold was chosen on left-out training pairs (79 % of those that share 80 m² believed; 4 of 107 hard negatives). The "
-    "peers' rows are of an earlier run on the same cached pairs, not of this one. 74 of the pairs had been run once before the "
-    "fault named under *Real pairs* was mended."
+    "The threshold was chosen on left-out training pairs (79 % of those that share 80 m² believed; 4 of 107 hard "
+    "negatives). The peers' rows are of an earlier run on the same cached pairs, not of this one. 74 of the pairs had been "
+    "run once before the fault named under *Real pairs* was mended."
 )
 
 

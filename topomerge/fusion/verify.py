@@ -174,7 +174,8 @@ class Side:
         at = np.array([*pose.translation[:2], pose.yaw, np.log(pose.scale)])
         v = on.view
         seen = (on.kind, v.to_wall, v.to_any, v.face, on.open, on.bits, v.plan.origin, v.plan.cell)
-        found: Array = align.tally(*self._some(every), *seen, at, NEAR, MARGIN)
+        points, kinds, faces, inner, filled = self._some(every)
+        found: Array = align.tally(points, kinds, faces, inner, filled, *seen, at, NEAR, MARGIN)
         return found * self.weight * every
 
 
