@@ -50,7 +50,8 @@ def test_a_longer_end_fits_only_when_it_is_moved(points):
 
 
 def test_furniture_in_place_is_counted(points):
-    empty, other = office(furnished=False).points(), Scene().box(3, 4, 0, 4.4, 4.8, 0.75).box(21.5, 5, 0, 22.9, 5.8, 0.75).points()
+    empty = office(furnished=False).points()
+    other = Scene().box(3, 4, 0, 4.4, 4.8, 0.75).box(21.5, 5, 0, 22.9, 5.8, 0.75).points()
     moved = np.concatenate([empty, other])
     assert seen(points, points)["in_place"] > 5 > seen(points, moved)["in_place"] + 4
     assert seen(points, empty)["pieces"] == pytest.approx(0, abs=0.5)  # what one map does not show at all says nothing

@@ -54,7 +54,7 @@ def _walls(here: View, there: View, move: Sim3) -> tuple[Array, float]:
     points = here.walls
     at = move.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
     cells = np.floor((at - there.plan.origin) / there.plan.cell).astype(np.int64)
-    inside: Array = ((cells >= 0) & (cells < there.plan.wall.shape)).all(axis=1)
+    inside = np.asarray(((cells >= 0) & (cells < there.plan.wall.shape)).all(axis=1))
     i, j = np.where(inside[:, None], cells, 0).T
     near = inside & (there.to_wall[i, j] <= NEAR)
     known = inside & (near | (there.kind[i, j] != 0))
