@@ -257,9 +257,23 @@ def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], l
 
 
 def hold_out(pairs: Sequence[GraphPair]) -> tuple[list[GraphPair], list[GraphPair]]:
-    """A tenth of the buildings is kept from training, chosen by a hash of their names."""
-    held = [hashlib.sha256(str(p.about.get("building")).encode()).digest()[0] < 26 for p in pairs]
-    return [p for p, h in zip(pairs, held, strict=True) if not h], [p for p, h in zip(pairs, held, strict=True) if h]
+    """A tenth of the pairs, by whole buildings in the order of a hash of their names, is kept from training; at least one of
+    them has rooms that match.
+
+    Raises:
+        InputError: no pair has any, or all that have are of one building.
+    """
+    buildings = [str(p.about.get("building")) for p in pairs]
+    held: set[str] = set()
+    for name in sorted(set(buildings), key=lambda name: hashlib.sha256(name.encode()).digest()):
+        watched = [p for p, of in zip(pairs, buildings, strict=True) if of in held]
+        if 10 * len(watched) >= len(pairs) and any(len(p.matches) for p in watched):
+            break
+        held.add(name)
+    parts = tuple([p for p, of in zip(pairs, buildings, strict=True) if (of in held) is which] for which in (False, True))
+    if not all(any(len(p.matches) for p in part) for part in parts):
+        raise InputError("too few pairs whose rooms match, to train on some buildings and watch others; make more of them")
+    return parts[0], parts[1]
 
 
 def _manifest(settings: Training, name: str) -> Path:
