@@ -34,7 +34,7 @@ LOOK = (
     "ipad_lidar_rooms/pix4d_user/470_user.ply",
     "ipad_lidar_rooms/user/808-60.ply",
     f"{TSC}/strands_maps/strands_maps/tsc_y3/maps/tsc20160523.yaml",
-    f"{TSC}/strands_morse/aachen/UMIC_FF.yaml",
+    f"{TSC}/strands_morse/aachen/UMIC_first_floor.yaml",
     f"{TSC}/strands_morse/g4s/g4s_y2.yaml",
 )
 

@@ -12,7 +12,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +110,8 @@ def item_of(row: Row) -> Item:
         KeyError: something of it is missing.
     """
     told = {**row, "overlap": row["asked_overlap"]}
-    return Item(**{field.name: _fixed(told[field.name]) for field in fields(Item)})
+    later = {field.name for field in fields(Item) if field.default is not MISSING}  # older rows don't tell them
+    return Item(**{field.name: _fixed(told[field.name]) for field in fields(Item) if field.name in told or field.name not in later})
 
 
 def _fixed(value: Any) -> Any:

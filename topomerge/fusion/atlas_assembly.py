@@ -1,7 +1,8 @@
 """Hypotheses of pairs -> sets of maps that lie in one frame without contradiction (method 3: agreement around cycles).
 
 Links are taken in the order of their probability, as in a maximum spanning tree, but each is heard before: every two maps that it
-would bring over each other say what they think of that. What contradicts better evidence is thrown out, and named.
+would bring over each other say what they think of that, its own two if they contradict it. What contradicts better evidence is
+thrown out, and named.
 """
 
 from __future__ import annotations
@@ -129,7 +130,8 @@ class Assembler:
         """
         move = across(a, b, pair, h.pose)
         place = {**a, **{j: move @ pose for j, pose in b.items()}}
-        backing, against, loudest, worst = 0.0, 0.0, None, 0.0
+        own = self.checks(*pair, place[pair[0]].inverse() @ place[pair[1]])
+        backing, against, loudest, worst = 0.0, own.log_odds if own.log_odds < LOUD else 0.0, None, 0.0
         for one, two in ((min(i, j), max(i, j)) for i in a for j in b):
             if (one, two) in (pair, rival_of):
                 continue
