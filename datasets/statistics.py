@@ -111,7 +111,8 @@ def item_of(row: Row) -> Item:
     """
     told = {**row, "overlap": row["asked_overlap"]}
     later = {field.name for field in fields(Item) if field.default is not MISSING}  # older rows don't tell them
-    return Item(**{field.name: _fixed(told[field.name]) for field in fields(Item) if field.name in told or field.name not in later})
+    known = {field.name for field in fields(Item)} - (later - set(told))
+    return Item(**{name: _fixed(told[name]) for name in known})
 
 
 def _fixed(value: Any) -> Any:

@@ -69,8 +69,8 @@ def any_ceiling(grid: VoxelGrid) -> bool:
 
 
 def with_assumed_floor(grid: VoxelGrid, rays: tuple[Array, Array] | None = None) -> VoxelGrid:
-    """The grid with a floor under whatever seems to be a ceiling: at the lowest points around, or so far below the ceiling that one
-    can stand; where the places of the sensor are known, as far below them as it is usually carried.
+    """The grid with a floor under whatever seems to be a ceiling: at the lowest points around, or so far below the ceiling that
+    one can stand; where the places of the sensor are known, as far below them as it is usually carried.
 
     Args:
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, where they are known.
