@@ -12,10 +12,11 @@ import topomerge as tm
 from tests.fusion.atlas_scenes import FRAMES, NAMES, office_map, stranger, truth
 from topomerge.errors import InputError
 from topomerge.fusion.atlas import AtlasResult
-from topomerge.fusion.atlas_join import extruded, join_many
+from topomerge.fusion.atlas_join import join_many
 from topomerge.fusion.atlas_maps import AT_ONCE, Maps, map_key
 from topomerge.fusion.atlas_pairs import Checks, Hypothesis, hypotheses, promise
 from topomerge.fusion.average import difference
+from topomerge.fusion.evidence import extruded
 from topomerge.fusion.result import merge_to_json
 from topomerge.types import Sim3, TopometricMap
 

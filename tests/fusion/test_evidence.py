@@ -8,7 +8,7 @@ from plans_of import doubled, grid_of, office
 from scenes import HEIGHT, Scene
 
 from topomerge.errors import InputError
-from topomerge.fusion.evidence import plans, slices
+from topomerge.fusion.evidence import extruded, plans, slices
 from topomerge.kernels.plan import column_bits, on_lines
 from topomerge.types import VoxelGrid
 
@@ -114,3 +114,15 @@ def test_on_lines_keeps_straight_runs_only():
     kept = on_lines(mask, np.cos(angles), np.sin(angles), 12, 11, 3)
     assert kept[5, 3:30].all() and kept[np.arange(10, 35), np.arange(10, 35)].all()
     assert not any(kept[leg] for leg in legs)
+
+
+def test_a_slice_that_was_given_walls_stays_a_slice(room):
+    """Its table is four legs at one height, and nothing is known of heights: extraction assumes walls and a floor."""
+    layer = room[np.abs(room[:, 2] - 0.3) < 0.05] * (1, 1, 0)
+    cells = grid_of(layer).cells
+    walls = np.concatenate([cells + (0, 0, k) for k in range(1, 25)])
+    inside = np.stack(np.meshgrid(np.arange(1, 59), np.arange(1, 39), [0]), -1).reshape(-1, 3)
+    raised = VoxelGrid.from_cells(np.concatenate([walls, inside]).astype(np.int32))
+    assert extruded(raised) and not extruded(grid_of(room))
+    (plan,) = plans(raised)
+    assert plan.sliced and at(plan, plan.wall | plan.clutter, 2.5, 0.05) and at(plan, plan.free, 1, 3)

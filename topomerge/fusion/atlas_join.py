@@ -16,11 +16,11 @@ from scipy import ndimage
 from topomerge.errors import InputError
 from topomerge.extraction.convolution import convolve, moore
 from topomerge.extraction.extract import COARSEST, FINEST, PRESETS, extract
+from topomerge.fusion.evidence import extruded
 from topomerge.fusion.fuse import ALIKE, MOST, resampled
 from topomerge.kernels import morton
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
-LEVELS = 12  # an extruded map has as many levels of one size, at least
 BESIDE = 0.3  # m around what other maps saw: there an extruded wall is one of theirs that is a little off
 SHIFT = 1 << 20  # cells are counted from there, as codes hold no negative ones
 
@@ -97,13 +97,6 @@ def _about(m: TopometricMap) -> tuple[float, int, float, bool]:
     """Usual number of neighbours of a cell, number of provenance bits, edge length, and whether heights were assumed."""
     bits = 1 if m.provenance is None else max(int(np.bitwise_or.reduce(m.provenance, initial=0)).bit_length(), 1)
     return _usual(m.grid), bits, m.grid.edge, extruded(m.grid)
-
-
-def extruded(grid: VoxelGrid) -> bool:
-    """Was a map made from lines on the floor? Then nearly all of its levels hold the same number of cells."""
-    many = np.bincount(grid.cells[:, 2]) if len(grid) else np.zeros(1, np.int64)
-    usual = np.median(many[many > 0]) if many.any() else 0
-    return bool((many == usual).sum() >= max(LEVELS, 0.8 * (many > 0).sum()))
 
 
 def _edge(about: Sequence[tuple[float, int, float, bool]], poses: Sequence[tuple[int, Sim3]]) -> float:

@@ -25,6 +25,7 @@ GAP = 1.9  # m of empty height between a floor and its ceiling
 LEAST_AREA = 3.0  # m2 of a storey
 LEAST_SHARE = 0.08  # of the largest storey
 SLICE = 0.6  # m; a map that is not higher is a slice
+LEVELS = 12  # of one size: a map of lines that were given walls has as many, at least
 LAYER = 0.1  # share of the cells that a layer of a map of slices holds at least
 NOMINAL = (2.7, 0.3, 1.375)  # m: floor to ceiling; a slice's height above the floor; and the height at which slices are drawn
 FLAT = 1.5  # m, radius over which the floor may rise and fall
@@ -91,6 +92,8 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
     free = map.free if isinstance(map, TopometricMap) and free is None else free
     if not len(grid):
         raise InputError("the map has no occupied cells: there is nothing to register")
+    if extruded(grid):
+        grid, free = _lines(grid)
     cell = max(cell, grid.edge)
     points = cell_middles(grid)
     corner = grid.origin[:2]  # columns are those of the cells: on another lattice some get two rows of cells, and some none
@@ -142,6 +145,27 @@ def with_means(grid: VoxelGrid, points: Array) -> VoxelGrid:
     many = np.bincount(rows, minlength=len(grid))[:, None]
     total = np.column_stack([np.bincount(rows, points[:, k], len(grid)) for k in range(3)])
     return grid.with_properties(mean=np.where(many > 0, total / np.maximum(many, 1), grid.centroids()))
+
+
+def extruded(grid: VoxelGrid) -> bool:
+    """Was a map made from lines, which were given walls? Then all of its levels but the lowest hold the same columns."""
+    if not len(grid):
+        return False
+    level = grid.cells[:, 2] - grid.cells[:, 2].min()
+    many = np.bincount(level)[1:]
+    if len(many) < LEVELS or (many != many[0]).any():
+        return False
+    first = grid.cells[level == 1, :2]
+    return all(np.array_equal(grid.cells[level == k, :2], first) for k in range(2, len(many) + 1))
+
+
+def _lines(grid: VoxelGrid) -> tuple[VoxelGrid, VoxelGrid]:
+    """The lines of such a map at the height of the floor that it was given, where its sensor looked, and that floor, over which it
+    looked."""
+    level = grid.cells[:, 2] - grid.cells[:, 2].min()
+    lines, floor = grid.cells[level == 1] - (0, 0, 1), grid.cells[level == 0]
+    kept = VoxelGrid.from_cells(lines, grid.origin, grid.edge, grid.shape)
+    return kept, VoxelGrid.from_cells(floor[~kept.contains(floor)], grid.origin, grid.edge, grid.shape)
 
 
 def slices(grid: VoxelGrid) -> list[float]:
