@@ -11,6 +11,7 @@ import urllib.error
 import urllib.request
 import webbrowser
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -172,7 +173,8 @@ def test_view_serves_the_page_and_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "my report.html").write_text("<p>seen</p>")
     (tmp_path / "secret.txt").write_text("no")
     command = [sys.executable, "-m", "topomerge", "view", "my report.html", "--serve", "--no-open"]
-    server = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores Ctrl-C
+    server = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heard)
     try:
         assert server.stdout is not None and server.stderr is not None
         address = server.stdout.readline().strip()
@@ -195,7 +197,7 @@ def test_view_serves_the_page_and_nothing_else(tmp_path: Path) -> None:
         )
         assert taken.returncode == 1 and "can't be used" in taken.stderr and len(taken.stderr.splitlines()) == 1
         server.send_signal(signal.SIGINT)
-        assert server.wait(10) == 0 and server.stderr.read() == ""
+        assert server.wait(30) == 0 and server.stderr.read() == ""
     finally:
         server.kill()
         server.wait()
@@ -211,7 +213,7 @@ def test_what_is_served_of_a_map_is_deleted_in_the_end(tmp_path: Path) -> None:
         assert server.stdout is not None and server.stdout.readline().startswith("http://127.0.0.1:")
         assert list((tmp_path / "scratch").rglob("a.html"))
         server.terminate()
-        assert server.wait(10) == 143
+        assert server.wait(30) == 143
         time.sleep(0.1)
         assert not list((tmp_path / "scratch").glob("topomerge-*"))
     finally:
