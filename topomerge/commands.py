@@ -19,7 +19,6 @@ from topomerge.errors import InputError
 from topomerge.export_commands import EXPORT, VIEW
 from topomerge.learn_commands import EXPORT_EMBEDDER
 
-DESCRIPTORS = ("engineered", "shapedna", "feather", "learned")
 FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 
@@ -244,7 +243,12 @@ def _map_from(path: str, args: argparse.Namespace) -> Any:
 
 
 MAPS = (
-    option("--descriptor", choices=DESCRIPTORS, default="engineered", help="default engineered"),
+    option(
+        "--descriptor",
+        default="engineered",
+        metavar="NAME",
+        help="engineered (default), shapedna, feather, learned, or the folder of a trained embedder",
+    ),
     option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)"),
     option("--voxel-size", type=_above_zero, metavar="E", help="edge length of a cell where a cloud is given, m (default 0.1)"),
     *(o for o in READING if o[0][0] in ("--up", "--unit")),

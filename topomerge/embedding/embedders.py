@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from topomerge.embedding.context import with_context
@@ -39,7 +40,7 @@ def embedder(name: str | Descriptor, k: int = 0, context: str = "join", **option
     """A callable map -> (R, D) float64.
 
     Args:
-        name: ``"engineered"``, ``"shapedna"``, ``"feather"``, ``"learned"``, or a descriptor.
+        name: ``"engineered"``, ``"shapedna"``, ``"feather"``, ``"learned"``, the folder of a trained one, or a descriptor.
         k: steps of context (see `with_context`).
         context: ``"join"`` or ``"mean"``.
         options: those of the function of that name.
@@ -51,8 +52,10 @@ def embedder(name: str | Descriptor, k: int = 0, context: str = "join", **option
         if options:
             raise InputError(f"options {', '.join(options)} are for embedders that are named, not for a callable")
         return with_context(name, k, context)
+    if name not in EMBEDDERS and Path(name).is_dir():
+        return embedder("learned", k, context, path=name, **options)
     if name not in EMBEDDERS:
-        raise InputError(f"unknown descriptor {name!r}: {', '.join(EMBEDDERS)} are possible")
+        raise InputError(f"unknown descriptor {name!r}: {', '.join(EMBEDDERS)} or the folder of a trained one are possible")
     make = EMBEDDERS[name]
     unknown = set(options) - set(inspect.signature(make).parameters)
     if unknown:
