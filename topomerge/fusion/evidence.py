@@ -160,8 +160,8 @@ def extruded(grid: VoxelGrid) -> bool:
 
 
 def _lines(grid: VoxelGrid) -> tuple[VoxelGrid, VoxelGrid]:
-    """The lines of such a map at the height of the floor that it was given, where its sensor looked, and that floor, over which it
-    looked."""
+    """The lines of such a map at the height of the floor that it was given, where its sensor looked; and that floor, over which
+    it looked."""
     level = grid.cells[:, 2] - grid.cells[:, 2].min()
     lines, floor = grid.cells[level == 1] - (0, 0, 1), grid.cells[level == 0]
     kept = VoxelGrid.from_cells(lines, grid.origin, grid.edge, grid.shape)
