@@ -58,6 +58,7 @@ def save_merge(result: MergeResult, folder: str | Path) -> None:
         with ExitStack() as stack:  # all are whole before the first is renamed
             for name, write in writers:
                 write(stack.enter_context(replacing(folder / name)))
+            (folder / "merge.json").unlink(missing_ok=True)  # renamed last: a kill leaves no list of another run's files
     except BaseException:
         if made and not any(folder.iterdir()):
             folder.rmdir()
