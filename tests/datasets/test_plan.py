@@ -11,8 +11,8 @@ from topomerge.errors import InputError
 
 
 def test_a_good_plan_passes() -> None:
-    check_plan(one_room())
-    check_plan(two_rooms())
+    for plan in (one_room(), two_rooms()):
+        assert check_plan(plan) is None
 
 
 @pytest.mark.parametrize(
@@ -36,4 +36,7 @@ def test_impossible_plans_are_refused_with_the_reason(plan: Plan, reason: str) -
 
 
 def test_rooms_that_share_a_wall_do_not_overlap() -> None:
-    check_plan(replace(one_room(), rooms=(room("a", 0, 0, 4, 5), room("b", 4, 0, 8, 5)), openings=()))
+    plan = replace(one_room(), rooms=(room("a", 0, 0, 4, 5), room("b", 4, 0, 8, 5)), openings=())
+    assert check_plan(plan) is None
+    with pytest.raises(InputError, match="overlap"):  # a hand's breadth more, and they do
+        check_plan(replace(plan, rooms=(room("a", 0, 0, 4.2, 5), plan.rooms[1])))

