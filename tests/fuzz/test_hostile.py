@@ -208,7 +208,7 @@ def test_e57_with_points_that_take_no_bytes(worker: Worker, tmp_path: Path) -> N
     assert "promise" in refused(worker, tmp_path / "a.e57", relaid(data, [many]))
     whole = 'type="Integer" minimum="5" maximum="5">5<'
     fixed = [(f"<cartesian{a} .*?</cartesian{a}>", f"<cartesian{a} {whole}/cartesian{a}>") for a in "XYZ"]
-    harmless(worker, tmp_path / "b.e57", relaid(data, [*fixed, many]))
+    assert "more than it has bits" in refused(worker, tmp_path / "b.e57", relaid(data, [*fixed, many]))
 
 
 def test_pipes_and_devices_are_not_waited_for(worker: Worker, tmp_path: Path) -> None:

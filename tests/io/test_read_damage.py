@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import sys
 import time
 import zipfile
 from pathlib import Path
@@ -166,3 +167,26 @@ def test_e57_pages_are_checked_before_the_library_sees_them(samples: dict[str, P
     (tmp_path / "a.e57").write_bytes(data)
     with pytest.raises(InputError, match="page 4 fails its checksum"):
         read_points(tmp_path / "a.e57")
+
+
+@pytest.mark.parametrize(
+    ("does", "says"),
+    [
+        ("os.abort()", "the library that reads it broke down"),
+        ("[0 for _ in iter(int, 1)]", "more than 1 s for a small part of it"),
+        ("bytearray(8 << 30)", "does not fit into memory"),
+        ("print('noise'); raise RuntimeError('two\\nlines')", "two lines"),
+    ],
+)
+def test_e57_library_that_dies_hangs_or_eats_memory(
+    samples: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: str, says: str
+) -> None:
+    from topomerge.io import e57
+
+    (tmp_path / "pye57.py").write_text(f"import os\n\ndef E57(path):\n    {does}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pye57", raising=False)
+    monkeypatch.setattr(e57, "SECONDS", 1)
+    with pytest.raises(InputError, match=says) as caught:
+        read_points(samples["cloud.e57"])
+    assert "cloud.e57: " in str(caught.value) and "\n" not in str(caught.value)

@@ -1,6 +1,6 @@
-"""A reader in a process of its own, for libraries that can end the process that they run in.
+"""A reader in a process of its own, for libraries that can end the process that they run in, or never come back.
 
-The child hands over its pieces on a pipe: a line of JSON, then the points as they lie in memory. Nothing is unpickled.
+The child hands over its pieces on a pipe: a line of JSON, then the arrays as they lie in memory. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -8,10 +8,11 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,68 +20,113 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.piece import Options, Piece, damaged
-from topomerge.types import TrueRoom
+from topomerge.types import Array, TrueRoom
+
+ARRAYS = {"points": np.float64, "colors": np.uint8, "poses": np.float64, "pose_of": np.int32}  # of a piece
 
 
-def read_apart(module: str, kind: str, path: Path, options: Options) -> Iterator[Piece]:
-    """What ``module.read_here(path, options)`` yields: points, rooms and warnings.
+def read_apart(
+    module: str, kind: str, path: Path, options: Options, seconds: int | None = None, room: int | None = None
+) -> Iterator[Piece]:
+    """What ``module.read_here(path, options)`` yields, labels and free space left out.
 
     Args:
         module: of `topomerge.io`.
         kind: what the file should be, for messages.
+        seconds: of the processor that the reader may take for one piece; None: any.
+        room: bytes that it may take beyond what it needs to start; None: any.
 
     Raises:
         InputError: as the reader; or the child came to an end before it was done.
     """
-    words = [sys.executable, "-c", f"from {__name__} import main; main()", module, str(path), json.dumps(asdict(options))]
+    told = json.dumps([module, str(path), asdict(options), seconds, room])
+    words = [sys.executable, "-c", f"from {__name__} import main; main()", told]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL, env=environment)
     assert child.stdout is not None
     try:
-        while line := child.stdout.readline():
-            told = json.loads(line)
-            if "end" in told:
-                return
-            if "refused" in told:
-                raise InputError(told["refused"])
-            if "fault" in told:
-                raise damaged(path, kind, told["fault"])
-            yield _piece(told, child.stdout)
-        raise damaged(path, kind, "the library that reads it broke down")
+        while (piece := _piece(path, kind, child.stdout)) is not None:
+            yield piece
+    except EOFError:
+        late = child.wait() == -signal.SIGXCPU
+        why = f"more than {seconds} s for a small part of it" if late else "the library that reads it broke down"
+        raise damaged(path, kind, why) from None
     finally:
         child.kill()
         child.communicate()
 
 
-def _piece(told: dict[str, Any], stream: IO[bytes]) -> Piece:
-    points = np.frombuffer(stream.read(24 * told["points"]), np.float64).reshape(-1, 3)
+def _piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:
+    """The next piece, None after the last; an EOFError where the child is no more."""
+    line = stream.readline()
+    if not line.endswith(b"\n"):
+        raise EOFError
+    told = json.loads(line)
+    if "end" in told:
+        return None
+    if "refused" in told:
+        raise InputError(told["refused"])
+    if "fault" in told:
+        raise damaged(path, kind, told["fault"])
+    arrays = {name: _array(stream, ARRAYS[name], shape) for name, shape in told["arrays"].items()}
     rooms = tuple(TrueRoom(**{**room, "polygon": np.array(room["polygon"], float).reshape(-1, 2)}) for room in told["rooms"])
-    return Piece(points, rooms=rooms, warnings=tuple(told["warnings"]), done=told["done"])
+    return replace(Piece(**arrays), rooms=rooms, warnings=tuple(told["warnings"]), done=told["done"])
+
+
+def _array(stream: IO[bytes], kind: Any, shape: list[int]) -> Array:
+    data = stream.read(int(np.prod(shape)) * np.dtype(kind).itemsize)
+    if len(data) < int(np.prod(shape)) * np.dtype(kind).itemsize:
+        raise EOFError
+    return np.frombuffer(data, kind).reshape(shape)
 
 
 def main() -> None:
-    """The child: module, path and options stand behind its name."""
-    module, path, options = sys.argv[1:]
+    """The child: what it is to do stands behind its name."""
+    module, path, options, seconds, room = json.loads(sys.argv[1])
+    reader = importlib.import_module(f"topomerge.io.{module}")
+    limit(room=room)
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)  # what a library prints is no piece
-        for told, points in _told(module, Path(path), Options(**json.loads(options))):
+        for told, arrays in _told(reader, Path(path), Options(**options), seconds):
             out.write(json.dumps(told).encode() + b"\n")
-            out.write(points)
+            for array in arrays:
+                out.write(array.data)
             out.flush()
 
 
-def _told(module: str, path: Path, options: Options) -> Iterator[tuple[dict[str, Any], bytes]]:
+def _told(reader: Any, path: Path, options: Options, seconds: int | None) -> Iterator[tuple[dict[str, Any], list[Array]]]:
     try:
-        for piece in importlib.import_module(f"topomerge.io.{module}").read_here(path, options):
-            points = np.ascontiguousarray(piece.points, np.float64)
+        limit(seconds=seconds)
+        for piece in reader.read_here(path, options):
+            arrays = {name: getattr(piece, name) for name in ARRAYS}
+            given = {name: np.ascontiguousarray(v, ARRAYS[name]) for name, v in arrays.items() if v is not None}
             rooms = [{**vars(room), "polygon": np.asarray(room.polygon).tolist()} for room in piece.rooms]
-            told = {"points": len(points), "rooms": rooms, "warnings": piece.warnings, "done": piece.done}
-            yield told, points.tobytes()
+            told = {"arrays": {name: v.shape for name, v in given.items()}, "rooms": rooms}
+            yield {**told, "warnings": piece.warnings, "done": piece.done}, list(given.values())
+            limit(seconds=seconds)
     except InputError as error:
-        yield {"refused": str(error)}, b""
+        yield {"refused": str(error)}, []
     except MemoryError:
-        yield {"refused": f"{path}: does not fit into memory; use a machine with more, or thin the file"}, b""
+        yield {"refused": f"{path}: does not fit into memory; use a machine with more, or thin the file"}, []
     except Exception as error:
-        yield {"fault": f"{error}" or type(error).__name__}, b""
+        yield {"fault": f"{error}" or type(error).__name__}, []
     else:
-        yield {"end": True}, b""
+        yield {"end": True}, []
+
+
+def limit(seconds: int | None = None, room: int | None = None) -> None:
+    """From now on this process may take so many more seconds of the processor, and bytes of memory; nothing on Windows."""
+    try:
+        import resource
+    except ImportError:
+        return
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    wanted = []
+    if seconds is not None:
+        wanted.append((resource.RLIMIT_CPU, int(used.ru_utime + used.ru_stime) + 1 + seconds))
+    size = Path("/proc/self/statm")
+    if room is not None and size.exists():  # elsewhere the limit of the address space does nothing
+        wanted.append((resource.RLIMIT_AS, int(size.read_text().split()[0]) * resource.getpagesize() + room))
+    for what, value in wanted:
+        _, hard = resource.getrlimit(what)
+        resource.setrlimit(what, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))

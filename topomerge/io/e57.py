@@ -1,6 +1,7 @@
 """E57: several scans with the poses of their scanner, read in blocks by pye57.
 
-The library trusts what it reads and can take the whole process down with it, so every page's checksum is verified first.
+The library trusts what it reads and can take the whole process down with it, or never come back: every page's checksum is
+verified first, and the library is in a process of its own, within limits.
 Source: ASTM E2807 (pages of 1024 bytes, the last four of which are their CRC-32C).
 """
 
@@ -8,18 +9,21 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.io.apart import read_apart
 from topomerge.io.pcd import pose
 from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
 from topomerge.kernels.codecs import crc32c
 from topomerge.types import Array
 
 PAGES = 1 << 15  # checked at a time
+SECONDS, ROOM = 30, 2 << 30  # of the processor for one block, which takes 0.2; bytes of memory for all, which takes 0.2 GB
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
@@ -28,8 +32,15 @@ INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 def read(path: Path, options: Options) -> Iterator[Piece]:
     """Blocks of the points of all scans, in the file's common frame."""
-    del options
+    if find_spec("pye57") is None:
+        raise ImportError("no pye57", name="pye57")
     _check_pages(path)
+    yield from read_apart("e57", "an E57 file", path, options, SECONDS, ROOM)
+
+
+def read_here(path: Path, options: Options) -> Iterator[Piece]:
+    """The same in this process, which the library may end."""
+    del options
     import pye57
 
     file = pye57.E57(str(path))
@@ -39,6 +50,8 @@ def read(path: Path, options: Options) -> Iterator[Piece]:
             raise InputError(f"{path}: holds no scans, only images or nothing; export it with its points")
         poses = np.stack([_pose(h) for h in headers])
         total = max(sum(h.point_count for h in headers), 1)
+        if total > 8 * path.stat().st_size:  # points of one place take no bytes, and could be without end
+            raise damaged(path, "an E57 file", f"it promises {total:,} points, more than it has bits")
         yield Piece(np.empty((0, 3)), poses=poses)
         done = 0
         for number, header in enumerate(headers):
