@@ -31,7 +31,7 @@ demo: setup
 	@echo "The map from above: demo/a.png; the merge and why it is believed: demo/merged/report.html"
 
 test: setup
-	$(BIN)/python -m pytest -rs -m 'not slow'
+	$(BIN)/python -m pytest -rs -m 'not slow' -n logical --maxprocesses 4 --dist worksteal
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow

@@ -147,6 +147,7 @@ def test_first_apartments(data_dir: Path) -> None:
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_apartments_come_through(data_dir: Path) -> None:
     counts = summarise(iter_plans(data_dir / "plans_r2v_apartments"))
     assert sum(counts.values()) == 1279 and counts["taken"] >= 1000, counts

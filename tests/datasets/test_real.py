@@ -21,7 +21,7 @@ BOUNDS = {"halmstad": 0.08, "utexas": 0.12, "strands": 0.18, "carmen": 0.08, "if
 COUNTS = {"halmstad": 20, "utexas": 7, "strands": 3, "carmen": 15, "ifc": 2}
 QUICK = (
     "carmen/orebro-first-last",
-    "ifc/duplex-scan",
+    pytest.param("ifc/duplex-scan", marks=pytest.mark.slow),
     "utexas/gdc1-1s",
     pytest.param("utexas/gdc2-lines", marks=pytest.mark.slow),
 )
