@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
-from topomerge.models.config import GEOMETRY, Network, check
 from topomerge.models.layers import Standardise, mlp
 from topomerge.models.nodes import NodeEncoder
 from topomerge.models.pointnet import LocalPointNet, PointNet
@@ -14,9 +13,9 @@ from topomerge.models.voxelcnn import VoxelCNN
 from topomerge.models.yaw import Turned
 from torch import Tensor, nn
 
+from topomerge.embedding.network import GEOMETRY, GRAPH, Network, check, needed, pair_tensors, tensors
+
 POINTS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}
-TENSORS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> tensor of the graph that it reads
-GRAPH = ("edge_index", "edge_attr")
 
 
 class Table(nn.Module):
@@ -53,11 +52,6 @@ class GeometryEncoder(nn.Module):
         return out
 
 
-def needed(part: str) -> str:
-    """The tensor of the graph that a part of the geometry reads."""
-    return TENSORS.get(part, "room_points")
-
-
 class Embedder(nn.Module):
     """Tensors of one or more maps (`embedding.graph`) -> embeddings (R, size) of length 1, dustbins (R,).
 
@@ -78,15 +72,12 @@ class Embedder(nn.Module):
     @property
     def tensors(self) -> tuple[str, ...]:
         """Names of the tensors that the network reads."""
-        return (*dict.fromkeys(needed(part) for part in self.network.geometry.parts), *GRAPH, *self.pairs)
+        return tensors(self.network)
 
     @property
     def pairs(self) -> tuple[str, ...]:
         """Names of the tensors that tell of pairs of doors, if the network reads any."""
-        node = self.network.node
-        if not node.doors or node.kind == "none":
-            return ()
-        return ("near_index", "near_attr") if node.near else ("door_index", "door_attr")
+        return pair_tensors(self.network.node)
 
     @property
     def temperature(self) -> Tensor:

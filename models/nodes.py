@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import torch
-from topomerge.models.config import Node
 from topomerge.models.doors import DoorLayer
 from topomerge.models.gat import GatLayer
 from topomerge.models.layers import Standardise
 from topomerge.models.sage import SageLayer
 from torch import Tensor, nn
+
+from topomerge.embedding.network import Node
 
 EDGE, PAIR, NEAR = 11, 3, 5  # widths of edge_attr and door_attr (`embedding.graph`), and of near_attr (`embedding.door_layout`)
 

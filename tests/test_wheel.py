@@ -83,7 +83,7 @@ def test_two_clouds_are_merged_without_the_learned_part(installed: Path, tmp_pat
     )
     call("simulate", "--building", "office", "--seed", "5", "--rooms", "8", "--overlap", "0.7", "-o", "pair")
     call("extract", "pair/a.ply", "-o", "a.tmap", "--report", "a.html")
-    call("merge", "a.tmap", "pair/b.ply", "-o", "merged", "--descriptor", "engineered")
+    call("merge", "a.tmap", "pair/b.ply", "-o", "merged")
     assert sorted(p.name for p in (tmp_path / "merged").iterdir()) == ["map.tmap", "merge.json", "merged.ply", "report.html"]
 
 

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from topomerge.embedding.learned import load_embedder as load_embedder
     from topomerge.errors import InputError as InputError
     from topomerge.extraction.extract import PRESETS as PRESETS
     from topomerge.extraction.extract import extract as extract
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from topomerge.io.points import read_chunks as read_chunks
     from topomerge.io.points import read_points as read_points
     from topomerge.io.rooms_ply import save_rooms_ply as save_rooms_ply
-    from topomerge.models.learned import load_embedder as load_embedder
     from topomerge.types import PointCloud as PointCloud
     from topomerge.types import Sim3 as Sim3
     from topomerge.types import TopometricMap as TopometricMap
@@ -54,7 +54,7 @@ _HOMES = {
     "atlas": "topomerge.fusion.atlas",
     "atlas_html": "topomerge.viz.atlas_report",
     "extract": "topomerge.extraction.extract",
-    "load_embedder": "topomerge.models.learned",
+    "load_embedder": "topomerge.embedding.learned",
     "load_map": "topomerge.io.maps",
     "map_to_json": "topomerge.io.listing",
     "merge": "topomerge.fusion.merge",

@@ -245,9 +245,9 @@ def _map_from(path: str, args: argparse.Namespace) -> Any:
 MAPS = (
     option(
         "--descriptor",
-        default="engineered",
+        default="learned",
         metavar="NAME",
-        help="engineered (default), shapedna, feather, learned, or the folder of a trained embedder",
+        help="learned (default: the embedder that ships), engineered, shapedna, feather, or the folder of a trained embedder",
     ),
     option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)"),
     option("--voxel-size", type=_above_zero, metavar="E", help="edge length of a cell where a cloud is given, m (default 0.1)"),

@@ -202,7 +202,9 @@ def test_a_map_laid_on_itself_is_itself(halves):
 
 def test_json_has_the_schema(merged, refused):
     listing = merge_to_json(merged)
-    assert list(listing) == ["format", "status", "probability", "reason", "maps", "transforms", "matches", "seconds"]
+    assert list(listing)[:5] == ["format", "status", "probability", "reason", "descriptor"]
+    assert list(listing)[5:] == ["maps", "transforms", "matches", "seconds"]
+    assert listing["descriptor"] == "learned"
     assert listing["format"] == 1 and listing["status"] == "merged" and 0 <= listing["probability"] <= 1
     assert listing["maps"][0] == {"source": "a.ply", "rooms": len(merged.maps[0].rooms), "storeys": 1}
     assert list(listing["transforms"]) == ["1"]

@@ -67,13 +67,13 @@ def read_atlas(path: Path) -> int:
 
 def read_embedder(path: Path) -> int:
     """Read an embedder whose settings or weights are damaged. Its checksum is made to fit: whoever means harm can do that."""
-    from topomerge.models.weights import read_embedder
+    from topomerge.embedding.learned import load_embedder
 
     settings = path.with_name("embedder.json")
     if path.suffix == ".safetensors":
         told = json.loads(settings.read_text())
         settings.write_text(json.dumps({**told, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}))
-    return len(list(read_embedder(path.parent)[0].parameters()))
+    return len(load_embedder(path.parent)(building(1)))
 
 
 READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others are clouds
@@ -133,9 +133,11 @@ def write_embedder(folder: Path) -> dict[str, Path]:
     if find_spec("torch") is None or find_spec("safetensors") is None:
         return {}
     import torch
-    from topomerge.models.config import Geometry, Network, Node
     from topomerge.models.embedder import Embedder
-    from topomerge.models.weights import SETTINGS, WEIGHTS, save_embedder
+    from topomerge.models.weights import save_embedder
+
+    from topomerge.embedding.network import Geometry, Network, Node
+    from topomerge.embedding.weights import SETTINGS, WEIGHTS
 
     torch.manual_seed(0)
     save_embedder(Embedder(Network(Geometry(width=8), Node("sage", 1), size=8)), folder)

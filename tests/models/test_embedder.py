@@ -9,10 +9,9 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import torch
-from topomerge.models.config import GEOMETRY, Geometry, Network, Node, check, network_from
 from topomerge.models.embedder import Embedder, match_scores
 from topomerge.models.layers import Standardise, segment_softmax
-from topomerge.models.learned import Learned, load_embedder
+from topomerge.models.learned import learned
 from topomerge.models.nodes import EDGE, NEAR, PAIR
 from topomerge.models.pointnet import farthest, nearest
 from topomerge.models.voxelcnn import crop
@@ -22,7 +21,9 @@ from topomerge.models.yaw import turn
 from tests.graphs import graph, shuffled, turned
 from tests.scenes_map import building
 from topomerge.embedding.door_layout import LAYOUT_FEATURES, REACH, door_layout
-from topomerge.embedding.graph import DOOR_FEATURES, EDGE_FEATURES, ROOM_FEATURES, to_graph
+from topomerge.embedding.graph import DOOR_FEATURES, EDGE_FEATURES, ROOM_FEATURES, graph_arrays
+from topomerge.embedding.learned import load_embedder
+from topomerge.embedding.network import GEOMETRY, Geometry, Network, Node, check, network_from
 from topomerge.errors import InputError
 
 NODES = [
@@ -197,10 +198,10 @@ def test_a_pickle_under_another_name_is_not_run(tmp_path):
 
 def test_an_embedder_of_maps():
     map = building(2, 2)
-    describe = Learned(network("scalars", "engineered", "shapedna", "pointnet", node=Node("gat", doors=1, near=True)))
+    describe = learned(network("scalars", "engineered", "shapedna", "pointnet", node=Node("gat", doors=1, near=True)))
     rows = describe(map)
     assert rows.shape == (len(map.rooms), 64) and rows.dtype == np.float64 and np.array_equal(rows, describe(map))
-    assert np.array_equal(rows, describe.graph(to_graph(map))[0]) and describe.matchability(map).shape == (len(map.rooms),)
+    assert np.array_equal(rows, describe.graph(graph_arrays(map))[0]) and describe.matchability(map).shape == (len(map.rooms),)
     assert describe(building(1, 1)).shape == (len(building(1, 1).rooms), 64)
     ours, theirs = describe.probabilities(map, map)
     assert np.allclose(ours.sum(axis=1), 1) and ours.shape == (len(map.rooms), len(map.rooms) + 1) and np.allclose(ours, theirs)

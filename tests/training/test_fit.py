@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from topomerge.models.config import Geometry, Network, Node
 from topomerge.models.embedder import Embedder
-from topomerge.models.learned import load_embedder
+from topomerge.models.weights import read_embedder
 
 from tests.graphs import pair, write_set
 from topomerge.checkpoint import load_state
+from topomerge.embedding.learned import load_embedder
+from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.errors import InputError
 from topomerge.training import fit as loop
 from topomerge.training.batches import changed, make_batch
@@ -188,7 +189,7 @@ def test_geometry_alone_then_frozen(settings, tmp_path):
     alone = replace(settings, name="alone", network=replace(SMALL, node=Node("none")))
     fit(alone, quiet)
     fit(replace(settings, name="frozen", geometry_from=str(tmp_path / "alone"), freeze="geometry"), quiet)
-    first, second = (load_embedder(tmp_path / n).network.geometry.state_dict() for n in ("alone", "frozen"))
+    first, second = (read_embedder(tmp_path / n)[0].geometry.state_dict() for n in ("alone", "frozen"))
     assert all(torch.equal(first[name], second[name]) for name in first)
     with pytest.raises(InputError, match="geometry_from"):
         fit(replace(settings, freeze="geometry"), quiet)

@@ -4,43 +4,42 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from topomerge.embedding.context import with_context
 from topomerge.embedding.engineered import engineered
 from topomerge.embedding.feather import feather
+from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.shapedna import shapedna
 from topomerge.errors import InputError
 
 
 def learned(path: str | None = None) -> Descriptor:
-    """The trained embedder in a folder (see `topomerge.load_embedder`), or the one that ships with the package.
-
-    The networks stand above this package, and need torch: they are looked up when they are asked for.
-    """
-    try:
-        found: Descriptor = import_module("topomerge.models.learned").load_embedder(path)
-    except ModuleNotFoundError as error:
-        raise InputError(f"a learned embedder needs {error.name}: pip install topomerge[learn]") from error
-    return found
+    """The trained embedder in a folder (see `topomerge.load_embedder`), or the one that ships with the package."""
+    return load_embedder(path)
 
 
 EMBEDDERS: dict[str, Callable[..., Descriptor]] = {
+    "learned": learned,
     "engineered": engineered,
     "shapedna": shapedna,
     "feather": feather,
-    "learned": learned,
 }
+DEFAULT = "learned"
 
 
-def embedder(name: str | Descriptor, k: int = 0, context: str = "join", **options: Any) -> Descriptor:
+def descriptor_name(name: str | Descriptor) -> str:
+    """What a report says of a descriptor: its name, or that of a callable."""
+    return name if isinstance(name, str) else getattr(name, "__name__", type(name).__name__)
+
+
+def embedder(name: str | Descriptor = DEFAULT, k: int = 0, context: str = "join", **options: Any) -> Descriptor:
     """A callable map -> (R, D) float64.
 
     Args:
-        name: ``"engineered"``, ``"shapedna"``, ``"feather"``, ``"learned"``, the folder of a trained one, or a descriptor.
+        name: ``"learned"``, ``"engineered"``, ``"shapedna"``, ``"feather"``, the folder of a trained one, or a descriptor.
         k: steps of context (see `with_context`).
         context: ``"join"`` or ``"mean"``.
         options: those of the function of that name.

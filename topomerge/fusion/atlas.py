@@ -107,8 +107,8 @@ def atlas(
         maps: topometric maps or `.tmap` files, two or more; of files only a few are in memory at once.
         scale: "fixed", or "free" where the scales of the maps differ in unknown ways.
         threshold: probability from which a link is believed; that of the calibration if None.
-        embedder: "engineered", "shapedna", "feather" or a callable map -> (R, D): matched rooms propose poses, too. None: the
-            engineered descriptors only say which pairs to try first.
+        embedder: "learned", "engineered", "shapedna", "feather", the folder of a trained one, or a callable map -> (R, D):
+            matched rooms propose poses, too. None: the learned descriptors only say which pairs to try first.
         known: registrations made before, by the keys of both maps; those made now are added.
 
     Raises:

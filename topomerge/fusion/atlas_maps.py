@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.fusion.refine import Surface, surface
@@ -34,7 +35,7 @@ class Maps:
     def __init__(self, maps: Sequence[TopometricMap | str | Path], embedder: str | Descriptor | None = None) -> None:
         self._maps = list(maps)
         self.matched = embedder is not None
-        self._describe = make_embedder(embedder or "engineered", 0)
+        self._describe = make_embedder(embedder or DEFAULT)
         self._recent: OrderedDict[int, TopometricMap] = OrderedDict()
         self._surfaces: OrderedDict[int, Surface] = OrderedDict()
         self._rows: dict[int, Array] = {}

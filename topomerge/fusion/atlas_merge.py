@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 
+from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.fusion.atlas import AtlasResult, Known, atlas
 from topomerge.fusion.fuse import rooms_in_common
@@ -19,7 +20,7 @@ def merge_many(
     scale: str = "fixed",
     force: bool = False,
     threshold: float | None = None,
-    embedder: str | Descriptor | None = None,
+    embedder: str | Descriptor = DEFAULT,
 ) -> MergeResult:
     """As `merge`. What belongs to the first map is joined; the reason names the maps that stand apart.
 
@@ -28,7 +29,7 @@ def merge_many(
     """
     began = time.perf_counter()
     known: Known = {}
-    rooms = None if embedder == "engineered" else embedder  # the default only says which pairs to try first
+    rooms = None if embedder == DEFAULT else embedder  # the default only says which pairs to try first
     found = atlas(maps, scale=scale, threshold=threshold, embedder=rooms, known=known)
     reason, status = found.words(), "merged" if _of_first(found)[1:] else "abstained"
     if status == "abstained" and found.status != "abstained":
@@ -51,6 +52,7 @@ def merge_many(
         maps=tuple(maps),
         atlas=found,
         warnings=found.warnings,
+        descriptor=descriptor_name(embedder),
     )
 
 

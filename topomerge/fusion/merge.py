@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
@@ -35,7 +36,7 @@ def merge(
     scale: str = "fixed",
     force: bool = False,
     threshold: float | None = None,
-    embedder: str | Descriptor | None = None,
+    embedder: str | Descriptor = DEFAULT,
 ) -> MergeResult:
     """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
 
@@ -44,7 +45,8 @@ def merge(
         scale: "fixed", or "free" where the scale of the second map is unknown.
         force: give the best transform and its joined map, too, where it is not believed; the status stays "abstained".
         threshold: probability from which a merge is believed; that of the calibration if None.
-        embedder: "engineered" (default), "shapedna", "feather" or a callable map -> (R, D), for the matching of rooms.
+        embedder: "learned" (default), "engineered", "shapedna", "feather", the folder of a trained one, or a callable
+            map -> (R, D), for the matching of rooms.
 
     Raises:
         InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale.
@@ -67,6 +69,7 @@ def merge(
         maps=(a, b),
         registration=found,
         warnings=tuple(_warnings(a, b, scale)),
+        descriptor=descriptor_name(embedder),
     )
     pose = found.transform
     if pose is None or not (believed or force):
@@ -146,13 +149,13 @@ def _storey_height(m: TopometricMap) -> float:
     return float(np.median(height)) if len(height) else 0.0
 
 
-def _hypotheses(a: TopometricMap, b: TopometricMap, embedder: str | Descriptor | None, scale: str, clock: _Clock) -> list[Sim3]:
+def _hypotheses(a: TopometricMap, b: TopometricMap, embedder: str | Descriptor, scale: str, clock: _Clock) -> list[Sim3]:
     """Poses T_ab of matched rooms."""
     if not len(a.rooms) or not len(b.rooms):
         return []
     if _order(b) < _order(a):  # as registration: nothing may depend on which comes first
         return [h.inverse() for h in _hypotheses(b, a, embedder, scale, clock)]
-    describe = make_embedder(embedder or "engineered", 0)
+    describe = make_embedder(embedder)
 
     def timed(m: TopometricMap) -> Array:
         with clock("embed"):

@@ -50,6 +50,7 @@ class MergeResult:
         registration: the evidence, of two maps.
         atlas: the evidence, of more than two.
         warnings: what the user should know.
+        descriptor: of the rooms, by which they were matched.
     """
 
     status: str
@@ -63,6 +64,7 @@ class MergeResult:
     registration: Registration | None = None
     atlas: AtlasResult | None = None
     warnings: tuple[str, ...] = ()
+    descriptor: str = ""
 
     def __post_init__(self) -> None:
         if self.status not in ("merged", "abstained"):
@@ -97,6 +99,7 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
         "status": result.status,
         "probability": min(max(float(result.probability), 0.0), 1.0),
         "reason": result.reason,
+        "descriptor": result.descriptor,
         "maps": [{"source": m.source, "rooms": len(m.rooms), "storeys": len(m.storeys)} for m in result.maps],
         "transforms": transforms,
         "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
@@ -26,7 +27,7 @@ KEPT = 10  # hypotheses
 def match(
     a: TopometricMap,
     b: TopometricMap,
-    embedder: str | Descriptor = "engineered",
+    embedder: str | Descriptor = DEFAULT,
     method: str = "consistent",
     *,
     k: int = 0,
@@ -39,7 +40,8 @@ def match(
     """Rooms of a that are rooms of b.
 
     Args:
-        embedder: ``"engineered"``, ``"shapedna"``, ``"feather"`` or a callable map -> (R, D).
+        embedder: ``"learned"``, ``"engineered"``, ``"shapedna"``, ``"feather"``, the folder of a trained one, or a callable
+            map -> (R, D).
         method: ``"consistent"``: sets of matches that one transform explains; ``"growing"``: from each pair to its neighbours;
             ``"assignment"``: by cost alone; ``"thesis"``: ShapeDNA with one step of context, and growing (embedder and k are the
             thesis' then).

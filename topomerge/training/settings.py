@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, make_dat
 from pathlib import Path
 from typing import Any
 
+from topomerge.embedding.network import Network, network_from
+from topomerge.embedding.network import check as check_network
 from topomerge.errors import InputError
-from topomerge.models.config import Network, network_from
-from topomerge.models.config import check as check_network
 from topomerge.models.losses import LossSettings
 from topomerge.models.losses import check as check_loss
 

@@ -266,7 +266,8 @@ def _texts(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: str) ->
 def _made(result: MergeResult) -> Markup:
     seconds = {step: f"{s:.2f}" for step, s in result.seconds.items()}
     sources = {name: m.source or "–" for name, m in zip("ab", result.maps, strict=True)}
-    tables = [facts(sources, "Maps"), facts(seconds, "Seconds")]
+    matching = {"descriptor of rooms": result.descriptor or "–"}
+    tables = [facts(sources, "Maps"), facts(matching, "Matching"), facts(seconds, "Seconds")]
     if result.transforms:
         matrix = result.transforms[1].matrix
         rows = {f"row {k}": "  ".join(f"{v:.6g}" for v in row) for k, row in enumerate(matrix.tolist())}

@@ -1,4 +1,4 @@
-"""What a network is made of: plain dataclasses, stored as JSON beside its weights."""
+"""What a network is made of: plain dataclasses, stored as JSON beside its weights; and what of a map's graph it reads."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ GEOMETRY = {  # part -> width of the rows it reads; 0: it reads the points
     "pointnet_local": 0,
     "voxelcnn": 0,
 }
+TENSORS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> tensor of the graph that it reads
+GRAPH = ("edge_index", "edge_attr")
 WIDEST = 4096  # more is a mistake, or a file that was made to take all memory
 NODES = ("none", "sage", "gat")
 JUMPS = ("last", "cat", "max")
@@ -75,6 +77,23 @@ class Network:
     node: Node = field(default_factory=Node)
     size: int = 64
     dropout: float = 0.1
+
+
+def needed(part: str) -> str:
+    """The tensor of the graph that a part of the geometry reads."""
+    return TENSORS.get(part, "room_points")
+
+
+def pair_tensors(node: Node) -> tuple[str, ...]:
+    """Names of the tensors that tell of pairs of doors, if the node encoder reads any."""
+    if not node.doors or node.kind == "none":
+        return ()
+    return ("near_index", "near_attr") if node.near else ("door_index", "door_attr")
+
+
+def tensors(network: Network) -> tuple[str, ...]:
+    """Names of the tensors that a network reads."""
+    return (*dict.fromkeys(needed(part) for part in network.geometry.parts), *GRAPH, *pair_tensors(network.node))
 
 
 def check(network: Network) -> None:

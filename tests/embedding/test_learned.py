@@ -1,0 +1,183 @@
+"""The NumPy run of trained networks: it says what torch says, reads nothing but what it should, and torch stays away."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes_map import building
+from topomerge.embedding.embedders import embedder
+from topomerge.embedding.graph import graph_arrays
+from topomerge.embedding.learned import load_embedder
+from topomerge.embedding.network import Geometry, Network, Node
+from topomerge.embedding.room_cells import joined
+from topomerge.embedding.weights import SETTINGS, WEIGHTS, embedder_folder, read_weights, unpacked
+from topomerge.errors import InputError
+
+ROOT = Path(__file__).parent.parent.parent
+CONFIGS = ROOT / "configs"
+PRETRAINED = ROOT / "topomerge" / "embedding" / "pretrained"
+GEOMETRIES = ("scalars", "engineered", "shapedna", "scalars_engineered", "scalars_shapedna")
+SAGE = Network(Geometry(["scalars"], width=8), Node("sage", 1, width=4), size=8)
+
+
+def graphs() -> dict[str, dict[str, np.ndarray]]:
+    """Arrays of varied maps: a house of one room, one without doors, several storeys, rooms that nothing leads to."""
+    two = building(2, 3)
+    found = {"storeys": graph_arrays(two), "small": graph_arrays(building(1)), "one": graph_arrays(joined(two, np.arange(3)))}
+    alone = dict(found["small"])
+    for name, array in alone.items():
+        if name.startswith(("edge", "door")):
+            alone[name] = array[:, :0] if name.endswith("index") else array[:0]
+    big, keep = found["storeys"], found["storeys"]["edge_index"].min(axis=0) > 2
+    kept = {n: big[n][:, keep] if n == "edge_index" else big[n][keep] for n in ("edge_index", "edge_attr", "edge_pos")}
+    none = {"door_index": np.zeros((2, 0), int), "door_attr": np.zeros((0, 3), np.float32)}
+    return found | {"no edges": alone, "isolated": {**big, **kept, **none}}
+
+
+@pytest.fixture(scope="module")
+def torch():
+    pytest.importorskip("safetensors")
+    return pytest.importorskip("torch")
+
+
+def saved(torch, network: Network, folder: Path, seed: int = 0) -> Path:
+    """A network with weights and statistics that are far from those of a fresh one."""
+    from topomerge.models.embedder import Embedder
+    from topomerge.models.weights import save_embedder
+
+    torch.manual_seed(seed)
+    made = Embedder(network)
+    with torch.no_grad():
+        for name, value in made.state_dict().items():
+            if name != "log_temperature":
+                value.add_(0.1 * torch.rand(value.shape))
+    save_embedder(made, folder, {"data": "none"})
+    return folder
+
+
+def compare(folder: Path, several: dict[str, dict[str, np.ndarray]]) -> None:
+    """Both ways give the same embeddings and dustbins."""
+    from topomerge.models.learned import load_with_torch
+
+    ours, theirs = load_embedder(folder), load_with_torch(folder)
+    assert ours.temperature == pytest.approx(theirs.temperature, abs=1e-7) and ours.about == theirs.about
+    for name, arrays in several.items():
+        for found, wanted in zip(ours.graph(arrays), theirs.graph(arrays), strict=True):
+            assert found.shape == wanted.shape and found.dtype == np.float64
+            assert np.abs(found - wanted).max() < 1e-5, name
+
+
+def test_the_embedder_that_ships_is_as_with_torch(torch):
+    compare(PRETRAINED, graphs())
+    ours, map = load_embedder(), building(2, 2)
+    from topomerge.models.learned import load_with_torch
+
+    theirs = load_with_torch(PRETRAINED)
+    assert np.abs(ours.matchability(map) - theirs.matchability(map)).max() < 1e-5
+    for one, other in zip(ours.probabilities(map, building(3)), theirs.probabilities(map, building(3)), strict=True):
+        assert np.abs(one - other).max() < 1e-5 and np.allclose(one.sum(axis=1), 1)
+
+
+@pytest.mark.parametrize("file", sorted(path.stem for path in (CONFIGS / "node").glob("*.yaml")))
+def test_every_node_encoder_is_as_with_torch(torch, file, tmp_path):
+    yaml = pytest.importorskip("yaml")
+    told = yaml.safe_load((CONFIGS / "node" / f"{file}.yaml").read_text())
+    node = Node(**{k: v for k, v in told.items() if not k.startswith("_")})
+    compare(saved(torch, Network(Geometry(["scalars"], width=16), node, size=24), tmp_path), graphs())
+
+
+@pytest.mark.parametrize("file", GEOMETRIES)
+@pytest.mark.parametrize("jump", ["last", "cat", "max"])
+def test_every_geometry_of_numbers_is_as_with_torch(torch, file, jump, tmp_path):
+    yaml = pytest.importorskip("yaml")
+    told = yaml.safe_load((CONFIGS / "geometry" / f"{file}.yaml").read_text())
+    node = Node("sage", 2, skip=jump == "max", jump=jump, width=8)
+    network = Network(Geometry(told["parts"], width=16), node, size=8)
+    rows = {"small": graphs()["small"], "one": graphs()["one"]}
+    compare(saved(torch, network, tmp_path), rows)
+
+
+def test_networks_that_read_points_go_through_torch(torch, tmp_path, monkeypatch):
+    saved(torch, Network(Geometry(["scalars", "pointnet"], width=8), Node("none"), size=8), tmp_path)
+    assert load_embedder(tmp_path)(building(1)).shape == (3, 8)
+    for name in [n for n in sys.modules if n.startswith("topomerge.models.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)  # as if it were not installed
+    with pytest.raises(InputError, match=r"reads points, for which it needs torch: pip install topomerge\[learn\]"):
+        load_embedder(tmp_path)
+    assert embedder("learned")(building(1)).shape == (3, 64)
+
+
+def test_torch_is_never_imported():
+    code = (
+        "import sys, topomerge as tm; from tests.scenes_map import building; from topomerge.commands import COMMANDS\n"
+        "found = tm.merge([building(1), building(2)]); tm.load_embedder()(building(1)); assert found.descriptor == 'learned'\n"
+        "print([m for m in ('torch', 'torch_geometric', 'safetensors', 'hydra', 'lightning') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def header(data: bytes) -> tuple[dict, bytes]:
+    size = int.from_bytes(data[:8], "little")
+    return json.loads(data[8 : 8 + size]), data[8 + size :]
+
+
+def packed(table: object, body: bytes) -> bytes:
+    text = json.dumps(table).encode()
+    return len(text).to_bytes(8, "little") + text + body
+
+
+def test_numbers_are_read_as_safetensors_reads_them():
+    numpy = pytest.importorskip("safetensors.numpy")
+    data = (PRETRAINED / WEIGHTS).read_bytes()
+    ours, theirs = unpacked(data), numpy.load(data)
+    assert ours.keys() == theirs.keys() and all(np.array_equal(ours[n], theirs[n]) for n in theirs)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: t["project.0.bias"].update(dtype="I64"), "no float32"),
+        (lambda t: t["project.0.bias"].update(shape=[-128]), "no float32"),
+        (lambda t: t["project.0.bias"].update(shape=[1 << 62]), "cut off"),
+        (lambda t: t["project.0.bias"].update(data_offsets=[1 << 40, (1 << 40) + 512]), "cut off"),
+        (lambda t: t["project.0.bias"].update(data_offsets=[0]), "no shape and place"),
+        (lambda t: t.update({"project.0.bias": 3}), "no shape and place"),
+        (lambda t: t.pop("project.0.bias"), "project.0.bias"),
+        (lambda t: t.update({"more": t["project.0.bias"]}), "more is of no layer"),
+        (lambda t: t["project.0.bias"].update(shape=[64], data_offsets=[0, 256]), r"is \(64,\), not \(128,\)"),
+        (lambda t: t["project.0.weight"].update(shape=[192, 128]), "does not fit"),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(change, said, tmp_path):
+    import hashlib
+
+    table, body = header((PRETRAINED / WEIGHTS).read_bytes())
+    change(table)
+    data = packed(table, body)
+    told = json.loads((PRETRAINED / SETTINGS).read_text())
+    (tmp_path / WEIGHTS).write_bytes(data)
+    (tmp_path / SETTINGS).write_text(json.dumps({**told, "sha256": hashlib.sha256(data).hexdigest()}))
+    with pytest.raises(InputError, match=rf"embedder\.safetensors: does not fit .*{said}" if said != "does not fit" else said):
+        load_embedder(tmp_path)
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff" * 8, b"\xff" * 100, b"\x05\0\0\0\0\0\0\0[1,2]", b"\x02\0\0\0\0\0\0\0{"])
+def test_what_is_no_safetensors_file_is_refused(data):
+    with pytest.raises(ValueError):
+        unpacked(data)
+
+
+def test_folders_of_an_embedder(tmp_path):
+    assert embedder_folder(PRETRAINED / WEIGHTS) == PRETRAINED == embedder_folder(PRETRAINED)
+    network, weights, about = read_weights(PRETRAINED)
+    assert network.geometry.parts == ["scalars"] and len(weights) > 40 and "data" in about
+    with pytest.raises(InputError, match="give a run's folder"):
+        load_embedder(tmp_path)
