@@ -1,8 +1,9 @@
 """Fit the coefficients by which merges are believed: ``topomerge/fusion/calibration.json``.
 
-``python benchmarks/calibrate_merge.py gather [folder]`` judges the hypotheses of the cached training pairs
-(`merge_pairs.py train`; resumable), one line of JSON a pair; ``... fit`` fits both logistic models on them, with cross-validation
-over buildings, and prints what is accepted at several thresholds. Only training buildings may be gathered.
+``python benchmarks/calibrate_merge.py gather`` judges the hypotheses of the cached training pairs (`merge_pairs.py train`, and
+`merge_drawings.py train` of maps and floor plans; resumable), one line of JSON a pair; ``... fit`` fits both logistic models on
+them, with cross-validation over buildings, and prints what is accepted at several thresholds. Only training buildings may be
+gathered.
 """
 
 from __future__ import annotations
@@ -21,15 +22,18 @@ from scipy.optimize import minimize
 from topomerge.fusion.closer import closer
 from topomerge.fusion.evidence import plans
 from topomerge.fusion.registration import _order as order
+from topomerge.fusion.scale import search_scaled
 from topomerge.fusion.search import View, search, wrapped
 from topomerge.fusion.verify import CLOSER, LEAD, VECTOR, Judge, closer_vector, lead, rank, vector
 from topomerge.types import Array, Sim3
 
-FOLDER, ROWS = Path("cache/merge/train"), Path("cache/merge/judged.jsonl")
+FOLDER, DRAWN, ROWS = Path("cache/merge/train"), Path("cache/merge/train_drawings"), Path("cache/merge/judged.jsonl")
 TARGET = Path("topomerge/fusion/calibration.json")
+TOLD = ("sensors", "kind", "building", "source", "overlap", "differs", "walls_differ", "scaled")
 KEPT, LOOKED = 25, 2  # hypotheses of a pair, and how many of them are looked at closer
 RIGHT = (0.5, 5.0)  # m, degrees
 STRENGTH = 0.3  # of the second model: the smaller, the simpler
+SAME_WALLS = 3.0  # m2 of walls by which two storeys differ at most that no drawing tells apart
 ALIKE = 0.3  # m by which walls of twin wings differ at most, where both maps look: drift does as much
 MANY = 15  # pairs that are printed
 MISSED = 0.2  # weight of a pair whose right hypothesis is taken away
@@ -52,10 +56,10 @@ def error(pose: Sim3, pair: GridPair) -> list[float] | None:
 
 
 def right(err: Sequence[float] | None, sensors: Sequence[str], limits: tuple[float, float] = RIGHT) -> bool:
-    """Is a pose right? A slice says nothing of its height."""
+    """Is a pose right? A slice or a drawing says nothing of its height."""
     if err is None:
         return False
-    flat = "laser2d" in sensors
+    flat = "laser2d" in sensors or "drawing" in sensors
     return (err[0] if flat else float(np.hypot(err[0], err[1]))) < limits[0] and err[2] < limits[1]
 
 
@@ -68,13 +72,14 @@ def gather(pattern: str = "*", cross: str = "0") -> None:
     """
     done = {json.loads(line)["name"] for line in ROWS.read_text().splitlines()} if ROWS.exists() else set()
     paths = sorted(FOLDER.glob(f"{pattern}.npz"), reverse=True)
-    todo: list[tuple[Path, ...]] = [(p,) for p in paths] + list(strangers(paths, int(cross)))
+    drawn = sorted(DRAWN.glob(f"{pattern}.npz"), reverse=True)
+    todo: list[tuple[Path, ...]] = [(p,) for p in (*drawn, *paths)] + list(strangers(paths, int(cross)))
     for chosen in todo:
         name = "+".join(p.stem for p in chosen)
         if name in done:
             continue
         pair = load(chosen[0]) if len(chosen) == 1 else together(load(chosen[0]), load(chosen[1]))
-        about = {k: pair.about.get(k) for k in ("sensors", "kind", "building", "source", "overlap", "differs")}
+        about = {k: pair.about[k] for k in TOLD if k in pair.about}
         row = {"name": pair.name, "common": pair.common, **about, "hyps": judged(pair)}
         with ROWS.open("a") as out:
             out.write(json.dumps(row) + "\n")
@@ -99,12 +104,13 @@ def together(first: GridPair, second: GridPair) -> GridPair:
 def judged(pair: GridPair) -> list[dict[str, Any]]:
     """Hypotheses with what they are judged by and their errors; the first ones with what only the best one is asked."""
     a, b = ([View(p) for p in plans(g, f)] for g, f in ((pair.a, pair.free[0]), (pair.b, pair.free[1])))
+    find = search_scaled if pair.about.get("scaled") else search
     if order(pair.b) < order(pair.a):
         judge, turn = Judge(b, a), True
-        candidates = search(b, a)
+        candidates = find(b, a)
     else:
         judge, turn = Judge(a, b), False
-        candidates = search(a, b)
+        candidates = find(a, b)
     rows = []
     for k, (c, f, _) in enumerate(rank(candidates, judge)[:KEPT]):
         pose = c.pose.inverse() if turn else c.pose
@@ -216,9 +222,14 @@ def fit() -> None:
 
 
 def fair(row: dict[str, Any]) -> bool:
-    """Pairs that anybody could tell: no twin wings that are the same where both maps look (those of set 0 are so throughout)."""
-    differs = 0.0 if row["name"].startswith("0_") else row.get("differs")
-    return row["kind"] != "same" and (row["kind"] != "twin-wing" or differs is None or differs >= ALIKE)
+    """Pairs that anybody could tell: no twin wings that are the same where both maps look (those of set 0 are so throughout, if
+    nobody measured it), and no drawings of a storey with the same walls."""
+    differs = row.get("differs")
+    if differs is None and row["name"].startswith("0_"):
+        differs = 0.0
+    if row["kind"] == "same" or row.get("walls_differ", SAME_WALLS) < SAME_WALLS:
+        return False
+    return row["kind"] != "twin-wing" or differs is None or differs >= ALIKE
 
 
 def _rounded(value: Any) -> Any:

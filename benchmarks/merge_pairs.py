@@ -2,7 +2,7 @@
 
 ``python benchmarks/merge_pairs.py train 400`` simulates pairs of training buildings into ``cache/merge/train``; ``test`` those of
 the test split. Every sixth pair has much moved furniture, every eighth glass walls, and a quarter must not merge; from seed 2 on
-half of them must not, most of them hard to tell (`MANY`).
+half of them must not, most of them hard to tell (`MANY`); seed 3 is of 2D slices and other storeys (`SLICES`).
 Needs TOPOMERGE_DATA for the buildings from real plans; without it all are procedural.
 """
 
@@ -12,7 +12,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -41,6 +41,7 @@ WEIGHTS = {
     "hard": {"other-building": 0.13, "other-storey": 0.07, "twin-wing": 0.05},
 }
 MANY = {"other-building": 0.1, "other-storey": 0.15, "twin-wing": 0.25}  # hard negatives from seed 2 on
+SLICES = {"other-storey": 0.6}  # hard negatives of seed 3, whose second map is a slice
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +77,10 @@ def recipe(split: str, pairs: int, seed: int = 0) -> Recipe:
     """What the pairs are drawn from."""
     folder = os.environ.get("TOPOMERGE_DATA", "")
     sources = WEIGHTS["sources"] if folder else {"procedural": 1.0}
+    hard = SLICES if seed == 3 else MANY if seed > 1 else WEIGHTS["hard"]
     return Recipe(
         name=f"merge_{split}", split=split, pairs=pairs, seed=seed, folder=folder, sources=dict(sources),
-        kinds=dict(WEIGHTS["kinds"]), sensors=dict(WEIGHTS["sensors"]), hard=dict(MANY if seed > 1 else WEIGHTS["hard"]),
+        kinds=dict(WEIGHTS["kinds"]), sensors=dict(WEIGHTS["sensors"]), hard=dict(hard),
         overlaps=[0.0, 0.1, 0.25, 0.4, 0.6], rooms=[4, 15], two_storeys=0.15,
     )  # fmt: skip
 
@@ -87,7 +89,8 @@ def items(split: str, pairs: int, seed: int = 0) -> tuple[list[Item], Library]:
     """The items, some made harder."""
     whole = recipe(split, pairs, seed)
     plans = library(whole)
-    return [_harder(i, item) for i, item in enumerate(draw_items(whole, plans))], plans
+    drawn = [_harder(i, item) for i, item in enumerate(draw_items(whole, plans))]
+    return [replace(d, sensors=(d.sensors[0], "laser2d")) for d in drawn] if seed == 3 else drawn, plans
 
 
 def _harder(i: int, item: Item) -> Item:
@@ -193,7 +196,11 @@ def sim3_of(matrix: Array) -> Sim3:
 
 def load(path: str | Path, mean: bool = False) -> GridPair:
     """A cached pair; `mean`: with the middles of the points of each cell, which maps that were extracted do not have."""
-    data = archive.read(path, "cached pair")
+    return unpacked(Path(path).stem, archive.read(path, "cached pair"), mean)
+
+
+def unpacked(name: str, data: Mapping[str, Array], mean: bool = False) -> GridPair:
+    """The pair of the arrays of a file."""
     told = json.loads(data["about"].tobytes())
     grids, free = [], []
     for side in "ab":
@@ -205,7 +212,7 @@ def load(path: str | Path, mean: bool = False) -> GridPair:
         empty = data.get(f"{side}.free")
         free.append(None if empty is None else VoxelGrid(empty.astype(np.int32), origin, EDGE, shape))  # type: ignore[arg-type]
     truth = None if np.isnan(data["truth"]).any() else sim3_of(data["truth"])
-    return GridPair(Path(path).stem, grids[0], grids[1], (free[0], free[1]), truth, float(told["common"]), told)
+    return GridPair(name, grids[0], grids[1], (free[0], free[1]), truth, float(told["common"]), told)
 
 
 def make(split: str, pairs: int, seed: int = 0, cache: str = "cache/merge") -> Iterator[Path]:

@@ -140,12 +140,12 @@ def real(rows: Sequence[Row]) -> str:
     return table(["pairs", "number", "right", "right and believed", "wrong and believed", "scale off by", "s", "not right"], out)
 
 
-def put(path: Path, text: str) -> None:
+def put(path: Path, text: str, name: str = "merging") -> None:
     """Replace what stands between the marks, or add the section at the end."""
-    begin, end = "<!-- merging:begin -->", "<!-- merging:end -->"
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
     whole = path.read_text(encoding="utf-8")
     if begin not in whole:
-        whole = f"{whole.rstrip()}\n\n## Merging\n\n{begin}\n{end}\n"
+        whole = f"{whole.rstrip()}\n\n## {name.capitalize()}\n\n{begin}\n{end}\n"
     before, rest = whole.split(begin, 1)
     with replacing(path) as beside:
         beside.write_text(f"{before}{begin}\n{text}\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")

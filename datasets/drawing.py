@@ -17,6 +17,7 @@ from topomerge.types import Array
 
 CELL = 0.05  # m
 WALL = 0.2  # m beside a room that is drawn as wall
+SAME_LEVEL = 1.0  # m between a door and the floor of its storey, at most
 
 
 def with_plan(pair: Pair, building: Building) -> Pair:
@@ -41,23 +42,26 @@ def with_plan(pair: Pair, building: Building) -> Pair:
     )
 
 
-def draw(building: Building) -> Flat:
-    """Walls and floor of the lowest storey; inner doors are open, outer ones shut."""
+def draw(building: Building, storey: int = 0) -> Flat:
+    """Walls and floor of a storey; inner doors are open, outer ones shut."""
     floors = draw_floors(building, CELL)
-    room = floors.room[0] >= 0
+    room = floors.room[storey] >= 0
     door = np.zeros(room.shape, bool)
-    for one in building.doors[(building.doors["rooms"] >= 0).all(axis=1)]:
-        door |= _doorway(one, room.shape, floors.origin)
+    level = np.abs(building.doors["centre"][:, 2] - building.storeys["floor"][storey]) < SAME_LEVEL
+    for one in building.doors[level & (building.doors["rooms"] >= 0).all(axis=1)]:
+        _open(one, door, floors.origin)
     walls = ~room & ~door & (ndimage.distance_transform_edt(~room) * CELL <= WALL)
     source = f"{building.name}:drawing"
     flat = from_masks(walls[::-1], (room | door)[::-1], CELL, (*floors.origin.tolist(), 0.0), rays=False, source=source)
     return replace(flat, rooms=tuple(replace(r, floor=0.0, ceiling=r.ceiling - r.floor) for r in building.rooms))
 
 
-def _doorway(door: Array, shape: tuple[int, ...], origin: Array) -> Array:
-    """Cells of the opening, through the whole wall."""
-    rows, columns = np.indices(shape)
-    x, y = origin[0] + (columns + 0.5) * CELL - door["centre"][0], origin[1] + (rows + 0.5) * CELL - door["centre"][1]
+def _open(door: Array, image: Array, origin: Array) -> None:
+    """Set the cells of the opening, through the whole wall."""
+    x, y = door["centre"][:2].tolist()
+    reach = float(door["thickness"] + door["width"]) / 2 + 4 * CELL
+    row, column = (slice(max(int((v - reach) / CELL), 0), int((v + reach) / CELL) + 1) for v in (y - origin[1], x - origin[0]))
+    rows, columns = np.indices(image[row, column].shape) + np.array([row.start, column.start])[:, None, None]
+    x, y = origin[0] + (columns + 0.5) * CELL - x, origin[1] + (rows + 0.5) * CELL - y
     c, s = np.cos(door["direction"]), np.sin(door["direction"])
-    opening: Array = (abs(x * c + y * s) <= door["thickness"] / 2 + 2 * CELL) & (abs(y * c - x * s) <= door["width"] / 2)
-    return opening
+    image[row, column] |= (abs(x * c + y * s) <= door["thickness"] / 2 + 2 * CELL) & (abs(y * c - x * s) <= door["width"] / 2)

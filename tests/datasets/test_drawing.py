@@ -42,3 +42,16 @@ def test_the_plan_lies_where_the_scan_would_be() -> None:
     assert len(drawn.shared) >= len(pair.visited[0])
     with pytest.raises(InputError, match="one storey"):
         with_plan(replace(pair, kind="twin-wing", shared=()), building)
+
+
+def test_the_upper_storey_has_its_own_rooms_and_doors() -> None:
+    building = make_building("office", 5, 2)
+    for storey in range(2):
+        flat = draw(building, storey)
+        own = [r for r in building.rooms if r.storey == storey]
+        rooms = shapely.union_all([shapely.Polygon(r.polygon) for r in own])
+        assert shapely.contains_xy(rooms.buffer(0.3), *flat.free.T).mean() > 0.95
+        inner = building.doors[(building.doors["rooms"] >= 0).all(axis=1)]
+        inner = inner[[building.rooms[i].storey == storey for i in inner["rooms"][:, 0]]]
+        free = shapely.union_all(shapely.points(flat.free)[::5]).buffer(0.1)
+        assert shapely.distance(free, shapely.points(inner["centre"][:, :2])).max() < 0.2

@@ -1,0 +1,167 @@
+"""Ours, KISS-Matcher (0.2 and 0.3 m), FPFH + RANSAC and FGR on the same pairs, in one run: what is right, and the time it takes.
+
+``python benchmarks/peers.py [seconds]`` works through test pairs (`merge_pairs.py test`, `merge_drawings.py test`) for so many
+seconds of processor, bin by bin and kind by kind in turn. Resumable: a line of JSON a pair with all methods in
+``cache/merge/peers.jsonl``; `peers_table.py` makes the tables of it.
+
+Everyone gets the same two clouds, the means of the points of 0.1 m cells, on one core and one thread. Timed, in seconds of
+processor: from these clouds in memory to the pose; ours also from them to the joined map with its rooms (``extract`` of both,
+``merge``). Of KISS-Matcher its own clock counts, without what its Python binding takes to copy points; it gets points thinned at
+its voxel and its four-degrees-of-freedom solver (Quatro). Open3D has none: its poses are made upright afterwards.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from calibrate_merge import error
+from merge_pairs import GridPair, load
+from register import open3d_features, upright
+
+from topomerge.fusion.evidence import cell_middles
+from topomerge.types import PointCloud, Sim3, VoxelGrid
+
+CACHE = Path("cache/merge")
+TARGET = CACHE / "peers.jsonl"
+VOXEL, ITERATIONS = 0.3, 100_000  # of Open3D
+WHOLE = 3  # every third pair goes the whole way to a joined map
+BINS = {"<40 m²": (1.0, 40.0), "40-80 m²": (40.0, 80.0), "≥80 m²": (80.0, np.inf)}
+ORDER = ["lidar", "other 3D", "slice", "floor plan"]
+Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, s of processor
+
+
+def kind_of(sensors: Sequence[str]) -> str:
+    """What is compared: a lidar's or another scan, a 2D slice or a floor plan, with what."""
+    names = {"laser2d": "slice", "drawing": "floor plan", "lidar": "lidar", "phone": "slice"}
+    one, two = sorted((names.get(s, "other 3D") for s in sensors), key=ORDER.index)
+    return f"{one} - {two}"
+
+
+def bin_of(common: float) -> str:
+    """Of the area that both maps saw."""
+    return next(name for name, (low, high) in BINS.items() if low <= common < high)
+
+
+def cloud(grid: VoxelGrid, free: VoxelGrid | None = None) -> PointCloud:
+    """A grid's points as a cloud."""
+    return PointCloud(np.asarray(grid.properties["mean"], np.float32), free=free)
+
+
+def ours(pair: GridPair) -> Answer:
+    """From points to the pose: cells, plans, search, verdict."""
+    from topomerge.extraction.voxels import voxelise
+    from topomerge.fusion.registration import register
+
+    points = [np.asarray(g.properties["mean"]) for g in (pair.a, pair.b)]
+    began = time.process_time()
+    a, b = (voxelise(PointCloud(p), pair.a.edge) for p in points)
+    found = register(a, b, free=pair.free)
+    return found.transform, found.accepted, time.process_time() - began
+
+
+def whole(pair: GridPair) -> dict[str, float]:
+    """Seconds from two clouds to the joined map and its rooms: extraction of both, and `merge` (joined even where refused)."""
+    from topomerge.extraction.extract import extract
+    from topomerge.fusion.merge import merge
+
+    began = time.process_time()
+    a, b = (extract(cloud(g, f), name=n) for g, f, n in zip((pair.a, pair.b), pair.free, "ab", strict=True))
+    middle = time.process_time()
+    found = merge([a, b], force=True)
+    return {"extract": middle - began, "merge": time.process_time() - middle, "joined": float(found.map is not None)}
+
+
+def kiss(voxel: float) -> Callable[[GridPair], Answer]:
+    """KISS-Matcher; it believes its answer if it says `valid`."""
+
+    def run(pair: GridPair) -> Answer:
+        import kiss_matcher
+        import open3d as o3d
+
+        began = time.process_time()
+        clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cell_middles(g))) for g in (pair.b, pair.a)]
+        thin = [np.asarray(c.voxel_down_sample(voxel).points, np.float32) for c in clouds]
+        before = time.process_time() - began
+        matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(voxel, use_quatro=True))
+        found = matcher.estimate(*thin)
+        steps = ("processing", "extraction", "matching", "rejection", "solver")
+        seconds = before + sum(float(getattr(matcher, f"get_{s}_time")()) for s in steps)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = np.array(found.rotation), np.array(found.translation).ravel()
+        return upright(matrix, pair), bool(found.valid), seconds
+
+    return run
+
+
+def open3d(pair: GridPair) -> dict[str, Answer]:
+    """RANSAC and FGR, with one set of features, whose time counts for both. It has no verdict: an answer counts as believed."""
+    import open3d as o3d
+
+    o3d.utility.random.seed(0)
+    reg = o3d.pipelines.registration
+    began = time.process_time()
+    b, a, fb, fa = open3d_features(pair, VOXEL)
+    features = time.process_time() - began
+    checks = [reg.CorrespondenceCheckerBasedOnEdgeLength(0.9), reg.CorrespondenceCheckerBasedOnDistance(1.5 * VOXEL)]
+    estimate, criteria = reg.TransformationEstimationPointToPoint(False), reg.RANSACConvergenceCriteria(ITERATIONS, 0.999)
+    option = reg.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * VOXEL)
+    run: dict[str, Callable[[], Any]] = {
+        "fpfh": lambda: reg.registration_ransac_based_on_feature_matching(
+            b, a, fb, fa, True, 1.5 * VOXEL, estimate, 3, checks, criteria
+        ),
+        "fgr": lambda: reg.registration_fgr_based_on_feature_matching(b, a, fb, fa, option),
+    }
+    out: dict[str, Answer] = {}
+    for name, method in run.items():
+        began = time.process_time()
+        found = method()
+        out[name] = upright(np.asarray(found.transformation), pair), True, features + time.process_time() - began
+    return out
+
+
+def measured(pair: GridPair, all_the_way: bool) -> dict[str, Any]:
+    """All methods on one pair."""
+    answers = {"ours": ours(pair), "kiss02": kiss(0.2)(pair), "kiss03": kiss(0.3)(pair), **open3d(pair)}
+    told = {
+        name: {"err": None if pose is None else error(pose, pair), "believed": believed, "seconds": seconds}
+        for name, (pose, believed, seconds) in answers.items()
+    }
+    about = {k: pair.about[k] for k in ("sensors", "building", "kind")}
+    return {"name": pair.name, "common": pair.common, **about, "methods": told, "whole": whole(pair) if all_the_way else None}
+
+
+def chosen() -> Iterator[Path]:
+    """Pairs that share something, one of each bin and kind in turn; drawings of unknown scale are left out."""
+    groups: dict[tuple[str, str], list[Path]] = {}
+    for path in sorted(CACHE.glob("test/*.npz")) + sorted(CACHE.glob("test_drawings/*_overlap.npz")):
+        pair = load(path)
+        if pair.about["kind"] == "overlap" and pair.common >= 1 and not pair.about.get("scaled"):
+            groups.setdefault((bin_of(pair.common), kind_of(pair.about["sensors"])), []).append(path)  # type: ignore[arg-type]
+    for k in range(max(map(len, groups.values()))):
+        yield from (paths[k] for _, paths in sorted(groups.items()) if k < len(paths))
+
+
+def run(seconds: float) -> None:
+    """Measure what is missing, until the seconds of processor are used up."""
+    os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})  # KISS-Matcher takes all cores otherwise
+    done = {json.loads(line)["name"] for line in TARGET.read_text().splitlines()} if TARGET.exists() else set()
+    for k, path in enumerate(list(chosen())):
+        if time.process_time() > seconds:
+            return
+        if path.stem not in done:
+            row = measured(load(path, mean=True), k % WHOLE == 0)
+            with TARGET.open("a") as out:
+                out.write(json.dumps(row) + "\n")
+            told = {m: (round(r["seconds"], 1), r["err"] and round(r["err"][0], 2)) for m, r in row["methods"].items()}
+            print(row["name"], row["sensors"], told, row["whole"], flush=True)
+
+
+if __name__ == "__main__":
+    run(float(sys.argv[1]))

@@ -1,0 +1,88 @@
+"""The section "Beside other methods" of docs/results.md from what `peers.py` left in ``cache/merge/peers.jsonl``.
+
+``python benchmarks/peers_table.py docs/results.md``
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from merge_results import NAMES, Row, good, put, share, table
+from peers import BINS, ITERATIONS, TARGET, VOXEL, bin_of, kind_of
+
+FINE = (0.1, 1.0)  # m, degrees
+TEXT = (
+    "Simulated test pairs in which both maps saw something in common, also where no room was entered by both; every bin of the "
+    "area and every kind of sensors in turn. All on the same points (means of 0.1 m cells), one core, one thread, in seconds of "
+    "processor from points in memory to the pose; of KISS-Matcher thinning and what it clocks itself, without its binding's "
+    f"copying, with Quatro for four degrees of freedom; Open3D at {VOXEL} m, RANSAC of {ITERATIONS:,} iterations (0.999), made "
+    "upright afterwards. Right: 0.5 m and 5° in the middle of what both saw (slices and floor plans: horizontally)."
+)
+
+
+def rows_of_methods() -> list[Row]:
+    """A row a pair and method, as `merge_results` has them."""
+    rows = [json.loads(line) for line in TARGET.read_text().splitlines()]
+    return [{**row, **told, "method": m} for row in rows for m, told in row["methods"].items()]
+
+
+def by(rows: Sequence[Row], key: Callable[[Row], str], groups: Sequence[str], name: str) -> str:
+    """A line a group and method: right, within 0.1 m and 1 degree, believed but wrong, seconds."""
+    out = []
+    for group in groups:
+        for method, title in NAMES.items():
+            mine = [r for r in rows if r["method"] == method and key(r) == group]
+            if mine:
+                fine, seconds = [good(r, FINE) for r in mine], [r["seconds"] for r in mine]
+                wrong = sum(r["believed"] and not good(r) for r in mine if r["err"])
+                shares = share(mine, good), f"{100 * np.mean(fine):.0f}", wrong
+                out.append([group, title, len(mine), *shares, f"{np.median(seconds):.1f}", f"{max(seconds):.1f}"])
+    heads = [name, "method", "pairs", "right %", "within 0.1 m, 1° %", "believed, wrong", "s, median", "s, most"]
+    return table(heads, out)
+
+
+def behind(rows: Sequence[Row], keys: Sequence[Callable[[Row], str]]) -> str:
+    """Where another method has more right than ours."""
+    found = []
+    for key in keys:
+        for group in sorted({key(r) for r in rows}):
+            mine = [r for r in rows if key(r) == group]
+            for limit in ((0.5, 5.0), FINE):
+                many = {m: sum(good(r, limit) for r in mine if r["method"] == m) for m in NAMES}
+                more = [f"{NAMES[m]} {n}" for m, n in many.items() if n > many["ours"]]
+                found += [f"{group}, within {limit[0]} m: {', '.join(more)}, topomerge {many['ours']}"] * bool(more)
+    return "; ".join(found) or "nowhere"
+
+
+def section() -> str:
+    """The tables."""
+    rows = rows_of_methods()
+    kinds = sorted({kind_of(r["sensors"]) for r in rows})
+    done = [r["whole"] for r in rows if r["method"] == "ours" and r["whole"]]
+    seconds = {k: np.median([r[k] for r in done]) for k in ("extract", "merge")}
+    longest = max(r["extract"] + r["merge"] for r in done)
+    names = {r["name"] for r in rows if r["method"] == "ours" and r["whole"]}
+    other = {m: np.median([r["seconds"] for r in rows if r["method"] == m and r["name"] in names]) for m in NAMES}
+    return "\n\n".join([
+        "`python benchmarks/merge_pairs.py test 175; python benchmarks/merge_drawings.py test 120; "
+        "python benchmarks/peers.py 900; python benchmarks/peers_table.py docs/results.md`",
+        TEXT,
+        by(rows, lambda r: bin_of(r["common"]), list(BINS), "in common"),
+        by(rows, lambda r: kind_of(r["sensors"]), kinds, "kind"),
+        f"More right by another method: {behind(rows, [lambda r: bin_of(r['common']), lambda r: kind_of(r['sensors'])])}.",
+        f"The whole way, on {len(done)} of the pairs: extraction of both maps {seconds['extract']:.1f} s, merge with the joined "
+        f"map and its rooms {seconds['merge']:.1f} s (medians; the longest pair {longest:.1f} s). To the pose alone, on the same "
+        "pairs: "
+        + ", ".join(f"{NAMES[m]} {s:.1f} s" for m, s in other.items()) + ".",
+    ])  # fmt: skip
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        put(Path(sys.argv[1]), section(), "peers")
+    else:
+        print(section())
