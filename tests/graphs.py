@@ -75,7 +75,7 @@ def pair(seed: int, rooms: int = 7) -> GraphPair:
     where = rooms_of.argsort()
     matches = torch.tensor([(i, int(where[i])) for i in range(1, rooms)])
     true = (torch.arange(rooms), torch.where(rooms_of > 0, rooms_of, torch.tensor(-1)))
-    return GraphPair(a, b, matches, true, (torch.ones(rooms), torch.ones(rooms)), {"building": f"b{seed}"})
+    return GraphPair(a, b, matches, true, (torch.ones(rooms), torch.ones(rooms)), {"building": f"b{seed}"}, torch.eye(4))
 
 
 def write_set(folder: Path, name: str, pairs: int) -> Path:
@@ -90,7 +90,7 @@ def write_set(folder: Path, name: str, pairs: int) -> Path:
             arrays |= {f"{side}.{n}": t.numpy() for n, t in tensors.items()}
             arrays[f"{side}.room_points"] = g["room_points"].numpy().astype(np.float32) / 1000
             arrays |= {f"{side}.true_room": true.numpy().astype(np.int32), f"{side}.true_iou": iou.numpy()}
-        arrays["matches"] = one.matches.numpy()
+        arrays |= {"matches": one.matches.numpy(), "transform": one.transform.double().numpy()}
         archive.write(arrays, folder / "pairs" / f"{name}{k}.npz")
         rows.append({"file": f"{name}{k}.npz", "building": f"b{k}", "source": "procedural", "sensors": ["tls", "depth"]})
     (folder / f"{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))

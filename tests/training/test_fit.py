@@ -108,12 +108,13 @@ def test_validation_of_a_perfect_and_of_a_blind_network():
     pairs = [pair(k) for k in range(3)]
     net = Embedder(SMALL).eval()
     net.fit_scales([g for p in pairs for g in (p.a, p.b)])
-    assert validate(net, pairs)["recall@1"] > 0.9  # the maps are nearly equal, and so are embeddings by any network
+    good = validate(net, pairs)
+    assert good["recall@1"] > 0.9 and good["merged"] == 1  # the maps are nearly equal, and so are embeddings by any network
     blind = Embedder(SMALL)
     for weights in blind.parameters():
         torch.nn.init.zeros_(weights)
     scored = validate(blind, pairs)
-    assert scored["recall@1"] == 0 and scored["rooms"] == 36 and 0 <= scored["f1"] <= 1
+    assert scored["recall@1"] == 0 and scored["rooms"] == 36 and scored["mergeable"] == 3 and 0 <= scored["f1"] <= 1
 
 
 def test_overfit_one_batch(settings):

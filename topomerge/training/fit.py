@@ -117,7 +117,7 @@ class Run:
             left = clock.left(epoch + 1)
             self.say(
                 f"epoch {epoch + 1}/{settings.epochs} loss {row['train/loss']:.3f} recall@1 {scored['recall@1']:.3f} "
-                f"@5 {scored['recall@5']:.3f} F1 {scored['f1']:.3f}{' *' if better else ''} "
+                f"@5 {scored['recall@5']:.3f} F1 {scored['f1']:.3f} merged {scored['merged']:.2f}{' *' if better else ''} "
                 f"{row['rooms_per_second']:.0f} rooms/s, {left} left"
             )
         if self.log is not None:

@@ -23,7 +23,7 @@ from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array
 
-FORMAT = 3
+FORMAT = 4
 CHUNK = 100  # pairs; descriptors that take long are kept chunk by chunk
 TABLES = ("x", "edge_attr", "door_attr", "pos", "edge_pos")  # no network reads positions: they depend on the frame
 INDICES = ("edge_index", "door_index", "near_index")
@@ -49,6 +49,7 @@ class GraphPair:
         true: (R,) true room of each room of a and of b, -1 none.
         iou: (R,) how much of each room and of its true room is common to both.
         about: building, sensors, overlap, source, ...
+        transform: (4, 4) T_ab, which maps points of b into the frame of a; nan where there is none.
     """
 
     a: Graph
@@ -57,6 +58,7 @@ class GraphPair:
     true: tuple[Tensor, Tensor]
     iou: tuple[Tensor, Tensor]
     about: dict[str, Any]
+    transform: Tensor
 
 
 def load_pairs(
@@ -74,7 +76,10 @@ def load_pairs(
     """
     path = Path(manifest)
     if path.suffix == ".npz":
-        return _with_layout(_unpacked(archive.read(path, "packed set"), {})[: limit or None], extras)
+        arrays = archive.read(path, "packed set")
+        if "transform" not in arrays:
+            raise InputError(f"{path}: was packed by an earlier version; give its manifest, and it is packed again")
+        return _with_layout(_unpacked(arrays, {})[: limit or None], extras)
     rows = _rows(path)
     names = [str(row["file"]) for row in rows]
     digest = hashlib.sha256(json.dumps([FORMAT, names]).encode()).hexdigest()[:12]
@@ -121,6 +126,7 @@ def _packed(pairs: list[dict[str, Array]], rows: list[dict[str, Any]]) -> dict[s
     out["true"] = np.concatenate([side["true_room"] for side in sides]).astype(np.int32)
     out["iou"] = np.concatenate([side["true_iou"] for side in sides]).astype(np.float32)
     out["matches"] = np.concatenate([pair["matches"] for pair in pairs]).astype(np.int32)
+    out["transform"] = np.stack([pair["transform"] for pair in pairs])
     out["partners"] = np.array([len(pair["matches"]) for pair in pairs])
     told = json.dumps([_short(row) for row in rows], ensure_ascii=False)
     return out | {"about": np.frombuffer(told.encode(), np.uint8)}
@@ -145,7 +151,8 @@ def _unpacked(arrays: dict[str, Array], extras: dict[str, Array]) -> list[GraphP
     told = json.loads(arrays["about"].tobytes())
     iou = torch.from_numpy(arrays["iou"]).split(counts["rooms"])
     truth = [list(zip(of[::2], of[1::2], strict=True)) for of in (true, iou)]
-    return [GraphPair(*one) for one in zip(graphs[::2], graphs[1::2], matches, *truth, told, strict=True)]
+    poses = torch.from_numpy(arrays["transform"]).unbind()
+    return [GraphPair(*one) for one in zip(graphs[::2], graphs[1::2], matches, *truth, told, poses, strict=True)]
 
 
 def _extra(name: str, arrays: dict[str, Array], whole: Path, say: Callable[[str], None], limit: int) -> Array:

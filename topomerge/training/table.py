@@ -10,7 +10,7 @@ from typing import Any
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 
-SHOWN = ("recall@1", "recall@1_single", "recall@1_twin", "recall@5", "mrr", "precision", "recall", "f1")
+SHOWN = ("recall@1", "recall@1_single", "recall@1_twin", "recall@5", "mrr", "precision", "recall", "f1", "merged")
 
 
 class SweepTable:
@@ -72,7 +72,7 @@ def _best(run: Path) -> dict[str, Any] | None:
         else "yes",
         "loss": told["loss"]["kind"],
         "seed": told["seed"],
-        **{name: best[f"val/{name}"] for name in SHOWN},
+        **{name: best.get(f"val/{name}", "–") for name in SHOWN},
         "epoch": best["epoch"] + 1,
         "s an epoch": sum(float(row["seconds"]) for row in rows) / len(rows),
     }
