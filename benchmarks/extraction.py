@@ -33,7 +33,7 @@ CODE = ("topomerge/extraction", "topomerge/kernels", "topomerge/metrics.py", "to
 def code_hash() -> str:
     """Of all that the numbers depend on beside the scan."""
     paths = [ROOT / name for name in CODE]
-    files = [f for p in paths for f in (sorted(p.rglob("*.*")) if p.is_dir() else [p]) if f.suffix in (".py", ".json")]
+    files = [f for p in paths for f in (sorted(p.rglob("*.*")) if p.is_dir() else [p]) if f.suffix in (".py", ".json", ".npz")]
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
 
 

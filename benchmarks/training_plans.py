@@ -41,7 +41,7 @@ SEEDS = {"network": 100_000, "judge": 200_000}  # of the first building; trainin
 TRUTHS = ("inside", "wall", "doorway", "shut", "outside")  # furniture is inside
 EDGES = (0.1, 0.1, 0.1, 0.08, 0.15)  # m
 SOURCES = {"tls": 0.16, "lidar": 0.16, "depth": 0.12, "tablet": 0.12, "mono": 0.08, "laser2d": 0.2, "drawn": 0.16}
-SPOILS = {"": 0.62, "sparse": 0.12, "noise": 0.1, "below2": 0.1, "drift": 0.06}
+SPOILS = {"": 0.48, "sparse": 0.16, "noise": 0.1, "below2": 0.1, "drift": 0.06, "above": 0.1}  # above: the upper half of rooms only
 ROOMS = (4, 9)  # that are visited: at least, less than
 FINE = 0.05  # m, of the rasters of what is true
 WALL = 0.4  # m: so far from a room it is wall, further outside
@@ -93,7 +93,7 @@ def save(path: Path, examples: list[Example]) -> None:
         small |= {name: np.asarray(small[name], np.float32) for name in ("ceiling", "clear")}
         arrays |= {f"{name}.{k}": v for name, v in small.items()}
         arrays |= {f"{name}.{k}": getattr(e, name) for name in ("room", "truth", "visited", "source")}
-    beside = path.with_name("new.npz")
+    beside = path.with_name(f"new_{path.name}")
     np.savez_compressed(beside, **arrays)
     os.replace(beside, path)
 
@@ -170,7 +170,20 @@ def scanned(building: Building, name: str, visited: Array, rng: np.random.Genera
     if sensor.drift:
         straight = scan(building, _exact(sensor), visited, np.random.default_rng(seed), budget=8)
         shift = _drift_of(cloud, straight)
-    return replace(_spoilt(cloud, building, spoil, rng), rooms=()), shift
+    cloud = upper(cloud, building, rng) if spoil == "above" else _spoilt(cloud, building, spoil, rng)
+    return replace(cloud, rooms=()), shift
+
+
+def upper(cloud: PointCloud, building: Building, rng: np.random.Generator) -> PointCloud:
+    """The upper half of rooms, as somebody with a tablet captures it; no point lies in the joints of the ceiling's panels."""
+    floor = building.storeys["floor"]
+    storey = np.clip(np.searchsorted(floor - 0.3, cloud.points[:, 2]) - 1, 0, None)
+    height = cloud.points[:, 2] - floor[storey]
+    panel, joint = rng.choice([0.6, 0.625, 1.2, 2.4], 2), rng.uniform(0.0, 0.12)
+    gap = (np.mod(cloud.points[:, :2] - rng.uniform(0, 1, 2), panel) < joint).any(axis=1) & (height > 2.2)
+    kept = (height > rng.uniform(0.9, 1.6)) & ~gap
+    pose_of = None if cloud.pose_of is None else cloud.pose_of[kept]
+    return replace(cloud, points=cloud.points[kept], labels=None, pose_of=pose_of)
 
 
 def drawn(building: Building, visited: Array, rng: np.random.Generator) -> PointCloud:

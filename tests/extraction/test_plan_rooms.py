@@ -12,10 +12,11 @@ from topomerge.extraction.judge import door_probability
 from topomerge.extraction.partition import merge_regions
 from topomerge.extraction.passages import FEATURES, clearance_of, features, find_passages, regions_of
 from topomerge.extraction.plan import storey_plan
+from topomerge.extraction.plan_rooms import _upper_side
 from topomerge.extraction.segment import segment
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
-from topomerge.types import Array, PointCloud, TopometricMap
+from topomerge.types import STOREY_DTYPE, Array, PointCloud, TopometricMap
 
 CORRIDOR_ROOMS = [(x, y) for x in (2, 6, 10, 14) for y in (2, 8)]
 
@@ -185,3 +186,12 @@ def test_passages_measure_the_door() -> None:
     sizes = np.bincount(region[region >= 0])
     assert len(np.unique(parted.room[sizes * 0.01 > 1])) == 2
     assert len(np.unique(never.room)) == 1 and len(np.unique(always.room)) == len(sizes)
+
+
+def test_what_nothing_is_above_at_the_height_of_a_ceiling_is_no_storey() -> None:
+    levels = np.array([(0.0, 2.6, 90.0), (2.5, np.nan, 20.0)], STOREY_DTYPE)
+    assert _upper_side(levels[1], levels[:1])
+    for floor, ceiling in ((2.9, np.nan), (2.5, 5.1)):  # a slab above it; something above it
+        levels[1] = (floor, ceiling, 20.0)
+        assert not _upper_side(levels[1], levels[:1])
+    assert not _upper_side(levels[0], levels[:0])

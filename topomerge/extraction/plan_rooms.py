@@ -28,6 +28,7 @@ LEAST_HALF_WIDTH = 0.35  # m: what is nowhere wider is the edge of a facade or o
 DOORWAY = 0.5  # m: so far the navigable volume goes on into what looks like wall: the openings of noisy scans
 SHEET = 0.2  # m: thinner than a floor that carries somebody
 HEADROOM, HIGHEST = 1.2, 8.0  # m of empty space under a ceiling: at least, at most
+SLAB = 0.15  # m: a thinner one parts no storeys
 OPEN_ALL_AROUND = 0.25  # share of the outline with walls, and of the floor with a ceiling: less, and a floor may be a ceiling
 
 
@@ -58,7 +59,7 @@ def rooms_of_plans(grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: f
     probability: dict[Pair, float] = {}
     rooms = areas = 0
     for k in range(int(storey.max(initial=-1)) + 1):
-        if not (level == k).any():
+        if not (level == k).any() or _upper_side(storeys[k], storeys[:k]):
             continue
         plan = storey_plan(coarse, walk, level, k)
         chance = segment(plan)
@@ -99,6 +100,11 @@ def _partition(
         kept_areas, area_of = kept_areas[1:], area_of - 1
     doors = {(int(number[a]), int(number[b])): p for (a, b), p in found.probability.items() if number[a] >= 0 and number[b] >= 0}
     return room_of[region], np.append(area_of, -1)[region], room_of[kept_areas], {(min(k), max(k)): p for k, p in doors.items()}
+
+
+def _upper_side(top: Array, below: Array) -> bool:
+    """Is a storey with nothing above it the ceiling of one below? A floor lies a slab above that."""
+    return bool(np.isnan(top["ceiling"]) and (np.abs(below["ceiling"] - top["floor"]) < SLAB).any())
 
 
 def _without_ceilings(grid: VoxelGrid, plan: Plan, region: Array) -> Array:
