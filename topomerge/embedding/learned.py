@@ -205,6 +205,8 @@ class Forward:
         """`models.layers.Standardise`."""
         x = np.asarray(x, np.float64)
         mean, spread = (self._get(f"{name}.{which}", x.shape[1:]) for which in ("mean", "spread"))
+        if not (spread > 0).all():
+            raise ValueError(f"{name}.spread: is not above 0")
         out: Array = np.clip((np.sign(x) * np.log1p(np.abs(x)) - mean) / spread, -5, 5)
         return out
 
