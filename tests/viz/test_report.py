@@ -6,7 +6,6 @@ import base64
 import hashlib
 import json
 import re
-import shutil
 import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -17,6 +16,7 @@ import pytest
 
 from tests.scenes import two_rooms
 from tests.scenes_map import HEIGHT, building
+from tests.viz.chromium import browser
 from tests.viz.test_figures import without_rooms
 from topomerge.cli import main
 from topomerge.errors import InputError
@@ -291,14 +291,6 @@ window.addEventListener("load", () => setTimeout(() => {
   document.title = JSON.stringify(seen);
 }, 500));
 """
-
-
-def browser() -> str:
-    for name in ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"):
-        path = shutil.which(name)
-        if path:
-            return path
-    pytest.skip("no Chromium here: apt-get install chromium")
 
 
 def browse(page: Path, *more: str) -> tuple[str, list[str]]:

@@ -10,7 +10,7 @@ import numpy as np
 from topomerge.io.palette import NO_ROOM, room_colours
 from topomerge.types import Array, TopometricMap
 
-MOST = 600_000  # cells that are drawn once the view rests; of a map with more, neighbours are merged
+MOST = 2_500_000  # cells that are drawn once the view rests; of a map with more, neighbours are merged
 LONGEST = 65_535  # cells along an axis that 16 bits can number
 
 

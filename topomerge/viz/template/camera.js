@@ -1,5 +1,7 @@
 // A camera that orbits a target, z up. Matrices are column-major, as WebGL wants them.
 
+const HALF = Math.tan(0.42); // of half of the field of view, across the shorter side
+
 function makeCamera(centre, size, turn, storeys) { // `turn`: what stands upright on paper does here, too
   return { target: [...centre], distance: size * (0.72 + 0.24 * Math.min(storeys - 1, 4)), yaw: -Math.PI / 2 - turn, pitch: storeys > 1 ? 0.75 : 0.95, size };
 }
@@ -20,7 +22,7 @@ const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 function matrixOf(camera, aspect) {
   const axes = axesOf(camera), eye = eyeOf(camera);
   const near = Math.max(camera.distance * 0.02, 0.05), far = camera.distance + camera.size * 3 + 10;
-  const f = 1 / Math.tan(0.42); // half of the field of view, rad, across the shorter side
+  const f = 1 / HALF;
   const scale = [aspect > 1 ? f / aspect : f, aspect > 1 ? f : f * aspect];
   const moved = axes.map((axis) => -dot(axis, eye));
   const a = (far + near) / (near - far), b = (2 * far * near) / (near - far);
@@ -44,7 +46,7 @@ function orbit(camera, dx, dy) {
 }
 
 function pan(camera, dx, dy, height) {
-  const step = (camera.distance * 2 * Math.tan(0.42)) / height;
+  const step = (camera.distance * 2 * HALF) / height;
   const [right, up] = axesOf(camera);
   camera.target = camera.target.map((value, i) => value - dx * step * right[i] + dy * step * up[i]);
 }

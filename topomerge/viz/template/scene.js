@@ -1,6 +1,10 @@
 // The 3D view of a map's cells: its controls, and what is drawn when.
 
-const LONGEST = 400; // ms that one pass may take once the view rests: what is not drawn by then follows in the next
+// While the view moves, cells are left out (down to FEWEST) so that a picture comes every QUICK ms; once it rests, all are
+// drawn behind the screen, in passes of about LONGEST ms, so that the page never stands still.
+const QUICK = 60, LONGEST = 120;
+const BEGIN = 200000, FEWEST = 50000; // cells that are drawn before it is known how long that takes, and at least
+const FINE = 1.5; // pixels: smaller cubes are drawn as squares
 
 function control(kind, words, settings, changed) {
   const label = document.createElement("label"), input = document.createElement("input"), output = document.createElement("output");
@@ -10,10 +14,10 @@ function control(kind, words, settings, changed) {
   return label;
 }
 
-function openScene(place) {
+async function openScene(place) {
   const missing = place.querySelector(".missing");
   try {
-    if (!startScene(place)) place.replaceChildren(missing);
+    if (!(await startScene(place))) place.replaceChildren(missing);
     place.dataset.state = place.contains(missing) ? "missing" : "shown";
   } catch (error) { // a driver that compiles nothing
     place.replaceChildren(missing);
@@ -22,27 +26,28 @@ function openScene(place) {
   place.classList.remove("waiting");
 }
 
-function startScene(place) {
+async function startScene(place) {
   const data = JSON.parse(document.getElementById(place.dataset.scene).textContent);
   const stage = document.createElement("div"), canvas = document.createElement("canvas"), words = document.createElement("canvas");
   stage.className = "stage";
   words.className = "words";
   stage.tabIndex = 0;
   stage.append(canvas, words);
-  const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true, powerPreference: "high-performance" });
+  const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true, powerPreference: "high-performance" });
   if (!gl || !data.drawn) return false; // the words that stand there say why
   const missing = place.querySelector(".missing");
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); stopped(place, missing); });
   const made = program(gl), at = (name) => gl.getUniformLocation(made, name);
-  const cells = decode(data), texture = gl.createTexture();
-  upload(gl, cells.cells);
+  const cells = await decode(data), texture = gl.createTexture();
+  upload(gl, cells);
+  const hidden = gl.createFramebuffer();
   const extent = data.shape.map((n) => n * data.edge);
   const [near, far] = data.look || [[0, 0, 0], extent];
   const size = Math.hypot(far[0] - near[0], far[1] - near[1]);
   const camera = makeCamera(near.map((v, i) => (v + far[i]) / 2), size, data.turn, data.storeys.length);
   const start = { ...camera, target: [...camera.target] };
   const shown = data.storeys.map(() => true);
-  const state = { cut: 2, apart: 0, numbers: true, colour: Object.keys(data.colours)[0], share: 1, rest: 1, drawn: 0, still: true, timer: 0, asked: false };
+  const state = { cut: 2, apart: 0, numbers: true, colour: Object.keys(data.colours)[0], share: Math.min(BEGIN / data.drawn, 1), rest: Math.min(BEGIN / data.drawn, 1), cubes: false, slow: false, drawn: 0, pass: null, began: 0, still: true, timer: 0, asked: false };
   let last = 0;
 
   function recolour() {
@@ -55,11 +60,7 @@ function startScene(place) {
 
   function frame(time) {
     state.asked = false;
-    if (!state.still && last) { // too slow while moving: draw fewer, larger cubes
-      const took = time - last;
-      if (took > 45) state.share = Math.max(state.share * 0.7, 0.02);
-      else if (took < 22) state.share = Math.min(state.share * 1.15, 1);
-    }
+    if (!state.still && last) adapt(time - last);
     last = state.still ? 0 : time;
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     for (const one of [canvas, words]) {
@@ -68,15 +69,46 @@ function startScene(place) {
     }
     if (!canvas.width) return;
     const matrix = matrixOf(camera, canvas.width / canvas.height);
-    if (state.still) {
-      drawCells(matrix, state.drawn, Math.min(state.drawn + state.rest, 1), 1);
-      state.drawn += state.rest;
-      if (state.drawn < 1) again();
-    } else drawCells(matrix, 0, state.share, Math.min(1 / Math.sqrt(state.share), 4));
+    if (!state.still || (state.drawn === 0 && state.rest < 1)) {
+      drawCells(matrix, 0, state.share, Math.min(1 / Math.sqrt(state.share), 4), state.cubes);
+    }
+    if (state.still) pass(matrix);
+    if (!state.still || state.drawn < 1) again();
+    stage.dataset.whole = state.still && state.drawn === 1;
     drawNumbers(matrix, ratio);
   }
 
-  function drawCells(matrix, from, to, cube) { // shares of the cells of each storey; what was drawn before stays
+  function pass(matrix) { // some more of the cells, once those before are drawn
+    if (state.pass) {
+      if (gl.clientWaitSync(state.pass, 0, 0) === gl.TIMEOUT_EXPIRED) return;
+      gl.deleteSync(state.pass);
+      state.pass = null;
+      const took = performance.now() - state.began;
+      state.rest = Math.min(Math.max(state.rest * (took > 1.5 * LONGEST ? 0.5 : took < 0.5 * LONGEST ? 1.6 : 1), 0.002), 1);
+    }
+    const whole = [canvas.width, canvas.height], to = Math.min(state.drawn + state.rest, 1);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, hidden);
+    if (state.drawn === 0) makeRoom(gl, ...whole);
+    drawCells(matrix, state.drawn, to, 1, (pixels() * data.edge) / camera.distance > FINE);
+    state.drawn = to;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    if (to === 1) show(gl, hidden, ...whole);
+    else state.pass = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    state.began = performance.now();
+  }
+
+  function adapt(took) { // as many cells as this machine can draw in time
+    const fewest = Math.min(FEWEST / data.drawn, 1);
+    if (took > 1.5 * QUICK && state.cubes) [state.cubes, state.slow] = [false, true];
+    else if (took > 1.5 * QUICK) state.share = Math.max(state.share * 0.7, fewest);
+    else if (took < 0.6 * QUICK && state.share < 1) state.share = Math.min(state.share * 1.15, 1);
+    else if (took < 0.6 * QUICK) state.cubes = !state.slow;
+  }
+
+  const pixels = () => (0.5 * Math.min(canvas.width, canvas.height)) / HALF; // of 1 m at a distance of 1 m
+
+  function drawCells(matrix, from, to, size, cubes) { // shares of the cells of each storey; what was drawn before them stays
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.clearColor(...rgb(hexOf("--faint")).map((v) => v / 255), 1);
     if (from === 0) gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
@@ -86,30 +118,24 @@ function startScene(place) {
     gl.uniformMatrix4fv(at("matrix"), false, matrix);
     gl.uniform3fv(at("eye"), eyeOf(camera));
     gl.uniform1f(at("edge"), data.edge);
-    gl.uniform1f(at("size"), cube);
+    gl.uniform1f(at("size"), size);
     gl.uniform1f(at("tall"), 2.5);
+    gl.uniform1f(at("pixels"), pixels());
+    gl.uniform1i(at("cells"), 1);
+    const corners = cubes ? 18 : 1;
+    gl.uniform1i(at("corners"), corners);
+    let drawn = 0;
     data.storeys.forEach(({ floor }, storey) => {
       if (!shown[storey] || !cells.count[storey]) return;
       const ground = floor - data.origin[2];
       gl.uniform1f(at("ground"), ground);
       gl.uniform2f(at("level"), state.apart * storey, state.cut === null ? 1e9 : (ground + state.cut) / data.edge);
       const [first, end] = [from, to].map((share) => Math.ceil(cells.count[storey] * share));
-      gl.vertexAttribIPointer(0, 4, gl.UNSIGNED_SHORT, 8, 8 * (cells.first[storey] + first));
-      gl.drawElementsInstanced(gl.TRIANGLES, 18, gl.UNSIGNED_SHORT, 0, end - first);
+      gl.uniform1i(at("first"), cells.first[storey] + first);
+      gl.drawArrays(cubes ? gl.TRIANGLES : gl.POINTS, 0, corners * (end - first));
+      drawn += end - first;
     });
-  }
-
-  function measure() { // where a computer draws without a graphics card, not all cells in one go: it would stand still
-    const matrix = matrixOf(camera, canvas.width / canvas.height), pixel = new Uint8Array(4);
-    const took = [0.001, 0.001, 0.1].map((share) => { // the first also makes the shaders ready
-      const began = performance.now();
-      drawCells(matrix, 0, share, 1);
-      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // waits for the drawing
-      return performance.now() - began;
-    });
-    const all = (took[2] - took[1]) * 10;
-    state.rest = Math.min(Math.max((LONGEST - took[1]) / Math.max(all, 1), 0.05), 1);
-    state.share = Math.min(state.rest, 60 / Math.max(all, 1));
+    stage.dataset.drawn = drawn;
   }
 
   function drawNumbers(matrix, ratio) {
@@ -129,7 +155,7 @@ function startScene(place) {
       if (!shown[storey] || (storey < top && state.apart < 0.1 * size)) continue; // those above would stand on those below
       const z = data.storeys[storey].floor - data.origin[2] + 0.6 + state.apart * storey;
       const spot = project(matrix, [x - data.origin[0], y - data.origin[1], z], words.width, words.height);
-      if (!spot || taken.some(([u, v]) => Math.abs(u - spot[0]) < 20 * ratio && Math.abs(v - spot[1]) < 13 * ratio)) continue;
+      if (!spot || taken.some(([u, v]) => Math.abs(u - spot[0]) < (6 + 8 * key.length) * ratio && Math.abs(v - spot[1]) < 13 * ratio)) continue;
       taken.push(spot);
       pen.strokeText(key, spot[0], spot[1]);
       pen.fillText(key, spot[0], spot[1]);
@@ -138,6 +164,8 @@ function startScene(place) {
 
   function ask() { // from anew
     state.drawn = 0;
+    gl.deleteSync(state.pass);
+    state.pass = null;
     again();
   }
 
@@ -161,7 +189,7 @@ function startScene(place) {
     const cut = control("range", "Cut at", { min: 0.1, max: tallest + 0.1, step: 0.1, value: state.cut }, (value, output) => {
       state.cut = value > tallest ? null : value;
       output.textContent = state.cut === null ? "nothing" : `${value.toFixed(1)} m`;
-      ask();
+      moved();
     });
     const parts = [cut];
     if (data.storeys.length > 1) {
@@ -172,7 +200,7 @@ function startScene(place) {
         start.target[2] += rise;
         state.apart = value;
         output.textContent = `${value.toFixed(1)} m`;
-        ask();
+        moved();
       }));
       const boxes = document.createElement("span");
       boxes.className = "layers";
@@ -215,7 +243,6 @@ function startScene(place) {
   told.textContent = `Drag to turn, with shift to move; click, then scroll to zoom.${merged}`;
   place.replaceChildren(controls(), stage, told);
   [canvas.width, canvas.height] = [stage.clientWidth, stage.clientHeight];
-  measure();
   startCamera(stage, camera, moved);
   document.addEventListener("lit", () => { recolour(); ask(); });
   document.addEventListener("theme", () => { recolour(); ask(); });

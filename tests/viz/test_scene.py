@@ -1,0 +1,70 @@
+"""The 3D view in real time: millions of cells are shown, and the page never stands still meanwhile."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes_map import building
+from tests.viz.chromium import Page
+from topomerge.viz.report import save_report
+from topomerge.viz.scene import scene_data
+
+FEWEST = 50_000  # cells that are drawn at least while the view moves, as scene.js has it
+WHOLE = "document.querySelector('.stage') && document.querySelector('.stage').dataset.whole === 'true'"
+# Turns the building and notes ms from picture to picture, how many cells each has, and the longest ms until all are drawn.
+ORBIT = """(async () => {
+  const stage = document.querySelector(".stage"), next = () => new Promise(requestAnimationFrame);
+  stage.scrollIntoView();
+  const at = (type, x) => stage.dispatchEvent(new PointerEvent(type, { bubbles: true, clientX: x, clientY: 300, pointerId: 1 }));
+  const took = [], drawn = [];
+  let last = performance.now(), rest = 0;
+  const tick = () => { const now = performance.now(), passed = now - last; last = now; return passed; };
+  at("pointerdown", 100);
+  for (let i = 0; i < 60; i++) {
+    at("pointermove", 100 + 4 * i);
+    await next();
+    took.push(tick());
+    drawn.push(Number(stage.dataset.drawn));
+  }
+  at("pointerup", 340);
+  const began = last;
+  while (stage.dataset.whole !== "true" && last - began < 60000) {
+    await next();
+    rest = Math.max(rest, tick());
+  }
+  return { took, drawn, rest, all: last - began };
+})()"""
+
+
+@pytest.mark.slow
+def test_two_million_cells_are_turned(tmp_path: Path) -> None:
+    map = building(38, 4)
+    assert len(map.grid) > 2_000_000
+    began = time.perf_counter()
+    save_report(map, tmp_path / "a.html")
+    written = time.perf_counter() - began
+    size = (tmp_path / "a.html").stat().st_size
+    total = scene_data(map)["drawn"]
+    assert size < 6e6 and total == len(map.grid)
+    began = time.perf_counter()
+    with Page(tmp_path / "a.html", tmp_path / "profile") as page:
+        page.wait(WHOLE)
+        opened = time.perf_counter() - began
+        seen = page.run(ORBIT)
+        page.theme("dark")
+        page.wait(WHOLE)
+        errors = [line for line in page.console if "GPU stall due to ReadPixels" not in line]  # of software drawing
+    took, drawn = np.array(seen["took"][5:]), np.array(seen["drawn"][5:])
+    print(
+        f"\n{len(map.grid):,} cells, {total:,} drawn, {size / 1e6:.1f} MB, written in {written:.1f} s, whole in {opened:.1f} s;"
+        f" turning: {np.median(took):.0f} ms a picture, at most {took.max():.0f}, of {np.median(drawn):,.0f} cells;"
+        f" at rest all after {seen['all'] / 1000:.1f} s, pictures up to {seen['rest']:.0f} ms apart"
+    )
+    assert errors == []
+    assert seen["all"] < 60_000
+    assert drawn.min() >= FEWEST and drawn.max() <= total
+    assert np.median(took) < 500 and seen["rest"] < 3000  # a machine that is busy with other things, without a graphics card
