@@ -22,6 +22,7 @@ from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.errors import InputError
 from topomerge.training import fit as loop
+from topomerge.training.__main__ import main
 from topomerge.training.batches import changed, make_batch
 from topomerge.training.fit import fit, hold_out, pace
 from topomerge.training.packed import load_pairs
@@ -267,20 +268,20 @@ def run(words: list[str]) -> subprocess.CompletedProcess:
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, env=environment)
 
 
-def test_without_hydra(settings, tmp_path):
+def test_without_hydra(settings, tmp_path, capsys):
     """On a machine with no Hydra and no Open3D, and without importing the extraction."""
     (tmp_path / "run.json").write_text(json.dumps({**to_dict(settings), "epochs": 1}))
     code = (
-        "import sys; from topomerge.training.__main__ import main; status = main(sys.argv[1:]); "
-        "bad = [m for m in sys.modules if m in ('hydra', 'omegaconf', 'open3d') or m.startswith('topomerge.extraction')]; "
-        "print(bad); sys.exit(status or bool(bad))"
+        "import atexit, re, runpy, sys; "
+        "bad = lambda: [m for m in sys.modules if re.match(r'(hydra|omegaconf|open3d|topomerge.extraction)(\\.|$)', m)]; "
+        "atexit.register(lambda: print('imported:', bad())); runpy.run_module('topomerge.training', run_name='__main__')"
     )
     done = run([sys.executable, "-c", code, str(tmp_path / "run.json"), "name=bare"])
     assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.endswith("imported: []\n")
     assert load_embedder(tmp_path / "bare").about["run"] == "bare"
-    assert run([sys.executable, "-m", "topomerge.training", str(tmp_path / "run.json"), "batch=0"]).stderr.startswith(
-        "train: batch"
-    )
+    assert main([str(tmp_path / "run.json"), "batch=0"]) == 1
+    assert capsys.readouterr().err.startswith("train: batch")
 
 
 def short(settings):
