@@ -22,10 +22,11 @@ from topomerge.fusion.merge import merge
 from topomerge.matching.consistency import CANDIDATES, candidate_poses, distinct, votes
 from topomerge.matching.costs import best_partners, descriptor_costs, similarities
 from topomerge.matching.match import match
-from topomerge.matching.topdown import top_down
+from topomerge.matching.topdown import TopDown, top_down
 from topomerge.types import Array, Sim3, TopometricMap
 
 NEAR, RIGHT = (1.0, 10.0), (0.5, 5.0)  # m, degrees
+PARTNERS = (1, 2, 3, CANDIDATES)  # of a room
 MOST = 1000  # poses that are looked through
 
 
@@ -36,12 +37,13 @@ def right(pose: Sim3, kept: KeptPair, limits: tuple[float, float]) -> bool:
     return within(pose_error(pose, kept.transform, kept.anchor), flat, limits)
 
 
-def proposed(a: TopometricMap, b: TopometricMap, rows: tuple[Array, Array], kept: KeptPair) -> tuple[int, float]:
-    """Number of poses that differ, and the place of the first right one in the order of how many rooms speak for each; inf."""
-    cost = descriptor_costs(*rows)
-    pairs = best_partners(cost, CANDIDATES)
+def proposed(
+    a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], cost: Array, partners: int, kept: KeptPair
+) -> tuple[int, float]:
+    """Number of poses, and the place of the first right one in the order of how many rooms speak for each; inf without one."""
+    pairs = best_partners(cost, partners)
     weight = similarities(cost)[tuple(pairs.T)] + 1e-3
-    poses = candidate_poses(a, b, (top_down(a), top_down(b)), pairs, weight, False)
+    poses = candidate_poses(a, b, plans, pairs, weight, False)
     order = distinct(poses, votes(poses), MOST) if len(poses.yaw) else []
     for place, h in enumerate(order, 1):
         if right(Sim3(float(poses.yaw[h]), tuple(poses.shift[h].tolist())), kept, NEAR):  # type: ignore[arg-type]
@@ -56,7 +58,8 @@ def measured(kept: KeptPair, name: str, merged: bool) -> dict[str, Any]:
     rows = describe(a), describe(b)
     out: dict[str, Any] = {"embed": time.process_time() - began}
     known = {id(a): rows[0], id(b): rows[1]}
-    out["poses"], out["place"] = proposed(a, b, rows, kept)
+    plans, cost = (top_down(a), top_down(b)), descriptor_costs(*rows)
+    out["proposed"] = {n: proposed(a, b, plans, cost, n, kept) for n in PARTNERS}
     found = match(a, b, lambda m: known[id(m)]).alternatives
     out["matched"] = bool(found) and right(found[0].transform, kept, RIGHT)
     if merged:
@@ -83,14 +86,16 @@ def main() -> None:
         for name in args.descriptors:
             rows[name].append(measured(kept, name, number < args.merges))
             print(kept.name[:8], name, rows[name][-1], flush=True)
-    print("| descriptor | pairs | s to describe | poses | until right: median / 90 % | right in 10 | in 60 | matching right |")
-    print("|---|---|---|---|---|---|---|---|")
+    heads = "pairs | s to describe | partners a room | poses | until right: median / 90 % | right in 10 | in 60 | matching right"
+    print(f"| descriptor | {heads} |\n|{'---|' * 9}")
     for name, some in rows.items():
-        place = np.array([r["place"] for r in some])
-        middle = {k: np.median([r[k] for r in some]) for k in ("embed", "poses")}
-        most = " / ".join(f"{np.sort(place)[min(int(q * len(place)), len(place) - 1)]:.0f}" for q in (0.5, 0.9))
-        shares = " | ".join(f"{np.mean(of):.2f}" for of in (place <= 10, place <= 60, [r["matched"] for r in some]))
-        print(f"| {name} | {len(some)} | {middle['embed']:.3f} | {middle['poses']:.0f} | {most} | {shares} |")
+        took, good = np.median([r["embed"] for r in some]), np.mean([r["matched"] for r in some])
+        for n in PARTNERS:
+            poses, place = np.array([r["proposed"][n] for r in some]).T
+            most = " / ".join(f"{np.sort(place)[int(q * (len(place) - 1))]:.0f}" for q in (0.5, 0.9))
+            cells = [f"{np.median(poses):.0f}", most, *(f"{np.mean(place <= k):.2f}" for k in (10, 60))]
+            matched = f"{good:.2f}" if n == CANDIDATES else "–"
+            print(f"| {name} | {len(some)} | {took:.3f} | {n} | {' | '.join(cells)} | {matched} |")
     for name, some in rows.items():
         done = [r for r in some if "merge" in r]
         words = [f"{sum(r[k] for r in done)} {text}" for k, text in (("best", "best pose right"), ("said", "believed"))]
