@@ -64,7 +64,10 @@ def pose_of_matches(a: Mapping[str, Array], b: Mapping[str, Array], certain: Arr
 
 
 def _places(a: Mapping[str, Array], b: Mapping[str, Array], pairs: Array) -> Places:
-    to, of, match, off = [], [], [], []
+    to: list[Array] = []
+    of: list[Array] = []
+    match: list[int] = []
+    off: list[float] = []
     for k, (i, j) in enumerate(pairs.tolist()):
         if len(to) > MOST:
             break

@@ -68,8 +68,8 @@ def _merged(pair: GraphPair, certain: Array) -> list[bool]:
     truth = pair.transform.numpy()
     if not len(pair.matches) or not abs(truth[2, 2] - 1) < 1e-6:
         return []
-    a, b = ({name: graph[name].double().numpy() for name in ("pos", "edge_pos")} for graph in (pair.a, pair.b))
-    pose = pose_of_matches(*(g | {"edge_index": of["edge_index"].numpy()} for g, of in ((a, pair.a), (b, pair.b))), certain)
+    a, b = ({name: graph[name].numpy() for name in ("pos", "edge_pos", "edge_index")} for graph in (pair.a, pair.b))
+    pose = pose_of_matches(a, b, certain)
     return [merged_right(pose, truth, b["pos"][pair.matches[:, 1].numpy()].mean(axis=0))]
 
 
