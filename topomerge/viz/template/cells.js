@@ -110,19 +110,23 @@ function upload(gl, { cells, rows }) {
   gl.activeTexture(gl.TEXTURE0);
 }
 
-function makeRoom(gl, width, height) { // for a picture with smooth edges, in the framebuffer that is bound
+function makeRoom(gl, hidden, width, height) { // a framebuffer of this size for a picture with smooth edges
+  if (hidden.width === width && hidden.height === height) return;
   const samples = Math.min(gl.getParameter(gl.MAX_SAMPLES), 4);
-  for (const [part, kind] of [[gl.COLOR_ATTACHMENT0, gl.RGBA8], [gl.DEPTH_ATTACHMENT, gl.DEPTH_COMPONENT24]]) {
-    const old = gl.getFramebufferAttachmentParameter(gl.FRAMEBUFFER, part, gl.FRAMEBUFFER_ATTACHMENT_OBJECT_TYPE);
-    const buffer = old === gl.NONE ? gl.createRenderbuffer() : gl.getFramebufferAttachmentParameter(gl.FRAMEBUFFER, part, gl.FRAMEBUFFER_ATTACHMENT_OBJECT_NAME);
+  for (const buffer of hidden.buffers || []) gl.deleteRenderbuffer(buffer);
+  const kinds = [[gl.COLOR_ATTACHMENT0, gl.RGBA8], [gl.DEPTH_ATTACHMENT, gl.DEPTH_COMPONENT24]];
+  const buffers = kinds.map(([part, kind]) => {
+    const buffer = gl.createRenderbuffer();
     gl.bindRenderbuffer(gl.RENDERBUFFER, buffer);
     gl.renderbufferStorageMultisample(gl.RENDERBUFFER, samples, kind, width, height);
     gl.framebufferRenderbuffer(gl.FRAMEBUFFER, part, gl.RENDERBUFFER, buffer);
-  }
+    return buffer;
+  });
+  Object.assign(hidden, { width, height, buffers });
 }
 
 function show(gl, hidden, width, height) {
-  gl.bindFramebuffer(gl.READ_FRAMEBUFFER, hidden);
+  gl.bindFramebuffer(gl.READ_FRAMEBUFFER, hidden.frame);
   gl.blitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
   gl.bindFramebuffer(gl.READ_FRAMEBUFFER, null);
 }

@@ -2,7 +2,7 @@
 
 // While the view moves, cells are left out (down to FEWEST) so that a picture comes every QUICK ms; once it rests, all are
 // drawn behind the screen, in passes of about LONGEST ms, so that the page never stands still.
-const QUICK = 60, LONGEST = 120;
+const QUICK = 60, LONGEST = 150;
 const BEGIN = 200000, FEWEST = 50000; // cells that are drawn before it is known how long that takes, and at least
 const FINE = 1.5; // pixels: smaller cubes are drawn as squares
 
@@ -40,7 +40,7 @@ async function startScene(place) {
   const made = program(gl), at = (name) => gl.getUniformLocation(made, name);
   const cells = await decode(data), texture = gl.createTexture();
   upload(gl, cells);
-  const hidden = gl.createFramebuffer();
+  const hidden = { frame: gl.createFramebuffer() };
   const extent = data.shape.map((n) => n * data.edge);
   const [near, far] = data.look || [[0, 0, 0], extent];
   const size = Math.hypot(far[0] - near[0], far[1] - near[1]);
@@ -69,27 +69,30 @@ async function startScene(place) {
     }
     if (!canvas.width) return;
     const matrix = matrixOf(camera, canvas.width / canvas.height);
-    if (!state.still || (state.drawn === 0 && state.rest < 1)) {
+    const anew = !state.still || state.drawn === 0;
+    if (anew && !(state.still && state.rest === 1)) {
       drawCells(matrix, 0, state.share, Math.min(1 / Math.sqrt(state.share), 4), state.cubes);
     }
     if (state.still) pass(matrix);
     if (!state.still || state.drawn < 1) again();
     stage.dataset.whole = state.still && state.drawn === 1;
-    drawNumbers(matrix, ratio);
+    if (anew) drawNumbers(matrix, ratio);
   }
 
   function pass(matrix) { // some more of the cells, once those before are drawn
+    const cubes = (pixels() * data.edge) / camera.distance > FINE;
     if (state.pass) {
       if (gl.clientWaitSync(state.pass, 0, 0) === gl.TIMEOUT_EXPIRED) return;
       gl.deleteSync(state.pass);
       state.pass = null;
       const took = performance.now() - state.began;
-      state.rest = Math.min(Math.max(state.rest * (took > 1.5 * LONGEST ? 0.5 : took < 0.5 * LONGEST ? 1.6 : 1), 0.002), 1);
+      const least = Math.min((cubes ? FEWEST / 2 : 3 * FEWEST) / data.drawn, 1); // smaller passes would only be more
+      state.rest = Math.min(Math.max(state.rest * (took > 1.5 * LONGEST ? 0.6 : took < 0.6 * LONGEST ? 1.6 : 1), least), 1);
     }
     const whole = [canvas.width, canvas.height], to = Math.min(state.drawn + state.rest, 1);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, hidden);
-    if (state.drawn === 0) makeRoom(gl, ...whole);
-    drawCells(matrix, state.drawn, to, 1, (pixels() * data.edge) / camera.distance > FINE);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, hidden.frame);
+    if (state.drawn === 0) makeRoom(gl, hidden, ...whole);
+    drawCells(matrix, state.drawn, to, 1, cubes);
     state.drawn = to;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     if (to === 1) show(gl, hidden, ...whole);
@@ -177,7 +180,7 @@ async function startScene(place) {
   function moved() { // fewer cubes now, all of them once it rests
     state.still = false;
     clearTimeout(state.timer);
-    state.timer = setTimeout(() => { state.still = true; ask(); }, 180);
+    state.timer = setTimeout(() => { state.still = true; ask(); }, 250);
     ask();
   }
 
