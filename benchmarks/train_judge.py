@@ -24,6 +24,7 @@ from topomerge.extraction.segment import segment, without_furniture
 from topomerge.types import Array
 
 WEIGHTS = Path("topomerge/extraction/judge.json")
+SEEDS = 5  # networks that are averaged
 PURE = 0.7  # share of a region in its true room; regions between rooms are no example
 
 
@@ -95,11 +96,20 @@ def fit(hidden: int = 16) -> None:
     os.replace(beside, WEIGHTS)
 
 
-def train(z: Array, y: Array, scan_of: Array, hidden: int, epochs: int = 60) -> list[tuple[Array, Array]]:
+def train(z: Array, y: Array, scan_of: Array, hidden: int) -> list[tuple[Array, Array]]:
+    """The mean of the scores of several networks that differ by their seed: one network with as many times the hidden units."""
+    (first, second) = zip(*(train_one(z, y, scan_of, hidden, seed) for seed in range(SEEDS)), strict=True)
+    w, b = np.concatenate([w for w, _ in first], axis=1), np.concatenate([b for _, b in first])
+    return [(w, b), (np.concatenate([v for v, _ in second]) / SEEDS, np.mean([c for _, c in second], axis=0))]
+
+
+def train_one(
+    z: Array, y: Array, scan_of: Array, hidden: int, seed: int, epochs: int = 60
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Weights and biases of a network with one hidden layer; scans with many examples count less than proportionally."""
     import torch
 
-    torch.manual_seed(0)
+    torch.manual_seed(seed)
     net = torch.nn.Sequential(torch.nn.Linear(z.shape[1], hidden), torch.nn.ReLU(), torch.nn.Linear(hidden, 1))
     optimiser = torch.optim.AdamW(net.parameters(), lr=5e-3, weight_decay=3e-2)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, epochs)
@@ -114,7 +124,8 @@ def train(z: Array, y: Array, scan_of: Array, hidden: int, epochs: int = 60) -> 
             optimiser.step()
         schedule.step()
     linear = [m for m in net if isinstance(m, torch.nn.Linear)]
-    return [(m.weight.detach().numpy().T, m.bias.detach().numpy()) for m in linear]
+    one, two = ((m.weight.detach().numpy().T, m.bias.detach().numpy()) for m in linear)
+    return one, two
 
 
 def forward(z: Array, layers: list[tuple[Array, Array]]) -> Array:
