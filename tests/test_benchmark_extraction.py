@@ -58,3 +58,16 @@ def test_sets_keep_to_their_buildings(benchmark) -> None:
                 of = split_of(case.source, str(case.seed) if case.source == "procedural" else case.building)
                 assert of == ("train" if name == "dev" else "test"), case.name
     assert len(cases.chosen(["all"], 1)) == len({c.set for c in cases.chosen(["all"])})
+
+
+@pytest.mark.data
+def test_rooms_of_a_robot_grid_are_those_of_its_segmentation(benchmark, data_dir, tmp_path) -> None:
+    """IPA's own lab: at most one of the ten rooms that a person drew is missing, whatever corners are rooms beside them."""
+    from topomerge.datasets.judge import judge
+    from topomerge.extraction.extract import extract
+
+    scans = importlib.import_module("extraction_scans")
+    case = scans.Case("grids", "ipa", "lab_ipa", "")
+    scan = scans.load(case, tmp_path, data_dir)
+    rooms = judge(extract(scan.cloud, voxel_size=case.voxel), scan.truth).rooms
+    assert len(rooms.each) == 10 and rooms.recall >= 0.9 and rooms.iou >= 0.8 and rooms.precision >= 0.75
