@@ -24,7 +24,7 @@ from topomerge.embedding import graph
 from topomerge.errors import InputError
 from topomerge.io.listing import plain
 
-FORMAT = 5  # raise it when the same item gives other bytes: it is part of the files' names
+FORMAT = 6  # raise it when the same item gives other bytes: it is part of the files' names
 LEAST_ROOMS = 5  # of a real plan: fewer have no two parts
 LEAST_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told apart
 LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
