@@ -190,9 +190,19 @@ def folds(groups: Array, many: int = 8) -> Iterator[tuple[Array, Array]]:
 
 
 def fit() -> None:
-    """Both models, and what left-out pairs say about them."""
+    """The models for pairs of maps with heights, from all pairs without drawings, and those for slices and drawings, from all
+    pairs; what left-out pairs say about them is printed of the pairs that each is for."""
     found = {row["name"]: row for row in map(json.loads, ROWS.read_text().splitlines())}
-    t = tabled([row for row in found.values() if row["hyps"] and fair(row)])
+    rows = [row for row in with_differs(list(found.values()), "train") if row["hyps"] and fair(row)]
+    result: dict[str, Any] = {"names": [*VECTOR, *LEAD, *CLOSER], "threshold": THRESHOLD}
+    result["solid"] = fit_models([row for row in rows if "drawing" not in row["sensors"]], False)
+    result["flat"] = fit_models(rows, True)
+    TARGET.write_text(json.dumps(_rounded(result), indent=1) + "\n")
+
+
+def fit_models(rows: list[dict[str, Any]], flat: bool) -> dict[str, Any]:
+    """Both models of these pairs; told is what they say of those that are flat, or are not."""
+    t = tabled(rows)
     sure = t.y >= 0
     pose, held = fitted(t.x[sure], t.y[sure] > 0, VECTOR, 1.0), np.zeros(len(t.y))
     for train, test in folds(t.building[t.owner]):
@@ -213,12 +223,12 @@ def fit() -> None:
         model = fitted(x[train], y[train] > 0, names, STRENGTH, weight[train])
         believed[test] = 1 / (1 + np.exp(-logits(model, x[test])))
     believed = np.minimum(believed[: len(chosen)], share)
-    report([t.rows[i] for i, _ in chosen], believed, y[: len(chosen)])
+    told = np.array([(not {"laser2d", "drawing"}.isdisjoint(t.rows[i]["sensors"])) == flat for i, _ in chosen])
+    report([t.rows[i] for (i, _), mine in zip(chosen, told, strict=True) if mine], believed[told], y[: len(chosen)][told])
     kept = y >= 0
     winner = fitted(x[kept], y[kept] > 0, names, STRENGTH, weight[kept])
     print({n: round(w, 2) for n, w in zip(names, winner["weight"], strict=True)})
-    result = {"names": names, "threshold": THRESHOLD, "pairs": len(chosen), "pose": pose, "winner": winner}
-    TARGET.write_text(json.dumps(_rounded(result), indent=1) + "\n")
+    return {"pairs": len(chosen), "pose": pose, "winner": winner}
 
 
 def fair(row: dict[str, Any]) -> bool:
@@ -230,6 +240,13 @@ def fair(row: dict[str, Any]) -> bool:
     if row["kind"] == "same" or row.get("walls_differ", SAME_WALLS) < SAME_WALLS:
         return False
     return row["kind"] != "twin-wing" or differs is None or differs >= ALIKE
+
+
+def with_differs(rows: list[dict[str, Any]], split: str) -> list[dict[str, Any]]:
+    """Rows of cached pairs, those of twin wings with what ``merge_drawings.py SPLIT differs`` found about them."""
+    path = Path("cache/merge") / f"differs_{split}.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    return [{**r, "differs": known[r["name"]]} if r.get("differs") is None and r["name"] in known else r for r in rows]
 
 
 def _rounded(value: Any) -> Any:

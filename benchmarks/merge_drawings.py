@@ -3,7 +3,7 @@
 ``python benchmarks/merge_drawings.py train 200`` takes the first maps of the training pairs and draws for each its own storey and
 one that is not its own: of another building, another storey, or the twin wing. They lie in ``cache/merge/<split>_drawings``. A
 third of the drawings have no scale, as real ones do (`about`: ``scaled``). Buildings and frames are drawn again from the pairs'
-own seeds, and checked against the cached truth.
+own seeds, and checked against the cached truth. ``... train differs`` tells of twin wings how far they differ where both look.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from merge_pairs import COMMON, GridPair, _misfit, columns_seen, grid_of, items, load, sim3_of, unpacked
+from merge_pairs import COMMON, ELSEWHERE, GridPair, _misfit, columns_seen, grid_of, items, load, sim3_of, unpacked
 from scipy import ndimage
 from topomerge.datasets.building import Building
 from topomerge.datasets.drawing import draw
@@ -137,6 +137,27 @@ def differing(here: Place, there: Place, storey: int) -> dict[str, float]:
     return {"walls_differ": float(((image[0] & far[1]) | (image[1] & far[0]))[seen].sum() * CELL**2)}
 
 
+def missing_differs(split: str) -> dict[str, float]:
+    """Of the twin wings among the cached pairs of two scans that do not tell it: `merge_pairs.differs` by the rooms that both
+    surveyors went into. Kept in ``cache/merge/differs_<split>.json``."""
+    target = Path("cache/merge") / f"differs_{split}.json"
+    found: dict[str, float] = json.loads(target.read_text()) if target.exists() else {}
+    for seed, count in SETS[split].items():
+        paths = [p for p in sorted((Path("cache/merge") / split).glob(f"{seed}_*.npz")) if p.stem not in found]
+        todo, plans = items(split, count, seed) if paths else ([], {})
+        for path in paths:
+            item = todo[int(path.stem.split("_")[1])]
+            if item.hard != "twin-wing":
+                continue
+            pair = load(path)
+            places = places_of(pair, item, plans) if pair.about.get("differs") is None else []
+            if len(places) == 2:
+                both = replace(places[0], visited=np.intersect1d(places[0].visited, places[1].visited))
+                found[path.stem] = differing(both, places[1], 0)["differs"] if len(both.visited) else ELSEWHERE
+    target.write_text(json.dumps(found, indent=1))
+    return found
+
+
 def make(split: str, many: int) -> Iterator[Path]:
     """Make what is missing."""
     folder = Path("cache/merge") / f"{split}_drawings"
@@ -165,5 +186,8 @@ def _with_common(arrays: dict[str, Array], here: Place) -> dict[str, Array]:
 
 
 if __name__ == "__main__":
-    for _ in make(sys.argv[1], int(sys.argv[2])):
-        pass
+    if sys.argv[2] == "differs":
+        print(missing_differs(sys.argv[1]))
+    else:
+        for _ in make(sys.argv[1], int(sys.argv[2])):
+            pass

@@ -1,7 +1,8 @@
-"""False merges: maps of different buildings put together, of the cached pairs of a split (``merge_pairs.py``).
+"""False merges: maps of different buildings put together, of the cached pairs of a split (``merge_pairs.py``), and maps with
+floor plans that are not theirs (``merge_drawings.py``).
 
 ``python benchmarks/merge_strangers.py [split] [pairs]``; resumable: one line of JSON a pair in ``cache/merge/strangers_*.jsonl``.
-None of them may be believed. Each map is prepared once and tried with several others.
+None of them may be believed. Each map is prepared once and tried with several others; of the floor plans all are taken.
 """
 
 from __future__ import annotations
@@ -9,15 +10,18 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Callable, Collection, Iterator
+from functools import cache, partial
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from merge_pairs import load
 
-from topomerge.fusion.registration import Prepared, prepare, register
+from topomerge.fusion.registration import Prepared, Registration, prepare, register
 
+Row = dict[str, Any]
 STRIDE = 7  # pairs are laid out in blocks of so many pairs, so that few maps are in memory at once
 
 
@@ -39,30 +43,51 @@ def strangers(split: str) -> Iterator[tuple[Path, Path]]:
         yield from ((paths[i], paths[j]) for i in block for j in block if i != j)
 
 
+def of_strangers(split: str, many: int, done: Collection[str]) -> Iterator[Row]:
+    """Maps of two buildings."""
+    for count, (first, second) in enumerate(strangers(split)):
+        name = f"{first.stem}+{second.stem}"
+        if count >= many:
+            return
+        if name in done:
+            continue
+        (where, (a, _), seen), (other, (_, b), by) = maps(first), maps(second)
+        if where != other:
+            about = {"name": name, "kind": "strangers", "building": where, "sensors": [seen[0], by[1]]}
+            yield _row(about, partial(register, a, b, refined=False))
+
+
+def of_drawings(split: str, done: Collection[str]) -> Iterator[Row]:
+    """Maps and floor plans of another building, another storey or another wing."""
+    for path in sorted((Path("cache/merge") / f"{split}_drawings").glob("*.npz")):
+        if path.stem in done or path.stem.endswith("_overlap"):
+            continue
+        pair = load(path)
+        told = {k: pair.about[k] for k in ("kind", "building", "sensors", "differs", "walls_differ", "scaled") if k in pair.about}
+        scale = "free" if pair.about["scaled"] else "fixed"
+        run = partial(register, pair.a, pair.b, free=pair.free, scale=scale, refined=False)
+        yield _row({"name": path.stem, **told}, run)
+
+
+def _row(about: Row, run: Callable[[], Registration]) -> Row:
+    began = time.process_time()
+    found = run()
+    seconds = time.process_time() - began
+    return {**about, "probability": found.probability, "believed": found.accepted, "seconds": seconds}
+
+
 def main(split: str = "train", pairs: str = "100") -> None:
     """Run what is missing and count."""
     target = Path("cache/merge") / f"strangers_{split}.jsonl"
     done = {r["name"]: r for r in map(json.loads, target.read_text().splitlines())} if target.exists() else {}
-    for count, (first, second) in enumerate(strangers(split)):
-        name = f"{first.stem}+{second.stem}"
-        if count >= int(pairs):
-            break
-        if name in done:
-            continue
-        (where, (a, _), seen), (other, (_, b), by) = maps(first), maps(second)
-        if where == other:
-            continue
-        began = time.process_time()
-        found = register(a, b, refined=False)
-        row = {"name": name, "buildings": [where, other], "sensors": [seen[0], by[1]], "probability": found.probability}
-        row |= {"believed": found.accepted, "seconds": time.process_time() - began}
-        done[name] = row
+    for row in chain(of_drawings(split, done), of_strangers(split, int(pairs), done)):
+        done[row["name"]] = row
         with target.open("a") as out:
             out.write(json.dumps(row) + "\n")
     rows = list(done.values())
     wrong = [r for r in rows if r["believed"]]
     most = sorted((r["probability"] for r in rows), reverse=True)[:5]
-    print(f"{len(rows)} pairs of maps of different buildings: {len(wrong)} believed; highest probabilities {np.round(most, 2)}")
+    print(f"{len(rows)} pairs that must not merge: {len(wrong)} believed; highest probabilities {np.round(most, 2)}")
     for row in wrong:
         print(row)
 

@@ -78,7 +78,9 @@ def test_both_ways_say_the_same(points):
 def test_the_calibration_fits_its_features():
     found = model()
     assert found["names"] == [*VECTOR, *LEAD, *CLOSER]
-    assert len(found["winner"]["weight"]) == len(found["names"]) and len(found["pose"]["weight"]) == len(VECTOR)
+    for kind in ("solid", "flat"):
+        winner, pose = (found[kind][which]["weight"] for which in ("winner", "pose"))
+        assert len(winner) == len(found["names"]) and len(pose) == len(VECTOR)
     assert 0.5 <= found["threshold"] < 1
 
 

@@ -237,15 +237,22 @@ def vector(f: Features) -> Array:
 
 @cache
 def model() -> dict[str, Any]:
-    """Coefficients of both models and the threshold, fitted on simulated training pairs (benchmarks/calibrate_merge.py)."""
+    """Coefficients and the threshold, fitted on simulated training pairs (benchmarks/calibrate_merge.py): of two models each for
+    pairs of maps with heights (``solid``) and for those of which one is a slice or a drawing (``flat``)."""
     text = resources.files("topomerge.fusion").joinpath("calibration.json").read_text(encoding="utf-8")
     found: dict[str, Any] = json.loads(text)
     return found
 
 
+def _models(f: Features) -> dict[str, Any]:
+    """What pairs with these features are judged by: a slice shows no heights, and is another matter."""
+    found: dict[str, Any] = model()["flat" if f["sliced"] else "solid"]
+    return found
+
+
 def plausibility(f: Features) -> float:
     """Log odds that a pose is right, seen by itself: what hypotheses are ranked by."""
-    return _logit(model()["pose"], vector(f))
+    return _logit(_models(f)["pose"], vector(f))
 
 
 def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[float, float, float, float]:
@@ -269,11 +276,12 @@ def probability(ranked: Sequence[Ranked], closer: Features) -> tuple[float, list
     Args:
         closer: what `closer.closer` found about the first one.
     """
-    pose = model()["pose"]
+    models = _models(ranked[0][1])
+    pose = models["pose"]
     vectors = np.array([vector(f) for _, f, _ in ranked])
     scores = np.array([s for _, _, s in ranked])
     leads = lead(scores, vectors, np.array(pose["weight"]), np.array(pose["scale"]))
-    odds = _logit(model()["winner"], np.concatenate([vectors[0], leads[:3], closer_vector(closer)]))
+    odds = _logit(models["winner"], np.concatenate([vectors[0], leads[:3], closer_vector(closer)]))
     shares = np.exp(scores - scores[0]) / np.exp(scores - scores[0]).sum()
     first = min(1 / (1 + np.exp(-odds)), leads[3])
     every = first * shares / shares[0]
