@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+from scipy.spatial import cKDTree
 from topomerge.datasets.buildings import make_building
 from topomerge.datasets.drawing import draw, with_plan
 from topomerge.datasets.flat import raise_flat
@@ -53,5 +54,4 @@ def test_the_upper_storey_has_its_own_rooms_and_doors() -> None:
         assert shapely.contains_xy(rooms.buffer(0.3), *flat.free.T).mean() > 0.95
         inner = building.doors[(building.doors["rooms"] >= 0).all(axis=1)]
         inner = inner[[building.rooms[i].storey == storey for i in inner["rooms"][:, 0]]]
-        free = shapely.union_all(shapely.points(flat.free)[::5]).buffer(0.1)
-        assert shapely.distance(free, shapely.points(inner["centre"][:, :2])).max() < 0.2
+        assert cKDTree(flat.free[::5]).query(inner["centre"][:, :2])[0].max() < 0.3
