@@ -14,6 +14,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from tests.fuzz.corpus import write_corpus
@@ -74,16 +75,21 @@ class Worker:
         self.process.communicate()
 
 
+@cache
+def valid_files() -> tuple[tempfile.TemporaryDirectory[str], dict[str, str]]:
+    """The corpus in a folder that this process keeps, and its files by name."""
+    folder = tempfile.TemporaryDirectory()
+    return folder, {name: str(path) for name, path in write_corpus(Path(folder.name)).items()}
+
+
 @contextmanager
 def started(folder: Path, only: Sequence[str] = ()) -> Iterator[tuple[Worker, list[str]]]:
     """A worker that has read the valid files, or those named; and their names."""
-    corpus, place = folder / "corpus", folder / "mutants"
-    corpus.mkdir(parents=True)
-    place.mkdir()
-    files = {name: str(path) for name, path in write_corpus(corpus).items()}
+    corpus, files = valid_files()
+    folder.mkdir(parents=True)
     names = list(only or files)
-    (corpus / "names.json").write_text(json.dumps({"files": files, "tried": names}))
-    worker = Worker(corpus, place)
+    (folder / "names.json").write_text(json.dumps({"files": files, "tried": names}))
+    worker = Worker(Path(corpus.name), folder)
     try:
         yield worker, names
     finally:
@@ -108,7 +114,7 @@ def main() -> None:
     seeds = range(args.first, args.first + args.each)
     counts: Counter[tuple[str, str]] = Counter()
     with tempfile.TemporaryDirectory() as folder:
-        for name, seed, state, message in run(Path(folder), seeds, args.only):
+        for name, seed, state, message in run(Path(folder) / "mutants", seeds, args.only):
             counts[name, state] += 1
             if state == "fault":
                 print(f"{name} {seed}: {message}", flush=True)

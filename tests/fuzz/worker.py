@@ -45,7 +45,7 @@ def attempt(path: Path) -> tuple[str, str]:
 def main(corpus: Path, folder: Path) -> None:
     """Warm up on the valid files, limit the memory, then do what is asked for."""
     warnings.simplefilter("ignore")
-    told = json.loads((corpus / "names.json").read_text())
+    told = json.loads((folder / "names.json").read_text())
     data = {name: Path(path).read_bytes() for name, path in told["files"].items()}
     for name in told["tried"]:
         state = attempt(Path(told["files"][name]))
