@@ -18,8 +18,8 @@ FINE = (0.1, 1.0)  # m, degrees
 TEXT = (
     "Simulated test pairs in which both maps saw something in common, also where no room was entered by both; every bin of the "
     "area and every kind of sensors in turn. All on the same points (means of 0.1 m cells), one core, one thread, in seconds of "
-    "processor from points in memory to the pose; of KISS-Matcher thinning and what it clocks itself, without its binding's "
-    f"copying, with Quatro for four degrees of freedom; Open3D at {VOXEL} m, RANSAC of {ITERATIONS:,} iterations (0.999), made "
+    "processor from points in memory to the pose; KISS-Matcher on points thinned at its voxel, with Quatro for four degrees of "
+    f"freedom; Open3D at {VOXEL} m, RANSAC of {ITERATIONS:,} iterations (0.999), made "
     "upright afterwards. Right: 0.5 m and 5° in the middle of what both saw (slices and floor plans: horizontally)."
 )
 

@@ -1,10 +1,10 @@
 """Registration of whole maps beside KISS-Matcher and Open3D: what is merged right and wrong, and how fast.
 
 ``python benchmarks/register.py [split] [limit] [methods]``: cached simulated pairs (``merge_pairs.py``; split ``train`` for
-development, ``test`` for final runs only), or ``real`` for the real pairs of TOPOMERGE_DATA. Methods: ours, kiss02, kiss03,
-fpfh, fgr (comma-separated; default all). Resumable: a line of JSON a pair and method in
-``cache/merge/results_<split>.jsonl``; the first `limit` pairs are run (0: none, only the table). Peers get the means of the
-points of 0.1 m cells and a voxel size.
+development, ``test`` for final runs only; ``test_drawings`` for maps and their floor plans), or ``real`` for the real pairs of
+TOPOMERGE_DATA. Methods: ours, kiss02, kiss03, fpfh, fgr (comma-separated; default all). Resumable: a line of JSON a pair and
+method in ``cache/merge/results_<split>.jsonl``; the first `limit` pairs are run (0: none, only the table). Peers get the means
+of the points of 0.1 m cells and a voxel size; `peers.py` compares them with more care.
 
 Right: within 0.5 m and 5 degrees (fine: 0.1 m, 1 degree) in the middle of what both maps saw; of slices, horizontally. Seconds
 are of the processor, so that other jobs on the machine do not count.
@@ -37,7 +37,8 @@ Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, how much
 def ours(pair: GridPair) -> Answer:
     """`register` with cells only, as maps have them; the scale is free where that of the source is unknown."""
     a, b = (VoxelGrid(g.cells, g.origin, g.edge, g.shape) for g in (pair.a, pair.b))
-    found = register(a, b, free=pair.free, scale="free" if pair.about["source"] in SCALELESS else "fixed")
+    scaled = pair.about["source"] in SCALELESS or pair.about.get("scaled")
+    found = register(a, b, free=pair.free, scale="free" if scaled else "fixed")
     return found.transform, found.accepted, found.probability
 
 
@@ -123,7 +124,7 @@ def real_pairs() -> Iterator[GridPair]:
 
 def simulated_pairs(split: str, limit: int, skip: set[str]) -> Iterator[GridPair]:
     """The first cached pairs of a split, but for those named."""
-    for path in sorted((Path("cache/merge") / split).glob("*.npz"))[:limit]:
+    for path in sorted((Path("cache/merge") / split).glob("*_overlap.npz" if split.endswith("_drawings") else "*.npz"))[:limit]:
         if path.stem not in skip:
             yield load(path, mean=True)
 
@@ -142,7 +143,7 @@ def run(split: str, limit: int, methods: list[str], target: Path) -> None:
             except Exception as failure:  # a peer that fails has not merged
                 print(f"{pair.name} {method}: {failure}", flush=True)
                 pose, believed, how = None, False, 0.0
-            about = {k: pair.about.get(k) for k in ("sensors", "kind", "building", "source", "overlap", "differs")}
+            about = {k: pair.about.get(k) for k in ("sensors", "kind", "building", "source", "overlap", "differs", "scaled")}
             row = {"name": pair.name, "method": method, "common": pair.common, **about, "seconds": time.process_time() - began}
             row |= {"believed": believed, "probability": how, "err": None if pose is None else error(pose, pair)}
             row["scale"] = None if pose is None or pair.truth is None else pose.scale / pair.truth.scale
