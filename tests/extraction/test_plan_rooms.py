@@ -12,11 +12,11 @@ from topomerge.extraction.judge import door_probability
 from topomerge.extraction.partition import merge_regions
 from topomerge.extraction.passages import FEATURES, clearance_of, features, find_passages, regions_of
 from topomerge.extraction.plan import storey_plan
-from topomerge.extraction.plan_rooms import _upper_side
+from topomerge.extraction.plan_rooms import _floor, _upper_side
 from topomerge.extraction.segment import segment
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
-from topomerge.types import STOREY_DTYPE, Array, PointCloud, TopometricMap
+from topomerge.types import STOREY_DTYPE, Array, PointCloud, TopometricMap, VoxelGrid
 
 CORRIDOR_ROOMS = [(x, y) for x in (2, 6, 10, 14) for y in (2, 8)]
 
@@ -195,3 +195,18 @@ def test_what_nothing_is_above_at_the_height_of_a_ceiling_is_no_storey() -> None
         levels[1] = (floor, ceiling, 20.0)
         assert not _upper_side(levels[1], levels[:1])
     assert not _upper_side(levels[0], levels[:0])
+
+
+def test_a_storey_without_a_room_of_its_own_is_none() -> None:
+    """Stray cells beside a room that the room reaches: they are its own, not a second storey."""
+    floor = np.argwhere(np.ones((20, 20, 1), bool))
+    stray = floor[-3:] + (1, 0, 0)
+    grid = VoxelGrid.from_cells(np.concatenate([floor, stray]), np.zeros(3), 0.1, (21, 20, 2))
+    storeys = np.array([(0.05, 0.35, 0.0), (0.15, np.nan, 0.0)], STOREY_DTYPE)
+    parts = [
+        (cells, np.ones(len(cells), bool), np.full(len(cells), k), np.full(len(cells), -k), np.full(len(cells), -k))
+        for k, cells in enumerate((floor, stray))
+    ]
+    found = _floor(grid, storeys, parts, [np.zeros(1, np.int32)], np.full(len(grid), -1, np.int32), {})
+    assert len(found.storeys) == 1 and found.storeys["area"][0] == pytest.approx(4.0, abs=0.05)
+    assert (found.storey == 0).all() and (found.room == 0).all()

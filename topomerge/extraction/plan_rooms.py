@@ -190,8 +190,9 @@ def _floor(
     of = {name: values[kept] for name, values in of.items()}
     floor = grid.with_cells(whole.cells[kept], {"standing": of["standing"].astype(bool)})
     storeys["area"] = np.bincount(of["storey"][lowest_of_column(floor)], minlength=len(storeys)) * floor.edge**2
-    used = storeys["area"] > 0  # what turned out to be the upper side of a ceiling is no storey
-    storeys, of["storey"] = storeys[used], (np.cumsum(used) - 1)[of["storey"]].astype(np.int32)
+    # What has no room of its own is no storey: the upper side of a ceiling, or stray cells that a room below reaches.
+    used = np.bincount(of["storey"][in_a_room[kept]], minlength=len(storeys)) > 0
+    storeys, of["storey"] = storeys[used], np.maximum(np.cumsum(used) - 1, 0)[of["storey"]].astype(np.int32)
     return Floor(
         floor, storeys, of["storey"], of["room"], of["area"], np.concatenate(owners).astype(np.int32), label, 0.0, probability
     )
