@@ -64,6 +64,7 @@ def test_sets_keep_to_their_buildings(benchmark) -> None:
 def test_rooms_of_a_robot_grid_are_those_of_its_segmentation(benchmark, data_dir, tmp_path) -> None:
     """IPA's own lab: at most one of the ten rooms that a person drew is missing, whatever corners are rooms beside them."""
     from topomerge.datasets.judge import judge
+
     from topomerge.extraction.extract import extract
 
     scans = importlib.import_module("extraction_scans")
