@@ -68,7 +68,7 @@ def _piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:
         raise InputError(told["refused"])
     if "fault" in told:
         raise damaged(path, kind, told["fault"])
-    arrays = {name: _array(stream, ARRAYS[name], shape) for name, shape in told["arrays"].items()}
+    arrays: dict[str, Any] = {name: _array(stream, ARRAYS[name], shape) for name, shape in told["arrays"].items()}
     rooms = tuple(TrueRoom(**{**room, "polygon": np.array(room["polygon"], float).reshape(-1, 2)}) for room in told["rooms"])
     return replace(Piece(**arrays), rooms=rooms, warnings=tuple(told["warnings"]), done=told["done"])
 
