@@ -20,6 +20,7 @@ setup: .venv/ready
 
 # Under five minutes on two cores: two scans merged; then a small embedder trained, judged on buildings that it never saw, exported.
 demo: setup
+	rm -rf demo/runs demo/eval
 	$(BIN)/topomerge simulate --building office --seed 5 --sensors tls,depth --rooms 8 --overlap 0.7 -o demo
 	$(BIN)/topomerge extract demo/a.ply -o demo/a.tmap --json demo/a.json --ply demo/a_rooms.ply --figure demo/a.png --report demo/a.html
 	$(BIN)/topomerge merge demo/a.tmap demo/b.ply -o demo/merged
