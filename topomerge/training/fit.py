@@ -150,7 +150,8 @@ class Run:
                 raise KeyboardInterrupt
         took = max(time.perf_counter() - began, 1e-9)
         row: dict[str, Any] = {"epoch": self.state.epoch, "seconds": took}
-        row |= {"rooms_per_second": rooms / took, "waiting": waited / took}
+        of_all = float(self.fabric.all_reduce(torch.tensor(float(rooms)), reduce_op="sum"))  # processes
+        row |= {"rooms_per_second": of_all / took, "waiting": waited / took}
         return row | {f"train/{name}": value / self.steps for name, value in self.state.sums.items()}
 
     def step(self, batch: Batch) -> dict[str, float]:
