@@ -67,15 +67,22 @@ def measures(rows: Sequence[Row]) -> list[object]:
 HEADS = ("pairs", "right", "right %", "within 0.1 m, 1° %", "right and believed %", "believed, wrong", "s")
 
 
-def by(rows: Sequence[Row], key: Callable[[Row], str], groups: Sequence[str], name: str) -> str:
-    """A line a group and method."""
+def by(
+    rows: Sequence[Row],
+    key: Callable[[Row], str],
+    groups: Sequence[str],
+    name: str,
+    heads: Sequence[str] = HEADS,
+    told: Callable[[Sequence[Row]], Sequence[Any]] = measures,
+) -> str:
+    """A line a group and method: what is `told` of its rows, under these heads."""
     out = []
     for group in groups:
         for method, title in NAMES.items():
             mine = [r for r in rows if r["method"] == method and key(r) == group]
             if mine:
-                out.append([group, title, *measures(mine)])
-    return table([name, "method", *HEADS], out)
+                out.append([group, title, *told(mine)])
+    return table([name, "method", *heads], out)
 
 
 def stranger_kind(row: Row) -> str:

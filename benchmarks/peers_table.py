@@ -9,9 +9,10 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from merge_results import NAMES, Row, good, put, share, table
+from merge_results import NAMES, Row, by, good, put, share
 from peers import BINS, ITERATIONS, TARGET, VOXEL, bin_of, kind_of
 
 FINE = (0.1, 1.0)  # m, degrees
@@ -30,19 +31,14 @@ def rows_of_methods() -> list[Row]:
     return [{**row, **told, "method": m} for row in rows for m, told in row["methods"].items()]
 
 
-def by(rows: Sequence[Row], key: Callable[[Row], str], groups: Sequence[str], name: str) -> str:
-    """A line a group and method: right, within 0.1 m and 1 degree, believed but wrong, seconds."""
-    out = []
-    for group in groups:
-        for method, title in NAMES.items():
-            mine = [r for r in rows if r["method"] == method and key(r) == group]
-            if mine:
-                fine, seconds = [good(r, FINE) for r in mine], [r["seconds"] for r in mine]
-                wrong = sum(r["believed"] and not good(r) for r in mine if r["err"])
-                shares = share(mine, good), f"{100 * np.mean(fine):.0f}", wrong
-                out.append([group, title, len(mine), *shares, f"{np.median(seconds):.1f}", f"{max(seconds):.1f}"])
-    heads = [name, "method", "pairs", "right %", "within 0.1 m, 1° %", "believed, wrong", "s, median", "s, most"]
-    return table(heads, out)
+HEADS = ("pairs", "right %", "within 0.1 m, 1° %", "believed, wrong", "s, median", "s, most")
+
+
+def measures(mine: Sequence[Row]) -> list[Any]:
+    """Right, within 0.1 m and 1 degree, believed but wrong, seconds."""
+    fine, seconds = [good(r, FINE) for r in mine], [r["seconds"] for r in mine]
+    wrong = sum(r["believed"] and not good(r) for r in mine if r["err"])
+    return [len(mine), share(mine, good), f"{100 * np.mean(fine):.0f}", wrong, f"{np.median(seconds):.1f}", f"{max(seconds):.1f}"]
 
 
 def behind(rows: Sequence[Row], keys: Sequence[Callable[[Row], str]]) -> str:
@@ -72,8 +68,8 @@ def section() -> str:
         "`python benchmarks/merge_pairs.py test 175; python benchmarks/merge_drawings.py test 110; "
         "python benchmarks/peers.py 900; python benchmarks/peers_table.py docs/results.md`",
         TEXT,
-        by(rows, keys[0], list(BINS), "in common"),
-        by(rows, keys[1], kinds, "kind"),
+        by(rows, keys[0], list(BINS), "in common", HEADS, measures),
+        by(rows, keys[1], kinds, "kind", HEADS, measures),
         f"Bins and kinds in which another method has more right than topomerge: {behind(rows, keys)}.",
         f"The whole way, on {len(done)} of the pairs: extraction of both maps {seconds['extract']:.1f} s, merge with the joined "
         f"map and its rooms {seconds['merge']:.1f} s (medians; the longest pair {longest:.1f} s). To the pose alone, on the same "

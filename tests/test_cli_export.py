@@ -197,7 +197,7 @@ def test_view_serves_the_page_and_nothing_else(tmp_path: Path) -> None:
         )
         assert taken.returncode == 1 and "can't be used" in taken.stderr and len(taken.stderr.splitlines()) == 1
         server.send_signal(signal.SIGINT)
-        assert server.wait(30) == 0 and server.stderr.read() == ""
+        assert server.wait(10) == 0 and server.stderr.read() == ""
     finally:
         server.kill()
         server.wait()
@@ -213,7 +213,7 @@ def test_what_is_served_of_a_map_is_deleted_in_the_end(tmp_path: Path) -> None:
         assert server.stdout is not None and server.stdout.readline().startswith("http://127.0.0.1:")
         assert list((tmp_path / "scratch").rglob("a.html"))
         server.terminate()
-        assert server.wait(30) == 143
+        assert server.wait(10) == 143
         time.sleep(0.1)
         assert not list((tmp_path / "scratch").glob("topomerge-*"))
     finally:

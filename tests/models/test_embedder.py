@@ -227,7 +227,7 @@ def test_layout_of_doors_by_hand():
 
 
 def test_check_takes_the_defaults():
-    check(Network())
+    assert check(Network()) is None
 
 
 @pytest.mark.slow
