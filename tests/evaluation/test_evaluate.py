@@ -19,7 +19,7 @@ from topomerge.errors import InputError
 from topomerge.evaluation import predict as predicting
 from topomerge.evaluation.describe import bare
 from topomerge.evaluation.evaluate import claim, evaluate
-from topomerge.evaluation.settings import Evaluation, Pairs, check, difference, folder_of, told, variants
+from topomerge.evaluation.settings import Evaluation, Pairs, check, difference, folder_of, run_title, told, variants
 from topomerge.evaluation.tables import Table, write_section
 from topomerge.types import PointCloud, Sim3
 
@@ -60,6 +60,7 @@ def test_a_wrong_key_is_named() -> None:
         (["run=[runs/nowhere]"], "runs/nowhere"),
         (["mergers=[x]"], "mergers: 'x'"),
         (["only=[]"], "nothing to evaluate"),
+        (["tables=[sizes]"], "tables: unknown 'sizes'"),
     ):
         with pytest.raises(InputError, match=said):
             check(compose("evaluate", Evaluation, words))
@@ -97,6 +98,15 @@ def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
     assert before["run"]["a"] != before["run"]["b"]
     (tmp_path / "b" / "best" / "weights.safetensors").write_bytes(b"three")
     assert difference(before, told(settings)).startswith("run.b")
+
+
+def test_runs_are_called_by_what_they_are_made_of() -> None:
+    run = "topomerge/embedding/pretrained"
+    assert run_title(run) == "scalars, gat, infonce"
+    settings = Evaluation(SMALL, run=[run], titles=True, mergers=[])
+    assert [v.name for v in variants(settings)] == ["scalars, gat, infonce"] == list(told(settings)["run"])
+    with pytest.raises(InputError, match="two are called 'scalars, gat, infonce'"):
+        check(replace(settings, run=[run, f"{run}/embedder.json"]))
 
 
 def test_comments_do_not_change_code() -> None:

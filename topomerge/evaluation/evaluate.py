@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -151,8 +152,13 @@ def short(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Eva
     """The tables that go into the documentation."""
     if any(m["change"] for m in matches):
         return [curves(ranks, matches, merges, settings)]
-    tables = [ranking(ranks, settings), beside(matches, settings), grouped(ranks, matches, "seen", settings)] if ranks else []
-    return [*tables, *([merging(merges, "area", settings)] if merges else [])]
+    made: dict[str, Callable[[], Table]] = {
+        "ranking": lambda: ranking(ranks, settings),
+        "matching": lambda: beside(matches, settings),
+        "merging": lambda: merging(merges, "area", settings),
+        **{key: partial(grouped, ranks, matches, key, settings) for key in BY},
+    }
+    return [made[name]() for name in settings.tables if (merges if name == "merging" else ranks)]
 
 
 def _about(ranks: list[Row], merges: list[Row], settings: Evaluation, command: str) -> str:

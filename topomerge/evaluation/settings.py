@@ -12,10 +12,12 @@ from typing import Any
 from topomerge.datasets.recipe import Recipe
 from topomerge.embedding.context import HOWS
 from topomerge.embedding.embedders import EMBEDDERS
+from topomerge.embedding.weights import read_weights
 from topomerge.errors import InputError
 from topomerge.io.listing import plain
 
 METHODS = ("full", "assignment", "growing", "consistent", "mutual")
+TABLES = ("ranking", "matching", "merging", "overlap", "area", "sensors", "source", "seen")
 FORMAT = 1  # of the predictions
 
 
@@ -51,6 +53,8 @@ class Evaluation:
         slow_k: "consistent" is run for these k only.
         merge: merge the maps, too, with each of the `mergers` among the descriptors, at k = 0, and each run.
         baseline: variant that the others are compared with.
+        titles: call runs by what they are made of and not by their folders: "scalars, gat, infonce".
+        tables: those of the short report, of `TABLES`.
         rounds: of the bootstrap.
         write: a Markdown file, to the marked section of which a short table goes; empty: none.
         section: the name of that mark.
@@ -73,6 +77,8 @@ class Evaluation:
     merge: bool = True
     mergers: list[str] = field(default_factory=lambda: ["engineered"])
     baseline: str = "engineered"
+    titles: bool = False
+    tables: list[str] = field(default_factory=lambda: ["ranking", "matching", "seen", "merging"])
     rounds: int = 2000
     write: str = ""
     section: str = "evaluation"
@@ -100,7 +106,7 @@ def check(settings: Evaluation) -> None:
     for name, options in settings.descriptors.items():
         if options.get("name") not in EMBEDDERS:
             raise InputError(f"descriptors.{name}.name {options.get('name')!r}: {', '.join(EMBEDDERS)} are possible")
-    for key, known in (("methods", METHODS), ("context", HOWS)):
+    for key, known in (("methods", METHODS), ("context", HOWS), ("tables", TABLES)):
         for value in getattr(settings, key):
             if value not in known:
                 raise InputError(f"{key}: unknown {value!r}; {', '.join(known)} are possible")
@@ -114,6 +120,9 @@ def check(settings: Evaluation) -> None:
     for run in settings.run:
         if not Path(run).exists():
             raise InputError(f"run={run}: no such folder or file; name a run that was trained")
+    names = [v.name for v in variants(settings)]
+    if again := next((name for name in names if names.count(name) > 1), ""):
+        raise InputError(f"run: two are called {again!r}; rename a folder, or set titles=true")
 
 
 def variants(settings: Evaluation) -> Iterator[Variant]:
@@ -125,13 +134,27 @@ def variants(settings: Evaluation) -> Iterator[Variant]:
                 title = name if not k else f"{name} k={k} {how}"
                 yield Variant(title, name, k, how, methods)
     for run in settings.run:
-        yield Variant(run_name(run), run_name(run), methods=tuple(settings.methods), run=run)
+        name = run_title(run) if settings.titles else run_name(run)
+        yield Variant(name, name, methods=tuple(settings.methods), run=run)
 
 
 def run_name(run: str) -> str:
     """What a run is called in tables: its folder."""
     path = Path(run)
     return path.parent.name if path.is_file() or path.name in ("best", "last") else path.name
+
+
+def run_title(run: str) -> str:
+    """What a run is made of: geometry, node encoder with features of edges or without (bare), loss, and the seed if it is not 0.
+
+    Raises:
+        InputError: no trained embedder there.
+    """
+    network, _, about = read_weights(run)
+    node = network.node
+    edges = "" if node.kind == "none" or node.edges else " bare"
+    seed = f", seed {about['seed']}" if about.get("seed") else ""
+    return f"{' + '.join(network.geometry.parts)}, {node.kind}{edges}, {about.get('loss', 'infonce')}{seed}"
 
 
 def folder_of(settings: Evaluation) -> Path:
@@ -149,7 +172,7 @@ def told(settings: Evaluation) -> dict[str, Any]:
     known["descriptors"] = {name: settings.descriptors[name] for name in settings.only}
     if not settings.run:
         known["methods"] = [m for m in settings.methods if m != "mutual"]
-    runs = {run_name(run): digest_of(Path(run)) for run in settings.run}
+    runs = {v.name: digest_of(Path(v.run)) for v in variants(settings) if v.run}
     found: dict[str, Any] = plain({"format": FORMAT, **known, "run": runs})
     return found
 
