@@ -113,16 +113,21 @@ def info_nce(embedding: Tensor, temperature: Tensor, truth: Truth, easy: float =
 
 
 def triplet(embedding: Tensor, truth: Truth, margin: float) -> tuple[Tensor, Tensor]:
-    """(N,) max(0, d(partner) - d(negative) + margin), and (N,) bool, which rooms have both: the farthest partner, the nearest
-    negative of the same pair of maps (Hermans et al. 2017)."""
+    """(N,) mean over a room's partners of the mean of d(partner) - d(negative) + margin over the negatives of the same pair of
+    maps for which it is above 0; and (N,) bool, which rooms have both (Hermans et al. 2017, "batch all").
+
+    With the hardest triplets alone all rooms come to one point: partners of which one map has a sliver are farther than the
+    nearest others.
+    """
     # Distances of unit vectors; the root needs a gradient at 0.
-    apart = (2 - 2 * embedding @ embedding.T).clamp(min=0).add(1e-8).sqrt()
+    apart = (2 - 2 * embedding @ embedding.T).clamp(min=0).add(1e-6).sqrt()
     own = truth.pair[:, None] == truth.pair[None]
     negative = own & ~truth.same & ~truth.piece & ~torch.eye(len(own), dtype=torch.bool, device=own.device)
-    has = truth.same.any(dim=1) & negative.any(dim=1)
-    far = apart.masked_fill(~truth.same, NEVER).amax(dim=1)
-    near = apart.masked_fill(~negative, -NEVER).amin(dim=1)
-    return torch.where(has, (far - near + margin).relu(), 0.0), has
+    room, partner = truth.same.nonzero(as_tuple=True)
+    wrong = (apart[room, partner, None] - apart[room] + margin).relu() * negative[room]
+    each = wrong.sum(dim=1) / (wrong > 0).sum(dim=1).clamp(min=1)
+    found = torch.zeros_like(embedding[:, 0]).index_add(0, room, each)
+    return found / truth.same.sum(dim=1).clamp(min=1), truth.same.any(dim=1) & negative.any(dim=1)
 
 
 def dustbin_loss(embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth) -> Tensor:

@@ -59,9 +59,33 @@ def test_the_dustbin():
 
 def test_triplets():
     loss, has = triplet(FLAT, ONE, 0.3)
-    assert has.tolist() == [True, False, True, False] and loss[0].item() == 0  # the negative is sqrt 2 away
+    assert has.tolist() == [True, False, True, False] and loss[0].item() == 0  # both negatives are sqrt 2 away, the partner 0
     swapped = torch.tensor([[1.0, 0], [1, 0], [0, 1], [0, 1]])
-    assert triplet(swapped, ONE, 0.3)[0][0].item() == pytest.approx(math.sqrt(2) + 0.3, abs=1e-3)
+    # Room 0: its partner is sqrt 2 away, room 1 is 0 and room 3 sqrt 2; room 2 sees 3 at 0 and 1 at sqrt 2.
+    expected = ((math.sqrt(2) + 0.3) + 0.3) / 2
+    assert triplet(swapped, ONE, 0.3)[0].tolist() == pytest.approx([expected, 0, expected, 0], abs=2e-3)
+
+
+def test_triplets_that_are_met_do_not_count():
+    """a: rooms 0 and 1; b: its pieces 2 and 3 of room 0, and room 4."""
+    embedding = torch.tensor([[1.0, 0], [-1, 0], [1, 0], [0, 1], [0, 1]])
+    what = truth([(0, 2), (0, 3)], [0] * 5, [0, 0, 1, 1, 1], [0, 1, 0, 0, 2])
+    loss, has = triplet(embedding, what, 0.3)
+    # Room 0: from piece 2 (0 away) nothing is wrong with 1 (2 away) or 4 (sqrt 2); from piece 3 (sqrt 2) only 4 is too near.
+    assert has.tolist() == [True, False, True, True, False]
+    assert loss[0].item() == pytest.approx((0 + 0.3) / 2, abs=2e-3)
+
+
+def test_triplets_part_rooms_that_are_at_one_point():
+    """Rooms that are nearly at one point leave it."""
+    rows = torch.nn.Parameter(torch.tensor([[1.0, 0, 0]]).repeat(4, 1) + 0.01 * torch.randn(4, 3, generator=torch.manual_seed(0)))
+    optimizer = torch.optim.Adam([rows], 0.05)
+    for _ in range(100):
+        loss = triplet(torch.nn.functional.normalize(rows, dim=1), ONE, 0.3)[0].sum()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert loss.item() == 0
 
 
 @pytest.mark.parametrize("kind", ["infonce", "ntxent", "triplet"])
