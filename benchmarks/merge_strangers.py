@@ -2,7 +2,8 @@
 floor plans that are not theirs (``merge_drawings.py``).
 
 ``python benchmarks/merge_strangers.py [split] [pairs]``; resumable: one line of JSON a pair in ``cache/merge/strangers_*.jsonl``.
-None of them may be believed. Each map is prepared once and tried with several others; of the floor plans all are taken.
+None of them may be believed. Each map is prepared once and tried with several others; of the floor plans all are taken. Split
+``real``: the maps of the real pairs, of two buildings or of two storeys of one.
 """
 
 from __future__ import annotations
@@ -12,16 +13,19 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterator
 from functools import cache, partial
-from itertools import chain
+from itertools import chain, combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from merge_pairs import load
+from register import SCALELESS, real_pairs
 
 from topomerge.fusion.registration import Prepared, Registration, prepare, register
+from topomerge.types import VoxelGrid
 
 Row = dict[str, Any]
+STOREYS = "utexas"  # all maps of this source are of one building
 STRIDE = 7  # pairs are laid out in blocks of so many pairs, so that few maps are in memory at once
 
 
@@ -57,6 +61,31 @@ def of_strangers(split: str, many: int, done: Collection[str]) -> Iterator[Row]:
             yield _row(about, partial(register, a, b, refined=False))
 
 
+def of_real(many: int, done: Collection[str]) -> Iterator[Row]:
+    """Real maps of two places, so that each place meets each other one before any does so again."""
+    places: dict[str, list[tuple[str, str, str, Prepared]]] = {}
+    for pair in real_pairs():
+        source = str(pair.about["source"])
+        place = pair.name.split("/")[1].split("-")[0] if source == STOREYS else str(pair.about["building"])
+        for grid, free, sensor, side in zip((pair.a, pair.b), pair.free, pair.about["sensors"], "ab", strict=True):  # type: ignore[call-overload]
+            cells = VoxelGrid(grid.cells, grid.origin, grid.edge, grid.shape)
+            places.setdefault(place, []).append((f"{pair.name}:{side}", source, sensor, prepare(cells, free)))
+    rng, count = np.random.default_rng(0), 0
+    while True:
+        for where, other in combinations(sorted(places), 2):
+            i, j = (int(rng.integers(len(places[k]))) for k in (where, other))
+            (one, source, seen, a), (two, origin, by, b) = places[where][i], places[other][j]
+            count += 1
+            if count > many:
+                return
+            name = f"{one}+{two}"
+            if name not in done:
+                kind = "other-storey" if source == origin == STOREYS else "other-building"
+                about = {"name": name, "kind": kind, "building": where, "sensors": [seen, by]}
+                scale = "free" if {source, origin} & set(SCALELESS) else "fixed"
+                yield _row(about, partial(register, a, b, scale=scale, refined=False))
+
+
 def of_drawings(split: str, done: Collection[str]) -> Iterator[Row]:
     """Maps and floor plans of another building, another storey or another wing."""
     for path in sorted((Path("cache/merge") / f"{split}_drawings").glob("*.npz")):
@@ -80,7 +109,8 @@ def main(split: str = "train", pairs: str = "100") -> None:
     """Run what is missing and count."""
     target = Path("cache/merge") / f"strangers_{split}.jsonl"
     done = {r["name"]: r for r in map(json.loads, target.read_text().splitlines())} if target.exists() else {}
-    for row in chain(of_drawings(split, done), of_strangers(split, int(pairs), done)):
+    simulated = () if split == "real" else chain(of_drawings(split, done), of_strangers(split, int(pairs), done))
+    for row in of_real(int(pairs), done) if split == "real" else simulated:
         done[row["name"]] = row
         with target.open("a") as out:
             out.write(json.dumps(row) + "\n")
