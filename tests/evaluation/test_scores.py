@@ -12,7 +12,16 @@ from topomerge.datasets.kept import KeptPair, twins
 from topomerge.errors import InputError
 from topomerge.evaluation.groups import calibration, draws, gain, value
 from topomerge.evaluation.predict import mutual
-from topomerge.evaluation.score import match_counts, merge_counts, overlap_bin, pose_error, rank_counts, ranks_of, within
+from topomerge.evaluation.score import (
+    after_counts,
+    match_counts,
+    merge_counts,
+    overlap_bin,
+    pose_error,
+    rank_counts,
+    ranks_of,
+    within,
+)
 from topomerge.types import Sim3, TrueRoom
 
 
@@ -70,6 +79,16 @@ def test_rank_counts_of_both_directions() -> None:
     assert found["reciprocal"] == pytest.approx(3 + 2 + 1 / 4 + 1 / 5)
     assert found["queries_twin"] == 1 and found["first_twin"] == 0
     assert (found["queries_whole"], found["first_whole"]) == (4, 2)  # rooms 0 and 3 of a, 1 and 2 of b, both entered
+
+
+def test_ranks_after_consensus() -> None:
+    cost = np.ones((5, 4))
+    cost[0, 3] = 0.5  # the descriptor prefers the wrong room to room 0's partner
+    agreed = np.array([(0, 1), (3, 3)])  # right, wrong
+    found = after_counts(kept(), cost, agreed)
+    assert rank_counts(kept(), cost)["first"] == 0
+    assert found == {"first_after": 2, "first_single_after": 2, "five_after": 7}  # room 0 of a, room 1 of b, both without twin
+    assert all(np.isnan(v) for v in after_counts(kept(), cost, None).values()) and cost.min() == 0.5
 
 
 def test_poses() -> None:

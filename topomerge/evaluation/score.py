@@ -41,7 +41,10 @@ def score_all(pairs: Sequence[Path], predictions: Sequence[Path], settings: Eval
         known = kept.about["rooms"] != "laid" or bool(len(kept.matches))
         for v in some if known else ():
             head = {**about, "variant": v.name, "descriptor": v.descriptor, "k": v.k, "context": v.context if v.k else "-"}
-            ranks.append({**head, "seconds": told["seconds"][v.name], **rank_counts(kept, data[f"{v.name}/cost"])})
+            cost, agreed = data[f"{v.name}/cost"], data.get(f"{v.name}/consistent/rooms")
+            ranks.append(
+                {**head, "seconds": told["seconds"][v.name], **rank_counts(kept, cost), **after_counts(kept, cost, agreed)}
+            )
             for method in v.methods:
                 rooms, chance = data[f"{v.name}/{method}/rooms"], data[f"{v.name}/{method}/probability"]
                 seconds = float(data[f"{v.name}/{method}/seconds"])
@@ -157,6 +160,18 @@ def rank_counts(kept: KeptPair, cost: Array) -> Row:
         out[f"five{name}"] = int((r[some] <= 5).sum())
         out[f"reciprocal{name}"] = float((1 / r[some]).sum())
     return out
+
+
+def after_counts(kept: KeptPair, cost: Array, agreed: Array | None) -> Row:
+    """`first`, `first_single` and `five` as of `rank_counts`, each with `_after`: of a ranking in which the matches (M, 2) that
+    one transform explains come first, and the descriptor ranks what they leave; nan where that was not run."""
+    names = ("first", "first_single", "five")
+    if agreed is None:
+        return {f"{name}_after": np.nan for name in names}
+    again = cost.astype(np.float64)
+    again[agreed[:, 0], agreed[:, 1]] = -1.0  # costs are 0 or more
+    found = rank_counts(kept, again)
+    return {f"{name}_after": found[name] for name in names}
 
 
 def pose_error(pose: Sim3, truth: Sim3, anchor: Array) -> tuple[float, float, float]:

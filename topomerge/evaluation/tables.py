@@ -23,11 +23,13 @@ BY = {
     "seen": "Sources that trained something, and those that did not",
 }
 RANKING = ("recall@1", "recall@1_single", "recall@1_twin", "recall@1_whole", "recall@5", "MRR")
+AFTER = ("recall@1_after", "recall@1_single_after", "recall@5_after")
 MATCHING = ("precision", "recall", "F1", "F1_single", "F1_twin", "strict recall")
 MERGING = ("right poses", "merged", "merged finely", "refused")
 NAMES = {
     "recall@1": "recall@1", "recall@1_single": "without twin", "recall@1_twin": "with twin",
     "recall@1_whole": "entered", "recall@5": "recall@5", "MRR": "MRR",
+    "recall@1_after": "after consensus: recall@1", "recall@1_single_after": "without twin", "recall@5_after": "recall@5",
     "precision": "precision", "recall": "recall", "F1": "F1", "F1_single": "F1 without twin", "F1_twin": "F1 with twin",
     "strict recall": "recall one to one", "right poses": "best pose right", "merged": "merged right", "refused": "right, refused",
     "merged finely": "within 0.1 m, 1°",
@@ -82,13 +84,15 @@ def by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
 def ranking(ranks: Sequence[Row], settings: Evaluation) -> Table:
     """How high the true partner of a room ranks among all rooms of the other map."""
     first = [r for r in ranks if r["variant"] == settings.baseline]
-    rows = []
+    rows, after = [], AFTER if any(np.isfinite(r["first_after"]) for r in ranks) else ()
     for name, some in _variants(ranks).items():
         better = gain(some, first, "recall@1", settings.rounds) if name != settings.baseline else None
         cells = [cell(value(some, m, settings.rounds), m in ("recall@1", "recall@5")) for m in RANKING]
         took = np.median([r["seconds"] for r in some])
-        rows.append([name, *cells, _signed(better), f"{took:.2f}"])
-    head = ["descriptor", *(NAMES[m] for m in RANKING), f"recall@1 more than {settings.baseline}", "s a pair"]
+        cells += [_signed(better), *(cell(value(some, m, settings.rounds), m == AFTER[0]) for m in after)]
+        rows.append([name, *cells, f"{took:.2f}"])
+    more = f"recall@1 more than {settings.baseline}"
+    head = ["descriptor", *(NAMES[m] for m in RANKING), more, *(NAMES[m] for m in after), "s a pair"]
     return Table("Ranking of rooms: is a room's true partner the nearest?", head, rows)
 
 
@@ -212,7 +216,7 @@ def curves(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], 
 
 def long_rows(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Iterator[Row]:
     """Every metric of every group, one a row, for other tools."""
-    for rows, metrics in ((ranks, RANKING), (matches, MATCHING), (merges, (*MERGING, "false"))):
+    for rows, metrics in ((ranks, (*RANKING, *AFTER)), (matches, MATCHING), (merges, (*MERGING, "false"))):
         for (variant, method), some in _pairs(rows).items():
             for key in ("all", *BY):
                 for group, these in {"all": some}.items() if key == "all" else by(some, key).items():
