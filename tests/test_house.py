@@ -62,10 +62,7 @@ def imports(path: Path) -> list[tuple[str, bool, int]]:
         for n in ast.walk(node)
     }
     inside = {
-        id(n)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        for n in ast.walk(node)
+        id(n) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) for n in ast.walk(node)
     }
     found = []
     for node in ast.walk(tree):
@@ -122,8 +119,10 @@ def test_nothing_is_unpickled():
             if isinstance(node, ast.Call):
                 called = ast.unparse(node.func)
                 where = f"{path}:{node.lineno}"
-                assert called.split(".")[0] not in ("pickle", "dill", "joblib") or called.endswith(("Parallel", "delayed")) or (
-                    not called.endswith(("load", "loads"))
+                assert (
+                    called.split(".")[0] not in ("pickle", "dill", "joblib")
+                    or called.endswith(("Parallel", "delayed"))
+                    or (not called.endswith(("load", "loads")))
                 ), f"{where}: {called}"
                 keywords = {k.arg: ast.unparse(k.value) for k in node.keywords}
                 assert keywords.get("allow_pickle", "False") == "False", where

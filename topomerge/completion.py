@@ -75,9 +75,7 @@ def _bash(words: dict[str, list[Word]], about: dict[str, str]) -> str:
     del about
     cases = "\n".join(line for name, all in words.items() for line in _cases(name, all))
     options = "\n".join(f'    {name}) _words "{" ".join(_options(all))}" ;;' for name, all in words.items())
-    rest = "\n".join(
-        f'    {name}) {_positional_bash(all)} ;;' for name, all in words.items() if any(not w.flags for w in all)
-    )
+    rest = "\n".join(f"    {name}) {_positional_bash(all)} ;;" for name, all in words.items() if any(not w.flags for w in all))
     return BASH % {"names": " ".join(words), "cases": cases, "options": options, "rest": rest}
 
 

@@ -82,10 +82,7 @@ def test_modularity_is_its_definition():
     weight = similarity.toarray() - np.eye(len(truth))
     degree, total = weight.sum(axis=1), weight.sum()
     expected = sum(
-        weight[i, j] - degree[i] * degree[j] / total
-        for i in range(len(truth))
-        for j in range(len(truth))
-        if truth[i] == truth[j]
+        weight[i, j] - degree[i] * degree[j] / total for i in range(len(truth)) for j in range(len(truth)) if truth[i] == truth[j]
     )
     assert modularity(similarity, truth) == pytest.approx(expected / total)
     assert modularity(similarity, np.zeros(len(truth), int)) == pytest.approx(0.0)

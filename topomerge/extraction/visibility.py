@@ -90,9 +90,7 @@ def visible_cells(
     return _joined(parts, len(at), len(grid))
 
 
-def _cast_tile(
-    cells: Array, table: Array, starts: Array, views: Array, reach: float, slack: float
-) -> tuple[Array, Array, Array]:
+def _cast_tile(cells: Array, table: Array, starts: Array, views: Array, reach: float, slack: float) -> tuple[Array, Array, Array]:
     """Counts a view, words and masks for the views of one tile."""
     margin = int(np.ceil(reach)) + 1
     view_cells = np.floor(views).astype(np.int64)

@@ -23,9 +23,7 @@ MERGE_AT = 4_000_000  # cells of pending chunks
 LARGE = 2e8  # cells: 200 x 200 x 5 m at 0.1 m; smaller grids cost little whatever is in them
 
 
-def voxelise(
-    cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1, warnings: list[str] | None = None
-) -> VoxelGrid:
+def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1, warnings: list[str] | None = None) -> VoxelGrid:
     """Occupied cells of a point cloud, with the property ``count``, the number of points in each.
 
     V_min is a multiple of the edge length, so the cells of a cloud do not depend on what else is in the file or on its order.

@@ -233,9 +233,7 @@ class Assembler:
         between = [link for link in held if len(set(pair) & set(self._parted(found, link)[0])) == 1]
         return min(between, key=lambda link: link.log_odds).maps if between else None
 
-    def settled(
-        self, poses: Poses, links: Sequence[Link], fine: bool = False
-    ) -> tuple[dict[int, Sim3], list[Measured]]:
+    def settled(self, poses: Poses, links: Sequence[Link], fine: bool = False) -> tuple[dict[int, Sim3], list[Measured]]:
         """Poses of a component that agree best with all that is measured between its maps, and that."""
         edges = list(self._measured(poses, links, fine))
         return optimise(poses, edges, self.scaled, min(poses)), edges

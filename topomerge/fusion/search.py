@@ -313,9 +313,7 @@ def _refined(v: View, w: View, group: Sequence[Candidate], scaled: bool) -> list
     return out
 
 
-def distinct(
-    candidates: Iterable[Candidate], middle: Array, same: tuple[float, float, float] = SAME
-) -> list[Candidate]:
+def distinct(candidates: Iterable[Candidate], middle: Array, same: tuple[float, float, float] = SAME) -> list[Candidate]:
     """The first of each group of poses that are one: they agree about b's middle, the yaw and the scale."""
     kept: list[Candidate] = []
     at: list[Array] = []
