@@ -16,8 +16,8 @@ from scipy.sparse.csgraph import connected_components
 import topomerge as tm
 from topomerge.errors import InputError
 from topomerge.fusion.fuse import fuse, join, resampled, room_of_rooms, rooms_in_common
-from topomerge.fusion.merge import match_probability
 from topomerge.fusion.result import STEPS, MergeResult, merge_to_json
+from topomerge.matching.odds import match_probability
 from topomerge.types import Sim3, TopometricMap, VoxelGrid
 
 

@@ -52,7 +52,7 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
                 f"{v.name}/{method}/{key}": value
                 for key, value in matched(v, method, maps, (a, b), kept.about["scale_free"]).items()
             }
-    told["merge"] = {v.name: merged(maps, rows[v.name][0], kept) for v in some if merges(v, settings)}
+    told["merge"] = {v.name: merged(maps, rows[v.name][0], kept, settings.poses) for v in some if merges(v, settings)}
     arrays["told"] = np.frombuffer(json.dumps(plain(told)).encode(), np.uint8)
     archive.write(arrays, target)
     return kept.name
@@ -98,12 +98,12 @@ def mutual(learned: Any, maps: Maps) -> tuple[Array, Array]:
     return np.stack([i, j], axis=1), np.sqrt(rows[i, j] * columns[j, i])
 
 
-def merged(maps: Maps, rows: tuple[Array, Array], kept: KeptPair) -> dict[str, Any]:
+def merged(maps: Maps, rows: tuple[Array, Array], kept: KeptPair, poses: str) -> dict[str, Any]:
     """What the merge of both maps says: as plain values."""
     scale = "free" if kept.about["scale_free"] else "fixed"
     began = time.process_time()
     try:
-        result = merge(maps, scale=scale, embedder=given(maps, rows))
+        result = merge(maps, scale=scale, embedder=given(maps, rows), poses=poses)
     except InputError as error:
         return {
             "refused": str(error),

@@ -14,6 +14,7 @@ from topomerge.embedding.context import HOWS
 from topomerge.embedding.embedders import EMBEDDERS
 from topomerge.embedding.weights import read_weights
 from topomerge.errors import InputError
+from topomerge.fusion.merge import POSES
 from topomerge.io.listing import plain
 
 METHODS = ("full", "assignment", "growing", "consistent", "mutual")
@@ -52,6 +53,7 @@ class Evaluation:
             likeliest, by the probabilities of a trained embedder).
         slow_k: "consistent" is run for these k only.
         merge: merge the maps, too, with each of the `mergers` among the descriptors, at k = 0, and each run.
+        poses: of the merges: "search", or "rooms" (of matched rooms alone, as the thesis fuses).
         baseline: variant that the others are compared with.
         titles: call runs by what they are made of and not by their folders: "scalars, gat, infonce".
         tables: those of the short report, of `TABLES`.
@@ -76,6 +78,7 @@ class Evaluation:
     slow_k: list[int] = field(default_factory=lambda: [0])
     merge: bool = True
     mergers: list[str] = field(default_factory=lambda: ["engineered"])
+    poses: str = "search"
     baseline: str = "engineered"
     titles: bool = False
     tables: list[str] = field(default_factory=lambda: ["ranking", "matching", "seen", "merging"])
@@ -110,6 +113,8 @@ def check(settings: Evaluation) -> None:
         for value in getattr(settings, key):
             if value not in known:
                 raise InputError(f"{key}: unknown {value!r}; {', '.join(known)} are possible")
+    if settings.poses not in POSES:
+        raise InputError(f"poses: unknown {settings.poses!r}; {', '.join(POSES)} are possible")
     if any(k < 0 for k in settings.k) or settings.limit < 0 or settings.rounds < 1 or settings.jobs < 1:
         raise InputError("k and limit must be 0 or more, rounds and jobs 1 or more")
     for name in (*settings.only, *settings.mergers):
@@ -170,6 +175,8 @@ def told(settings: Evaluation) -> dict[str, Any]:
     known["data"].pop("trained")
     known["data"].pop("folder")
     known["descriptors"] = {name: settings.descriptors[name] for name in settings.only}
+    if settings.poses != "search":
+        known["poses"] = settings.poses
     if not settings.run:
         known["methods"] = [m for m in settings.methods if m != "mutual"]
     runs = {v.name: digest_of(Path(v.run)) for v in variants(settings) if v.run}

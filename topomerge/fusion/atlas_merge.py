@@ -9,8 +9,8 @@ from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.fusion.atlas import AtlasResult, Known, atlas
 from topomerge.fusion.fuse import rooms_in_common
-from topomerge.fusion.merge import match_probability
 from topomerge.fusion.result import STEPS, MergeResult, RoomMatch
+from topomerge.matching.odds import match_probability
 from topomerge.types import TopometricMap
 
 

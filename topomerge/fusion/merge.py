@@ -17,15 +17,14 @@ from topomerge.fusion.atlas_join import join_many
 from topomerge.fusion.fuse import rooms_in_common
 from topomerge.fusion.registration import Registration, _order, register
 from topomerge.fusion.result import STEPS, MergeResult, RoomMatch
+from topomerge.fusion.room_poses import room_poses
 from topomerge.fusion.verify import model
 from topomerge.fusion.words import why
 from topomerge.matching.match import match
+from topomerge.matching.odds import match_probability
 from topomerge.types import Array, Sim3, TopometricMap
 
-SCRAP = 0.5  # m2
-# Of a match: constant, fit, log m2 of the smaller room, how many of both are glimpsed, one of both is in several matches. Fitted
-# to the 203 matches of 19 simulated pairs (seeds 21 to 39, true transforms): right where most points of both are of one room.
-ODDS = (0.31, 1.17, 0.35, -0.57, -1.33)
+POSES = ("search", "rooms")
 TOO_WIDE, WIDER = 300.0, 30.0  # m, and times the other map: a map that spans this is in another unit
 HIGHER = 2.2  # times the height of the other's storeys: the same, or a hall
 
@@ -37,6 +36,7 @@ def merge(
     force: bool = False,
     threshold: float | None = None,
     embedder: str | Descriptor = DEFAULT,
+    poses: str = "search",
 ) -> MergeResult:
     """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
 
@@ -47,10 +47,17 @@ def merge(
         threshold: probability from which a merge is believed; that of the calibration if None.
         embedder: "learned" (default), "engineered", "shapedna", "feather", the folder of a trained one, or a callable
             map -> (R, D), for the matching of rooms.
+        poses: "search": of walls and of matched rooms (default); "rooms": of each matched pair of rooms by its surfaces alone, as
+            the thesis does (two maps of one scale; with `embedder="shapedna"` its whole way).
 
     Raises:
-        InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale.
+        InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale
+            or the poses.
     """
+    if poses not in POSES:
+        raise InputError(f"poses must be {' or '.join(POSES)}, not {poses!r}")
+    if poses == "rooms" and (len(maps) > 2 or scale != "fixed"):
+        raise InputError("poses of rooms alone are for two maps of one scale; leave them out (--poses search)")
     if len(maps) > 2:
         from topomerge.fusion.atlas_merge import merge_many  # it stands above this file
 
@@ -60,7 +67,8 @@ def merge(
     if not 0 <= limit <= 1:
         raise InputError(f"threshold must be a probability between 0 and 1, not {threshold}")
     clock = _Clock()
-    found = register(a, b, scale=scale, hypotheses=_hypotheses(a, b, embedder, scale, clock))
+    known = (_hypotheses if poses == "search" else _rooms_alone)(a, b, embedder, scale, clock)
+    found = register(a, b, scale=scale, hypotheses=known, searched=poses == "search")
     believed = found.transform is not None and found.probability >= limit
     result = MergeResult(
         "merged" if believed else "abstained",
@@ -155,14 +163,35 @@ def _hypotheses(a: TopometricMap, b: TopometricMap, embedder: str | Descriptor, 
         return []
     if _order(b) < _order(a):  # as registration: nothing may depend on which comes first
         return [h.inverse() for h in _hypotheses(b, a, embedder, scale, clock)]
+    with clock("match"):
+        found = match(a, b, _timed(embedder, clock), scale_free=scale == "free")
+        return [h.transform for h in found.alternatives]
+
+
+def _rooms_alone(a: TopometricMap, b: TopometricMap, embedder: str | Descriptor, scale: str, clock: _Clock) -> list[Sim3]:
+    """Poses T_ab of the rooms that any hypothesis of growing matches, each pair by its surfaces."""
+    if not len(a.rooms) or not len(b.rooms):
+        return []
+    if _order(b) < _order(a):
+        return [h.inverse() for h in _rooms_alone(b, a, embedder, scale, clock)]
+    with clock("match"):
+        likely: dict[tuple[int, ...], float] = {}
+        for h in match(a, b, _timed(embedder, clock), "growing").alternatives:
+            for pair in h.rooms.tolist():
+                likely[tuple(pair)] = likely.get(tuple(pair), 0.0) + h.probability
+        rooms = np.array(sorted(likely), np.int64).reshape(-1, 2)
+        weights = np.array([likely[i, j] for i, j in rooms.tolist()])
+        return [pose for pose, _ in room_poses(a, b, rooms, weights)]
+
+
+def _timed(embedder: str | Descriptor, clock: _Clock) -> Descriptor:
     describe = make_embedder(embedder)
 
     def timed(m: TopometricMap) -> Array:
         with clock("embed"):
             return describe(m)
 
-    with clock("match"):
-        return [h.transform for h in match(a, b, timed, scale_free=scale == "free").alternatives]
+    return timed
 
 
 def _matches(a: TopometricMap, b: TopometricMap, found: Registration) -> Iterator[RoomMatch]:
@@ -172,18 +201,3 @@ def _matches(a: TopometricMap, b: TopometricMap, found: Registration) -> Iterato
     chance = found.probability * match_probability(a, b, rooms, fit)
     for (i, j), p in zip(rooms.tolist(), chance.tolist(), strict=True):
         yield RoomMatch((0, 1), (i, j), p)
-
-
-def match_probability(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array) -> Array:
-    """(M,) that rooms which share floor under the right transform are one: scraps, glimpses and pieces of a room seldom are.
-
-    Args:
-        rooms, fit: of `rooms_in_common`.
-    """
-    i, j = rooms.T
-    smaller = np.minimum(a.rooms["area"][i], b.rooms["area"][j])
-    glimpsed = a.rooms["glimpsed"][i].astype(float) + b.rooms["glimpsed"][j]
-    several = (np.bincount(i, minlength=1)[i] > 1) | (np.bincount(j, minlength=1)[j] > 1)
-    odds = np.stack([np.ones(len(fit)), fit, np.log(np.maximum(smaller, SCRAP)), glimpsed, several], axis=1) @ ODDS
-    out: Array = 1 / (1 + np.exp(-odds))
-    return out

@@ -15,7 +15,8 @@ from topomerge.fusion.closer import closer
 from topomerge.fusion.evidence import cell_middles, plans
 from topomerge.fusion.refine import Surface, refine_pose, surface
 from topomerge.fusion.scale import search_scaled
-from topomerge.fusion.search import View, search
+from topomerge.fusion.search import Candidate, View, search
+from topomerge.fusion.search import refined as moved
 from topomerge.fusion.verify import MARGIN_CAP, Judge, Ranked, model, probability, rank
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
@@ -101,6 +102,7 @@ def register(
     free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
     yaws: Sequence[float] = (),
     refined: bool = True,
+    searched: bool = True,
 ) -> Registration:
     """The pose of map b in map a's frame. `register(b, a)` gives its inverse.
 
@@ -111,6 +113,7 @@ def register(
         free: cells of a and of b known to be empty; topometric maps bring their own.
         yaws: further turns of b to try, rad.
         refined: finish with the fine registration? Without it the pose is right to a cell.
+        searched: look for poses by correlation? Else the hypotheses are all there is.
 
     Raises:
         InputError: an empty map, or another word for the scale.
@@ -122,13 +125,17 @@ def register(
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
         turned = [h.inverse() for h in hypotheses], [-y for y in yaws]
-        found = register(b, a, scale=scale, hypotheses=turned[0], yaws=turned[1], refined=refined)
+        found = register(b, a, scale=scale, hypotheses=turned[0], yaws=turned[1], refined=refined, searched=searched)
         return replace(_inverse(found), seconds={**found.seconds, **clock.seconds})
     first, second = a.views, b.views
-    candidates = (search_scaled if scale == "free" else search)(first, second, hypotheses, yaws)
+    if searched:
+        candidates = (search_scaled if scale == "free" else search)(first, second, hypotheses, yaws)
+    else:
+        candidates = moved(first, second, [Candidate(h, 0.0, True) for h in hypotheses])
     clock("search")
     if not candidates:
-        return Registration(None, 0.0, False, reason="the maps show no walls that could be compared", seconds=clock.seconds)
+        reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
+        return Registration(None, 0.0, False, reason=reason, seconds=clock.seconds)
     judge = Judge(first, second)
     ranked = rank(candidates, judge)
     seen = closer(judge, ranked[0][0].pose)

@@ -25,7 +25,7 @@ class RoomMatch:
     Args:
         maps: which maps, by their place in the list that was merged.
         rooms: one room of each.
-        probability: that they are one (of the merge, times `merge.match_probability`).
+        probability: that they are one (of the merge, times `odds.match_probability`).
     """
 
     maps: tuple[int, int]

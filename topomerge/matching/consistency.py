@@ -15,6 +15,7 @@ from topomerge.kernels.poses import pose_evidence
 from topomerge.matching.assignment import by_overlap
 from topomerge.matching.costs import best_partners
 from topomerge.matching.door_poses import Poses, door_poses, joined_poses, middle_poses, scaled_poses
+from topomerge.matching.odds import CONFLICT, FLOOR, hypothesis_probability
 from topomerge.matching.result import Hypothesis
 from topomerge.matching.topdown import TopDown, top_down
 from topomerge.types import Array, Sim3, TopometricMap
@@ -28,11 +29,8 @@ TRIMS = (0.8, 0.6, 0.45, 0.35, 0.3, 0.3)  # m, walls farther apart do not count,
 MANY = 20_000  # poses: neighbours are not looked for among more
 FEWEST = 10  # walls that meet; fewer move nothing
 STOREY = 0.7  # m by which floors of one storey may differ
-CONFLICT = 2.0  # weight of a metre that disagrees against one that agrees
-FLOOR = 0.1  # m of wall that a m2 of floor in common is worth
 SAME = (0.5, np.radians(5), 0.05)  # m, rad, share: poses closer than this are one
 SHORTLIST = 0.6  # of the best agreement
-ODDS = (5.71, -3.52, -5.10, 2.52)  # of a hypothesis against "none": see `odds_features`; from benchmarks/matching_odds.py
 
 
 class Sampled(NamedTuple):
@@ -167,8 +165,7 @@ def rank(poses: Poses, evidence: Array, plans: tuple[TopDown, TopDown]) -> tuple
     agree = evidence[:, 1] + FLOOR * evidence[:, 3]
     short = agree >= SHORTLIST * agree.max()
     order = np.lexsort((-evidence[:, 0], ~short))
-    odds = np.exp(np.clip(odds_features(evidence[:, 1:]) @ ODDS, -50, 50))
-    chance = odds / (odds.sum() + 1)
+    chance = hypothesis_probability(evidence[:, 1:])
     found = []
     for h in order.tolist():
         x, y, z = poses.shift[h].tolist()
@@ -178,14 +175,6 @@ def rank(poses: Poses, evidence: Array, plans: tuple[TopDown, TopDown]) -> tuple
         told = dict(zip(("agree_m", "conflict_m", "floor_m2"), evidence[h, 1:].round(3).tolist(), strict=True))
         found.append(Hypothesis(pose, rooms, fit, float(chance[h]), float(evidence[h, 0]), told))
     return tuple(found)
-
-
-def odds_features(evidence: Array) -> Array:
-    """(H, 4) what the odds of a hypothesis depend on: 1, the amount of evidence, the share that conflicts, and the score, from
-    metres that agree, metres that conflict and m2 of floor in common (H, 3)."""
-    agree, conflict, floor = evidence.T
-    score = agree - CONFLICT * conflict + FLOOR * floor
-    return np.stack([np.ones(len(agree)), np.log1p(agree), conflict / (agree + 3), score / 10], axis=1)
 
 
 def matches_under(transform: Sim3, plans: tuple[TopDown, TopDown], storeys: Array) -> tuple[Array, Array]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,13 @@ from topomerge.matching.assignment import assign
 from topomerge.matching.consistency import hypotheses
 from topomerge.matching.costs import descriptor_costs, similarities, usual_best
 from topomerge.matching.growing import align, grow
+from topomerge.matching.odds import match_probability
 from topomerge.matching.result import Hypothesis, Matching
 from topomerge.types import Array, TopometricMap
 
 METHODS = ("consistent", "growing", "assignment", "thesis")
 THESIS: dict[str, Any] = {"laplacian": "graph", "values": 256, "normalise": "first", "k": 1}
-LEAST = 0.05  # probability of a match that is worth telling
+LIKELY = 0.5  # probability of a match that the best hypothesis lacks
 KEPT = 10  # hypotheses
 
 
@@ -73,7 +73,7 @@ def match(
     if method != "consistent":  # one hypothesis wins as a whole, as in the thesis
         rooms = found[0].rooms if found else np.zeros((0, 2), np.int64)
         return Matching(rooms, found[0].fit if found else np.zeros(0), found[0].transform if found else None, found, told)
-    rooms, probability = marginal(found, likelihood(similarity))
+    rooms, probability = marginal(a, b, found)
     return Matching(rooms, probability, found[0].transform if found else None, found, told)
 
 
@@ -103,25 +103,21 @@ def checked(describe: Descriptor, map: TopometricMap) -> Array:
     return rows
 
 
-def marginal(found: tuple[Hypothesis, ...], likely: Callable[[int, int], float]) -> tuple[Array, Array]:
-    """Matches of the best hypothesis, and all whose probability over the hypotheses is above 0.05 and that exclude none of those.
+def marginal(a: TopometricMap, b: TopometricMap, found: tuple[Hypothesis, ...]) -> tuple[Array, Array]:
+    """Matches of the best hypothesis, and all whose probability over the hypotheses is above 0.5 and that exclude none of those.
 
-    The probability of a match is the sum over the hypotheses that have it of theirs times how well it fits.
+    The probability of a match is the sum, over the hypotheses that have it, of theirs times that rooms which fit so are one.
     """
     total: dict[tuple[int, int], float] = {}
     for h in found:
-        for (i, j), fit in zip(h.rooms.tolist(), h.fit.tolist(), strict=True):
-            total[i, j] = total.get((i, j), 0.0) + h.probability * min(1.0, fit + 0.3) * likely(i, j)
+        one = match_probability(a, b, h.rooms, h.fit)
+        for (i, j), p in zip(h.rooms.tolist(), one.tolist(), strict=True):
+            total[i, j] = total.get((i, j), 0.0) + h.probability * p
     best = {(i, j) for i, j in found[0].rooms.tolist()} if found else set()
     taken = ({i for i, _ in best}, {j for _, j in best})
-    others = {(i, j) for (i, j), p in total.items() if p >= LEAST and i not in taken[0] and j not in taken[1]}
-    chosen = sorted(best | {p for p in others if total[p] > 0.5})
+    others = {(i, j) for (i, j), p in total.items() if p > LIKELY and i not in taken[0] and j not in taken[1]}
+    chosen = sorted(best | others)
     return np.array(chosen, np.int64).reshape(-1, 2), np.array([min(total[p], 1.0) for p in chosen])
-
-
-def likelihood(similarity: Array) -> Callable[[int, int], float]:
-    """How much a descriptor's similarity speaks for a pair that geometry proposes: 0.8 if not at all, 1 if fully."""
-    return lambda i, j: 0.8 + 0.2 * float(similarity[i, j])
 
 
 def _from_growing(

@@ -1,0 +1,51 @@
+"""How likely what geometry proposes is so: a hypothesis, and that two rooms which it lays over each other are one room.
+
+Logistic models, fitted to simulated training pairs by ``benchmarks/matching_odds.py``, which prints both lines of weights.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topomerge.types import Array, TopometricMap
+
+CONFLICT = 2.0  # weight of a metre that disagrees against one that agrees
+FLOOR = 0.1  # m of wall that a m2 of floor in common is worth
+SCRAP = 0.5  # m2
+HYPOTHESIS = (5.71, -3.52, -5.10, 2.52)  # against "none", of `hypothesis_features`
+MATCH = (0.31, 1.17, 0.35, -0.57, -1.33)  # of `match_features`
+
+
+def hypothesis_features(evidence: Array) -> Array:
+    """(H, 4) what the odds of a hypothesis depend on: 1, the amount of evidence, the share that conflicts, and the score, from
+    metres that agree, metres that conflict and m2 of floor in common (H, 3)."""
+    agree, conflict, floor = evidence.T
+    score = agree - CONFLICT * conflict + FLOOR * floor
+    return np.stack([np.ones(len(agree)), np.log1p(agree), conflict / (agree + 3), score / 10], axis=1)
+
+
+def hypothesis_probability(evidence: Array) -> Array:
+    """(H,) that each is the right one; with "none of them" they sum to 1."""
+    odds = np.exp(np.clip(hypothesis_features(evidence) @ HYPOTHESIS, -50, 50))
+    out: Array = odds / (odds.sum() + 1)
+    return out
+
+
+def match_features(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array) -> Array:
+    """(M, 5) 1, how well two rooms fit, log m2 of the smaller one, how many of both are glimpsed, and whether one of both is in
+    several matches.
+
+    Args:
+        rooms, fit: (M, 2), (M,) of `consistency.matches_under`.
+    """
+    i, j = rooms.T
+    smaller = np.maximum(np.minimum(a.rooms["area"][i], b.rooms["area"][j]), SCRAP)
+    glimpsed = a.rooms["glimpsed"][i].astype(float) + b.rooms["glimpsed"][j]
+    several = (np.bincount(i, minlength=1)[i] > 1) | (np.bincount(j, minlength=1)[j] > 1)
+    return np.stack([np.ones(len(fit)), fit, np.log(smaller), glimpsed, several], axis=1)
+
+
+def match_probability(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array) -> Array:
+    """(M,) that rooms which share floor under the right transform are one: scraps, glimpses and pieces of a room seldom are."""
+    out: Array = 1 / (1 + np.exp(-match_features(a, b, rooms, fit) @ MATCH))
+    return out
