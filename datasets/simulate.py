@@ -48,11 +48,13 @@ def simulate(
         raise InputError(f"give one or two sensors, not {len(sensors)}")
     for sensor in sensors:
         get_sensor(sensor)
+    if rooms is not None and rooms < 1:
+        raise InputError(f"a map must have 1 room or more, not {rooms}")
     twins = hard == "other-storey"
     building = make_building(kind, seed, max(storeys, 2) if twins else storeys, Difficulty(differ=0.0) if twins else None)
     rng = np.random.default_rng([seed, 1])
     if len(sensors) == 2:
-        pair = make_pair(building, overlap, sensors, rng, scale, hard, rooms or ROOMS)
+        pair = make_pair(building, overlap, sensors, rng, scale, hard, ROOMS if rooms is None else rooms)
         assert pair.frames is not None
         return building, pair, pair.frames[0]
     if hard or scale:

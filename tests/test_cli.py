@@ -131,6 +131,19 @@ def test_wrong_words(run: Run, words: list[str]) -> None:
     assert err.startswith("topomerge") and err.count("\n") == 1 and "--help" in err
 
 
+@pytest.mark.parametrize("words", [["", "-o", "a.tmap"], ["scan.ply", "-o", ""], ["scan.ply", "-o", "a.tmap", "--json", ""]])
+def test_empty_names_are_no_files(run: Run, stages: dict[str, Any], tmp_path: Path, words: list[str]) -> None:
+    status, out, err = run("extract", *words)
+    assert status == 1 and out == "" and "is empty; give the name of a file" in err and err.count("\n") == 1
+    assert not stages.keys() & {"read"} and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", [["--up", "-y"], ["--up=-y"]])
+def test_values_may_start_with_a_dash(run: Run, stages: dict[str, Any], words: list[str]) -> None:
+    assert run("extract", "scan.ply", "-o", "a.tmap", *words)[0] == 0
+    assert stages["read"]["up"] == "-y"
+
+
 def test_no_words(run: Run) -> None:
     status, _, err = run()
     assert status == 1 and "extract" in err

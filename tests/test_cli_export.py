@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -96,6 +97,13 @@ BAD = [
     (("a.tmap", "--to", "graphml", "-o", "x", "--storey", "one"), "whole number"),
     (("a.tmap", "-o", "x"), "--to"),
 ]
+
+
+def test_an_origin_in_the_south(run: Run) -> None:
+    for words in (("--origin", "-33.9,-151.2"), ("--origin=-33.9,-151.2,-5",)):
+        assert run("export", "a.tmap", "--to", "geojson", "-o", "a.geojson", *words)[0] == 0
+        west = [x for x, y in re.findall(r"\[\s*(-?[\d.]+),\s*(-?[\d.]+)", Path("a.geojson").read_text()) if float(y) < -33]
+        assert len(west) > 10 and {round(float(x)) for x in west} == {-151}
 
 
 @pytest.mark.parametrize(("words", "said"), BAD)

@@ -112,7 +112,7 @@ def test_bad_input_is_told_in_one_line(run: Run, folder: Path, words: tuple[str,
 
 def test_bad_folders(run: Run, folder: Path) -> None:
     (folder / "file").write_text("")
-    for place, told in (("file", "is a file"), ("file/merged", "can't be written"), ("merged", "is the input")):
+    for place, told in (("file", "is a file"), ("file/merged", "can't be made"), ("merged", "is the input")):
         first = "merged/map.tmap" if place == "merged" else "b.tmap"
         status, _, err = run(first, "c.tmap", "-o", place)
         assert status == 1 and told in err and len(err.splitlines()) == 1

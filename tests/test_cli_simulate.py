@@ -28,6 +28,23 @@ def truth(folder: Path) -> Any:
     return json.loads((folder / "truth.json").read_text())
 
 
+@pytest.mark.parametrize("place", ["file", "file/x", "/proc/x", ""])
+def test_a_folder_that_cannot_be_is_found_first(tmp_path: Path, monkeypatch: Any, capsys: Any, place: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("topomerge.datasets.simulate.simulate", lambda *_, **__: pytest.fail("simulated for nothing"))
+    Path("file").touch()
+    assert cli.main(["simulate", "--building", "house", "-o", place]) == 1
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "; give " in err
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_what_cannot_be_simulated_leaves_no_folder(tmp_path: Path, capsys: Any) -> None:
+    for words in (("--rooms", "0"), ("--rooms", "0", "--sensors", "tls"), ("--sensors", "eyes"), ("--storeys", "0")):
+        assert cli.main(["simulate", "--building", "house", *words, "-o", str(tmp_path / "a" / "b")]) == 1
+        assert capsys.readouterr().err.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
 def test_files(folder: Path) -> None:
     assert sorted(p.name for p in folder.iterdir()) == ["a.ply", "b.ply", "plan.png", "truth.json"]
     known = truth(folder)

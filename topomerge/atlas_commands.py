@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from topomerge.command import Argument, Command, option
-from topomerge.console import warn
+from topomerge.console import check_inputs, warn
 from topomerge.errors import InputError
 
 Read = Callable[[str, argparse.Namespace], Any]  # path, options -> map
@@ -35,7 +35,7 @@ def _add(args: argparse.Namespace, read: Read) -> int:
     if not args.items:
         raise InputError(f"{args.folder}: name the maps or clouds to add: topomerge atlas add {args.folder} MAP ...")
     check_folder(args.folder)
-    _check_inputs(args.items)
+    check_inputs(args.items)
     maps = []
     for path in args.items:
         try:
@@ -45,16 +45,6 @@ def _add(args: argparse.Namespace, read: Read) -> int:
         maps.append((Path(path).stem, replace(found, source=path)))
     settings = {name: getattr(args, name) for name in ("scale", "threshold", "embedder") if hasattr(args, name)}
     return _told(add(args.folder, maps, **settings), args)
-
-
-def _check_inputs(paths: Sequence[str]) -> None:
-    seen: set[Path] = set()
-    for path in paths:
-        if not Path(path).exists():
-            raise InputError(f"{path}: no such file")
-        if Path(path).resolve() in seen:
-            raise InputError(f"{path}: is given twice; give it once")
-        seen.add(Path(path).resolve())
 
 
 def _remove(args: argparse.Namespace) -> int:

@@ -29,6 +29,9 @@ exit status:
 Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""
 
 
+SIGNED = ("--origin", "--up")  # options whose value may start with a dash
+
+
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, with status 1: 2 is kept for "no trustworthy merge"."""
 
@@ -92,11 +95,31 @@ def _named_paths(args: argparse.Namespace) -> list[str]:
     return [str(path) for value in given for path in (value if isinstance(value, list) else [value])]
 
 
+def _refuse_empty_names(args: argparse.Namespace) -> None:
+    """An empty name is what a script's unset variable leaves; pathlib would take it for the current folder."""
+    for name in args.paths:
+        value = getattr(args, name, None)
+        if value == "" or (isinstance(value, list) and "" in value):
+            raise ValueError(f"the name given for {name} is empty; give the name of a file or folder")
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    """`--origin -33.9,151.2` as `--origin=-33.9,151.2`: argparse takes a value that starts with a dash for another option."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] in SIGNED and word.startswith("-"):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
 def _run(args: argparse.Namespace) -> int:
     debug = args.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
     logging.basicConfig(format="topomerge: %(message)s")
     logging.getLogger("topomerge").setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[min(args.verbose, 2)])
     try:
+        _refuse_empty_names(args)
         status = int(args.run(args))
         sys.stdout.flush()
         return status
@@ -135,7 +158,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")  # a terminal without m² must not end the work
     parser = build_parser()
     try:
-        args = parser.parse_args(argv)
+        args = parser.parse_args(_joined(sys.argv[1:] if argv is None else argv))
         if args.run is None:
             parser.print_help(sys.stderr)
             return 1

@@ -14,7 +14,7 @@ from typing import Any
 import topomerge
 from topomerge.atlas_commands import atlas_verb
 from topomerge.command import Command, count, option
-from topomerge.console import Bars, check_outputs, warn, write_all
+from topomerge.console import Bars, check_inputs, check_outputs, output_folder, warn, write_all
 from topomerge.errors import InputError
 from topomerge.export_commands import EXPORT, VIEW
 from topomerge.learn_commands import EXPORT_EMBEDDER
@@ -50,7 +50,7 @@ READING = (
     option(
         "--up",
         choices=("z", "y", "x", "-z", "-y", "-x"),
-        help="axis of the input that points up (default z, for glTF y); write --up=-y for one that points down",
+        help="axis of the input that points up (default z, for glTF y); -y: it points down",
     ),
     option("--unit", choices=("m", "cm", "mm", "ft", "in"), help="unit of the input (default m)"),
     option("--scale", type=_above_zero, metavar="S", help="multiply coordinates by this (default 1)"),
@@ -105,18 +105,16 @@ def info_command(args: argparse.Namespace) -> int:
 
 def simulate_command(args: argparse.Namespace) -> int:
     """`topomerge simulate`: clouds of a building that is known, with the truth."""
-    folder = Path(args.output)
-    if folder.is_file():
-        raise InputError(f"{folder}: is a file; give the name of a folder")
-    from topomerge.datasets.simulate import outputs, simulate
-
     choices = _given(args, "seed", "storeys", "overlap", "rooms", "hard")
     if hasattr(args, "sensors"):
         choices["sensors"] = tuple(name.strip() for name in args.sensors.split(",") if name.strip())
-    building, made, frame = simulate(args.building, **choices, scale=args.scale == "free")
-    folder.mkdir(parents=True, exist_ok=True)
-    files = outputs(building, made, frame, folder)
-    write_all(files)
+    with output_folder(args.output) as folder:
+        check_outputs([folder / "truth.json"])
+        from topomerge.datasets.simulate import outputs, simulate
+
+        building, made, frame = simulate(args.building, **choices, scale=args.scale == "free")
+        files = outputs(building, made, frame, folder)
+        write_all(files)
     if not args.quiet:
         print(f"{building.name}: {len(building.rooms)} rooms -> {' '.join(str(path) for path, _ in files)}")
     return 0
@@ -155,8 +153,7 @@ def match_command(args: argparse.Namespace) -> int:
     from topomerge.matching.listing import matching_to_json, matching_to_text
     from topomerge.matching.match import check, match
 
-    if Path(args.a).resolve() == Path(args.b).resolve():
-        raise InputError(f"{args.b}: is given twice; give two different maps")
+    check_inputs([args.a, args.b])
     a, b = _map_from(args.a, args), _map_from(args.b, args)
     check(a, b)
     alone = [path for path, m in ((args.a, a), (args.b, b)) if len(m.rooms) == 1]
@@ -168,31 +165,15 @@ def match_command(args: argparse.Namespace) -> int:
 
 def merge_command(args: argparse.Namespace) -> int:
     """`topomerge merge`: maps in, one map out, or an honest refusal."""
-    folder = Path(args.output)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; give the name of a folder")
-    _check_inputs(args.inputs)
-    made = not folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    if len(args.inputs) < 2:
+        raise InputError(f"{args.inputs[0]}: merge takes two maps or more, 1 given; give another one")
+    check_inputs(args.inputs)
+    with output_folder(args.output) as folder:
         check_outputs([folder / name for name in ("merge.json", "report.html", "merged.ply", "map.tmap")], args.inputs)
-        status = _merge(args, folder)
-    except OSError as error:
-        raise InputError(f"{folder}: can't be written ({error.strerror or error})") from error
-    finally:
-        if made and folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-    return status
-
-
-def _check_inputs(paths: list[str]) -> None:
-    if len(paths) < 2:
-        raise InputError(f"{paths[-1]}: merge takes two maps or more, {len(paths)} given; give another one")
-    for k, path in enumerate(paths):
-        if not Path(path).exists():
-            raise InputError(f"{path}: no such file")
-        if Path(path).resolve() in [Path(other).resolve() for other in paths[:k]]:
-            raise InputError(f"{path}: is given twice; give different maps")
+        try:
+            return _merge(args, folder)
+        except OSError as error:
+            raise InputError(f"{folder}: can't be written ({error.strerror or error}); make room, or give another") from error
 
 
 def _merge(args: argparse.Namespace, folder: Path) -> int:
@@ -213,7 +194,7 @@ def _merge(args: argparse.Namespace, folder: Path) -> int:
         read, extracted = read + took - steps, extracted + steps
         maps.append(replace(found, source=path))
     choices = _given(args, "force", "threshold")
-    result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, **choices)
+    result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices)
     result = replace(result, seconds={**result.seconds, "read": read, "extract": extracted})
     warn(result.warnings)
     result.save(folder)
@@ -345,6 +326,12 @@ COMMANDS = (
                 choices=("fixed", "free"),
                 default="fixed",
                 help="free: those of all but the first are unknown",
+            ),
+            option(
+                "--poses",
+                choices=("search", "rooms"),
+                default="search",
+                help="rooms: only of matched rooms by their surfaces, as the thesis does; two maps",
             ),
             option("--force", action="store_true", help="write the best merge even if it is not believed (status 2 stays)"),
             option("--threshold", type=_share, metavar="P", help="probability from which a merge is believed (default 0.9)"),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,6 +87,45 @@ def warn(messages: Iterable[str]) -> None:
 
 class _Probe(Exception):
     """Ends a trial of writing."""
+
+
+def check_inputs(paths: Sequence[str]) -> None:
+    """Find out before the work starts whether its files are there, each of them once.
+
+    Raises:
+        InputError: one is missing, or two names mean the same file.
+    """
+    seen: set[Path] = set()
+    for path in paths:
+        place = Path(path).resolve()
+        if not place.exists():
+            raise InputError(f"{path}: no such file; check the path")
+        if place in seen:
+            raise InputError(f"{path}: is given twice; give each file once")
+        seen.add(place)
+
+
+@contextmanager
+def output_folder(path: str | Path) -> Iterator[Path]:
+    """A folder to write into, made with those above it where they are missing. What stays empty is taken away again.
+
+    Raises:
+        InputError: it is a file, or can't be made.
+    """
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; give the name of a folder")
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: can't be made ({error.strerror or error}); give another folder") from error
+        yield folder
+    finally:
+        for empty in missing:
+            with suppress(OSError):  # what is written stays
+                empty.rmdir()
 
 
 def check_outputs(outputs: Sequence[str | Path], inputs: Sequence[str | Path] = ()) -> None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from topomerge.command import Command, count, option
-from topomerge.console import check_outputs, warn, write_all
+from topomerge.console import check_inputs, check_outputs, output_folder, warn, write_all
 from topomerge.errors import InputError
 
 PAGES = (".html", ".htm")
@@ -27,15 +26,10 @@ def export_command(args: argparse.Namespace) -> int:
     path, folder = _place(args, names, source)
     found = load_map(source)
     warn(found.warnings)
-    made = _make_folders(path.parent)
-    try:
+    with output_folder(path.parent):
         files = [file for name in names for file in outputs(found, name, path, folder, **options)]
         check_outputs([file for file, _ in files], [source])
         write_all(files)
-    finally:
-        for empty in made:
-            with suppress(OSError):
-                empty.rmdir()  # only where nothing was written
     if not args.quiet:
         print(f"{len(found.rooms)} rooms, {len(found.edges)} doors and stairs -> {' '.join(str(file) for file, _ in files)}")
     return 0
@@ -72,10 +66,9 @@ def _map_file(given: str) -> Path:
             raise InputError(f"{path}: holds {len(joined)} joined maps; give one of {', '.join(str(p) for p in joined)}")
         refused = " (its merge was refused: merge again with --force)" if (path / "merge.json").is_file() else ""
         raise InputError(f"{path}: holds no joined map{refused}; give a .tmap, or the folder of a merge or an atlas")
-    if not path.exists():
-        raise InputError(f"{path}: no such file")
+    check_inputs([given])
     if path.suffix.lower() != ".tmap":
-        raise InputError(f"{path}: is no map; make one with `topomerge extract {path.name} -o {path.stem}.tmap`")
+        raise InputError(f"{path}: is no map; make one with `topomerge extract {path} -o {path.stem}.tmap`")
     return path
 
 
@@ -93,16 +86,6 @@ def _place(args: argparse.Namespace, names: list[str], source: Path) -> tuple[Pa
     if several or path.is_dir() or args.output.endswith(("/", "\\")):
         return path / stem, True
     return path, False
-
-
-def _make_folders(folder: Path) -> list[Path]:
-    """Make a folder and those above it; which had to be made, the innermost first."""
-    missing = [p for p in (folder, *folder.parents) if not p.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: can't be made ({error.strerror or error}); give another folder") from error
-    return missing
 
 
 def view_command(args: argparse.Namespace) -> int:
@@ -135,8 +118,7 @@ def _page(args: argparse.Namespace, scratch: str | None = None) -> Path:
         if not (path / "map.tmap").is_file():
             raise InputError(f"{path}: holds no report.html; give the folder of a merge or an atlas, a .tmap or an .html")
         path = path / "map.tmap"
-    elif not path.exists():
-        raise InputError(f"{path}: no such file")
+    check_inputs([str(path)])
     if path.suffix.lower() in PAGES:
         if args.output is not None:
             raise InputError(f"{args.output}: -o is for the report of a .tmap, and {path} is a page already; leave it out")

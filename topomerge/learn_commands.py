@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from topomerge.command import Command, option
+from topomerge.console import output_folder
 from topomerge.errors import InputError
 
 
 def export_embedder_command(args: argparse.Namespace) -> int:
     """`topomerge export-embedder`: the best embedder of a run, as safetensors and JSON, and as ONNX."""
-    folder = Path(args.output)
-    if folder.is_file():
-        raise InputError(f"{folder}: is a file; give the name of a folder")
     try:
         from topomerge.models.weights import read_embedder, save_embedder
     except ModuleNotFoundError as error:
         raise InputError(f"a learned embedder needs {error.name}: pip install topomerge[learn]") from error
     network, about = read_embedder(args.run_folder)
-    save_embedder(network, folder, about)
-    if args.onnx:
-        from topomerge.models.onnx import save_onnx
+    with output_folder(args.output) as folder:
+        save_embedder(network, folder, about)
+        if args.onnx:
+            from topomerge.models.onnx import save_onnx
 
-        save_onnx(network, folder / "embedder.onnx")
+            save_onnx(network, folder / "embedder.onnx")
     if not args.quiet:
         count = sum(p.numel() for p in network.parameters())
         print(f"{count} weights, {network.network.size} numbers a room -> {folder}")

@@ -98,6 +98,6 @@ def test_feather_is_the_formula(map: TopometricMap):
 
 
 def test_bad_names():
-    for name, options in (("x", {}), ("engineered", {"k": -1}), ("shapedna", {"value": 3}), ("feather", {"steps": 0})):
+    for name, options in (("x", {}), ("engineered", {"k": -1}), ("engineered", {"k": 100_000}), ("", {}), ("shapedna", {"value": 3}), ("feather", {"steps": 0})):
         with pytest.raises(InputError):
             embedder(name, **options)

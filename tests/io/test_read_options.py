@@ -152,7 +152,8 @@ def test_missing_unknown_empty_and_locked_files(tmp_path: Path) -> None:
     (tmp_path / "a.docx").write_text("x")
     (tmp_path / "empty.ply").touch()
     (tmp_path / "folder.ply").mkdir()
-    cases = {"none.ply": "no such file", "a.docx": "known are ply pcd", "empty.ply": "is empty", "folder.ply": "is a folder"}
+    cases = {"none.ply": "no such file", "a.docx": "one of ply pcd", "empty.ply": "is empty", "folder.ply": "is a folder"}
+    cases["a.tmap"] = "is a map already"
     for name, says in cases.items():
         with pytest.raises(InputError, match=says) as caught:
             read_points(tmp_path / name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,7 +98,10 @@ def test_maps_with_little_in_them(tmp_path: Path) -> None:
     none = np.zeros(0, np.int32)
     cells = {"room": none, "navigable_room": none, "navigable_area": none}
     empty = without_rooms(replace(building(1, 1), grid=grid, navigable=grid, **cells))
-    save_figure(replace(empty, source="$x^2$"), tmp_path / "empty.png")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in ("$x^2$", "房间"):
+            save_figure(replace(empty, source=name), tmp_path / "empty.png")
     assert len(list(tmp_path.iterdir())) == 2
 
 

@@ -12,6 +12,7 @@ from topomerge.errors import InputError
 from topomerge.types import Array, TopometricMap
 
 HOWS = ("join", "mean")
+MOST_STEPS = 20  # no room of a building is much farther from another
 
 
 def with_context(descriptor: Descriptor, k: int = 1, how: str = "join") -> Descriptor:
@@ -24,10 +25,10 @@ def with_context(descriptor: Descriptor, k: int = 1, how: str = "join") -> Descr
             mean of their descriptors.
 
     Raises:
-        InputError: k is no whole number of 0 or more, or `how` is unknown.
+        InputError: k is no whole number from 0 to `MOST_STEPS`, or `how` is unknown.
     """
-    if not isinstance(k, int) or isinstance(k, bool) or k < 0:
-        raise InputError(f"steps of context must be a whole number, 0 or more, not {k}")
+    if not isinstance(k, int) or isinstance(k, bool) or not 0 <= k <= MOST_STEPS:
+        raise InputError(f"steps of context must be a whole number from 0 to {MOST_STEPS}, not {k}")
     if how not in HOWS:
         raise InputError(f"context {how!r}: {', '.join(HOWS)} are possible")
     if k == 0:

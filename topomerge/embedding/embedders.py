@@ -51,7 +51,7 @@ def embedder(name: str | Descriptor = DEFAULT, k: int = 0, context: str = "join"
         if options:
             raise InputError(f"options {', '.join(options)} are for embedders that are named, not for a callable")
         return with_context(name, k, context)
-    if name not in EMBEDDERS and Path(name).is_dir():
+    if name and name not in EMBEDDERS and Path(name).is_dir():
         return embedder("learned", k, context, path=name, **options)
     if name not in EMBEDDERS:
         raise InputError(f"unknown descriptor {name!r}: {', '.join(EMBEDDERS)} or the folder of a trained one are possible")

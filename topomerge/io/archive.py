@@ -61,14 +61,14 @@ def read(path: str | Path, kind: str = "archive") -> dict[str, Array]:
             if not start:
                 raise InputError(f"{path}: is empty; make the {kind} again")
             if start[:2] != b"PK":
-                raise InputError(f"{path}: is not a {kind}")
+                raise InputError(f"{path}: is not a {kind}; check the name, or make one again")
             return _read(file, path.stat().st_size)
     except (InputError, MemoryError):
         raise
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
+        raise InputError(f"{path}: no such file; check the path") from error
     except PermissionError as error:
-        raise InputError(f"{path}: can't be read (permission denied)") from error
+        raise InputError(f"{path}: can't be read (permission denied); check its permissions") from error
     except Exception as error:  # damage can surface anywhere in zipfile, zlib and NumPy, as nearly any exception
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{path}: damaged or cut off ({reason}); copy or make the {kind} again") from error

@@ -157,8 +157,10 @@ def _format_of(path: Path) -> Format:
         if path.suffix.lower() in file_format.suffixes:
             break
     else:
+        if path.suffix.lower() == ".tmap":
+            raise InputError(f"{path}: is a map already; give the scan that it was made of, or see it with `topomerge info`")
         known = " ".join(s[1:] for s in suffixes())
-        raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; known are {known}")
+        raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; rename or export it as one of {known}")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is no regular file (a pipe or a device); give the name of a file")
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,8 @@ def save_figure(map: TopometricMap, path: str | Path) -> None:
     kind = Path(path).suffix.lower().removeprefix(".") or "png"
     # No date and no program's name, so that the same map gives the same file.
     undated = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
-    with mpl.rc_context({"svg.hashsalt": "topomerge"}), replacing(path) as beside:
+    with mpl.rc_context({"svg.hashsalt": "topomerge"}), replacing(path) as beside, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # a sign in the scan's name that the font lacks is drawn as a box
         figure.savefig(beside, format=kind, dpi=DPI, metadata=undated.get(kind))
 
 
