@@ -158,6 +158,14 @@ def test_view_opens_reports(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     assert status == 0 and out == "merged/report.html\n" and "no browser" in err
 
 
+def test_views_of_damaged_maps_leave_nothing(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    Path("half.tmap").write_bytes(Path("a.tmap").read_bytes()[:3000])
+    status, out, err = run("view", "half.tmap", "--no-open")
+    assert status == 1 and out == "" and err.startswith("topomerge: half.tmap: damaged") and not names("temporary")
+
+
 BAD_VIEWS = [
     (("no.html",), "no such file"),
     (("cloud.npy",), "can't be shown"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -125,15 +126,16 @@ def _page(args: argparse.Namespace, scratch: str | None = None) -> Path:
         return path
     if path.suffix.lower() != ".tmap":
         raise InputError(f"{path}: can't be shown; give a .tmap (of `topomerge extract`), the folder of a merge or an .html")
+    from topomerge.io.maps import load_map
+    from topomerge.viz.report import save_report
+
+    found = load_map(path)
     if args.output is not None:
         place = Path(args.output)
     else:  # a browser reads it after this program has ended: only what is served is deleted
         place = Path(scratch or tempfile.mkdtemp(prefix="topomerge-")) / f"{path.stem}.html"
     check_outputs([place], [path])
-    from topomerge.io.maps import load_map
-    from topomerge.viz.report import save_report
-
-    write_all([(place, lambda beside: save_report(load_map(path), beside))])
+    write_all([(place, partial(save_report, found))])
     return place
 
 

@@ -98,6 +98,7 @@ def test_feather_is_the_formula(map: TopometricMap):
 
 
 def test_bad_names():
-    for name, options in (("x", {}), ("engineered", {"k": -1}), ("engineered", {"k": 100_000}), ("", {}), ("shapedna", {"value": 3}), ("feather", {"steps": 0})):
+    wrong = [("x", {}), ("", {}), ("shapedna", {"value": 3}), ("feather", {"steps": 0})]
+    for name, options in [*wrong, *(("engineered", {"k": k}) for k in (-1, 100_000, 0.5, True))]:
         with pytest.raises(InputError):
             embedder(name, **options)
