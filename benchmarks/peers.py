@@ -1,13 +1,14 @@
 """Ours, KISS-Matcher (0.2 and 0.3 m), FPFH + RANSAC and FGR on the same pairs, in one run: what is right, and the time it takes.
 
-``python benchmarks/peers.py [seconds]`` works through test pairs (`merge_pairs.py test`, `merge_drawings.py test`) for so many
-seconds of processor, bin by bin and kind by kind in turn. Resumable: a line of JSON a pair with all methods in
-``cache/merge/peers.jsonl``; `peers_table.py` makes the tables of it.
+``python benchmarks/peers.py SECONDS [real]`` works through test pairs (`merge_pairs.py test`, `merge_drawings.py test`) for so
+many seconds of processor, bin by bin and kind by kind in turn, or through the real pairs of TOPOMERGE_DATA. Resumable: a line of
+JSON a pair with all methods in ``cache/merge/peers.jsonl``, ``peers_real.jsonl``; `peers_table.py` makes the tables of them.
 
 Everyone gets the same two clouds, the means of the points of 0.1 m cells, on one core and one thread. Timed, in seconds of
 processor: from these clouds in memory to the pose; ours also from them to the joined map with its rooms (``extract`` of both,
 ``merge``). KISS-Matcher gets points thinned at its voxel, so that its Python binding has little to copy, and its solver of four
-degrees of freedom (Quatro). Open3D has none: its poses are made upright afterwards.
+degrees of freedom (Quatro). Open3D has none: its poses are made upright afterwards. Where the scale is unknown (Halmstad), ours
+has to find it; the others, which can't, are given it.
 """
 
 from __future__ import annotations
@@ -17,19 +18,20 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from calibrate_merge import error
 from merge_pairs import GridPair, load
-from register import open3d_features, upright
+from register import SCALELESS, open3d_features, real_pairs, upright
 
 from topomerge.fusion.evidence import cell_middles
 from topomerge.types import PointCloud, Sim3, VoxelGrid
 
 CACHE = Path("cache/merge")
-TARGET = CACHE / "peers.jsonl"
+TARGETS = {"": CACHE / "peers.jsonl", "real": CACHE / "peers_real.jsonl"}
 VOXEL, ITERATIONS = 0.3, 100_000  # of Open3D
 WHOLE = 3  # every third pair goes the whole way to a joined map
 BINS = {"<40 m²": (1.0, 40.0), "40-80 m²": (40.0, 80.0), "≥80 m²": (80.0, np.inf)}
@@ -62,7 +64,7 @@ def ours(pair: GridPair) -> Answer:
     points = [np.asarray(g.properties["mean"]) for g in (pair.a, pair.b)]
     began = time.process_time()
     a, b = (voxelise(PointCloud(p), pair.a.edge) for p in points)
-    found = register(a, b, free=pair.free)
+    found = register(a, b, free=pair.free, scale="free" if pair.about["source"] in SCALELESS else "fixed")
     return found.transform, found.accepted, time.process_time() - began
 
 
@@ -74,7 +76,7 @@ def whole(pair: GridPair) -> dict[str, float]:
     began = time.process_time()
     a, b = (extract(cloud(g, f), name=n) for g, f, n in zip((pair.a, pair.b), pair.free, "ab", strict=True))
     middle = time.process_time()
-    found = merge([a, b], force=True)
+    found = merge([a, b], scale="free" if pair.about["source"] in SCALELESS else "fixed", force=True)
     return {"extract": middle - began, "merge": time.process_time() - middle, "joined": float(found.map is not None)}
 
 
@@ -124,14 +126,24 @@ def open3d(pair: GridPair) -> dict[str, Answer]:
     return out
 
 
+def scaled(pair: GridPair) -> GridPair:
+    """The pair with b brought to the scale of a."""
+    size = pair.truth.scale if pair.truth is not None else 1.0
+    if size == 1.0:
+        return pair
+    grid = VoxelGrid(pair.b.cells, pair.b.origin * size, pair.b.edge * size, pair.b.shape)
+    grid = grid.with_properties(mean=np.asarray(pair.b.properties["mean"]) * size)
+    return replace(pair, b=grid, free=(pair.free[0], None), truth=replace(pair.truth, scale=1.0))
+
+
 def measured(pair: GridPair, all_the_way: bool) -> dict[str, Any]:
     """All methods on one pair."""
-    answers = {"ours": ours(pair), "kiss02": kiss(0.2)(pair), "kiss03": kiss(0.3)(pair), **open3d(pair)}
-    told = {
-        name: {"err": None if pose is None else error(pose, pair), "believed": believed, "seconds": seconds}
-        for name, (pose, believed, seconds) in answers.items()
-    }
-    about = {k: pair.about[k] for k in ("sensors", "building", "kind")}
+    given = scaled(pair)
+    answers = {"kiss02": kiss(0.2)(given), "kiss03": kiss(0.3)(given), **open3d(given)}
+    told = {}
+    for name, where, (pose, believed, seconds) in (("ours", pair, ours(pair)), *((n, given, a) for n, a in answers.items())):
+        told[name] = {"err": None if pose is None else error(pose, where), "believed": believed, "seconds": seconds}
+    about = {k: pair.about[k] for k in ("sensors", "building", "kind", "source")}
     return {"name": pair.name, "common": pair.common, **about, "methods": told, "whole": whole(pair) if all_the_way else None}
 
 
@@ -147,20 +159,30 @@ def chosen() -> Iterator[Path]:
         yield from (paths[k] for _, paths in sorted(groups.items()) if k < len(paths))
 
 
-def run(seconds: float) -> None:
+def pairs(which: str, done: set[str]) -> Iterator[tuple[int, GridPair]]:
+    """Numbered pairs that are not done."""
+    if which == "real":
+        yield from ((k, pair) for k, pair in enumerate(real_pairs()) if pair.name not in done)
+        return
+    for k, path in enumerate(list(chosen())):
+        if path.stem not in done:
+            yield k, load(path, mean=True)
+
+
+def run(seconds: float, which: str = "") -> None:
     """Measure what is missing, until the seconds of processor are used up."""
     os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})  # KISS-Matcher takes all cores otherwise
-    done = {json.loads(line)["name"] for line in TARGET.read_text().splitlines()} if TARGET.exists() else set()
-    for k, path in enumerate(list(chosen())):
+    target = TARGETS[which]
+    done = {json.loads(line)["name"] for line in target.read_text().splitlines()} if target.exists() else set()
+    for k, pair in pairs(which, done):
+        row = measured(pair, k % WHOLE == 0)
+        with target.open("a") as out:
+            out.write(json.dumps(row) + "\n")
+        told = {m: (round(r["seconds"], 1), r["err"] and round(r["err"][0], 2)) for m, r in row["methods"].items()}
+        print(row["name"], row["sensors"], told, row["whole"], flush=True)
         if time.process_time() > seconds:
             return
-        if path.stem not in done:
-            row = measured(load(path, mean=True), k % WHOLE == 0)
-            with TARGET.open("a") as out:
-                out.write(json.dumps(row) + "\n")
-            told = {m: (round(r["seconds"], 1), r["err"] and round(r["err"][0], 2)) for m, r in row["methods"].items()}
-            print(row["name"], row["sensors"], told, row["whole"], flush=True)
 
 
 if __name__ == "__main__":
-    run(float(sys.argv[1]))
+    run(float(sys.argv[1]), *sys.argv[2:])

@@ -87,8 +87,20 @@ def test_the_calibration_fits_its_features():
 def test_little_evidence_is_no_praise():
     """Shares of nothing are drawn to what is usual: two walls that just touch must not beat a building that agrees."""
     known = dict.fromkeys(("tall_conflict", "crossing", "squares", "bad_squares", "in_place", "pieces", "by_chance"), 0.0)
-    known |= {"moved_walls": 0.0, "worst_ratio": 0.5, "hanging": 0.0, "hanging_met": 0.0}
+    known |= {"moved_walls": 0.0, "worst_ratio": 0.5, "hanging": 0.0, "hanging_met": 0.0, "free": 0.0}
     assert np.isfinite(closer_vector(known)).all() and len(closer_vector(known)) == len(CLOSER)
+
+
+def test_amounts_grow_no_more_on_large_floors():
+    """Ten times the floor with ten times the pieces out of place, lamps gone and high walls in the way says the same."""
+    amounts = {"tall_conflict": 2.0, "pieces": 30.0, "in_place": 10.0, "by_chance": 1.0, "hanging": 9.0, "hanging_met": 4.0}
+    shares = {"crossing": 20.0, "squares": 20.0, "bad_squares": 0.1, "moved_walls": 0.02, "worst_ratio": 0.7}
+    names = [CLOSER.index(n) for n in ("tall", "in_place", "out_of_place", "hanging", "fallen")]
+    floors = [{**shares, **{k: m * v for k, v in amounts.items()}, "free": m * 2000.0} for m in (1.0, 10.0)]
+    one, ten = (closer_vector(f)[names] for f in floors)
+    assert np.allclose(one, ten, atol=0.1)
+    small = closer_vector({**floors[0], "free": 20.0})[names]
+    assert (small > one + 0.5).all()
 
 
 def test_a_wing_with_another_end_is_not_believed(points):

@@ -27,6 +27,7 @@ SLICE_BITS = 0b111 << 2  # 0 to 0.75 m above the floor: where the lasers of robo
 BLOCK = 12  # columns
 MARGIN_CAP = 6.0
 BASIN = (1.2, np.radians(3.0), 0.05)  # m, rad, log scale: a worse pose nearer than that is no rival
+ENOUGH = 200.0  # m2 of free floor that both maps saw
 RIVAL = 0.3  # of the walls that the best hypothesis brings together
 Features = Mapping[str, float]
 Ranked = tuple[Candidate, dict[str, float], float]  # a hypothesis, its features, log odds that it is right, seen by itself
@@ -281,7 +282,7 @@ def probability(ranked: Sequence[Ranked], closer: Features) -> tuple[float, list
     vectors = np.array([vector(f) for _, f, _ in ranked])
     scores = np.array([s for _, _, s in ranked])
     leads = lead(scores, vectors, np.array(pose["weight"]), np.array(pose["scale"]))
-    odds = _logit(models["winner"], np.concatenate([vectors[0], leads[:3], closer_vector(closer)]))
+    odds = _logit(models["winner"], np.concatenate([vectors[0], leads[:3], closer_vector({**ranked[0][1], **closer})]))
     shares = np.exp(scores - scores[0]) / np.exp(scores - scores[0]).sum()
     first = min(1 / (1 + np.exp(-odds)), leads[3])
     every = first * shares / shares[0]
@@ -300,21 +301,25 @@ CLOSER = (
 
 
 def closer_vector(f: Features) -> Array:
-    """(12,) what the model of the best hypothesis sees of `closer.closer`, named `CLOSER`."""
+    """(12,) what the model of the best hypothesis sees of `closer.closer`, named `CLOSER`.
+
+    Amounts are those of `ENOUGH` m2 at most: on a floor ten times as large ten times as much is out of place, and says no more.
+    """
     gain, pieces = max(f["in_place"] - f["by_chance"], 0.0), max(f["pieces"] - f["by_chance"], 0.0)
+    part = ENOUGH / (ENOUGH + f["free"])
     return np.array(
         [
-            np.log(f["tall_conflict"] + 0.05),
+            np.log(part * f["tall_conflict"] + 0.05),
             np.log(f["crossing"] + 0.1),
             f["worst_ratio"],
             np.log1p(f["squares"]),
             f["bad_squares"],
-            np.log1p(gain),
-            np.log1p(pieces - gain),
+            np.log1p(part * gain),
+            np.log1p(part * (pieces - gain)),
             gain / (pieces + 1.0),
             np.log(f["moved_walls"] + 0.004),
-            np.log1p(f["hanging_met"]),
-            np.log1p(f["hanging"] - f["hanging_met"]),
+            np.log1p(part * f["hanging_met"]),
+            np.log1p(part * (f["hanging"] - f["hanging_met"])),
             f["hanging_met"] / (f["hanging"] + 1.0),
         ]
     )

