@@ -231,7 +231,7 @@ def test_all_outputs_or_none(run: Run, stages: dict[str, Any], tmp_path: Path, m
     monkeypatch.setattr(topomerge, "save_figure", full)
     (tmp_path / "a.tmap").write_text("an older one")
     status, _, err = run("extract", "scan.ply", "-o", "a.tmap", "--figure", "a.png")
-    assert (status, err) == (1, "topomerge: a.png: can't be written (No space left on device)\n")
+    assert (status, err) == (1, "topomerge: a.png: can't be written (No space left on device); give another place\n")
     assert [p.name for p in tmp_path.iterdir()] == ["a.tmap"]
     assert (tmp_path / "a.tmap").read_text() == "an older one"
 

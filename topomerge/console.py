@@ -165,7 +165,7 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
             try:
                 save(beside)
             except OSError as error:
-                raise InputError(f"{path}: can't be written ({error.strerror or error})") from error
+                raise InputError(f"{path}: can't be written ({error.strerror or error}); give another place") from error
         if len(outputs) > 1:  # a kill between two renames must not leave one file of this run beside one of an earlier run
             for path, _ in outputs:
                 Path(path).resolve().unlink(missing_ok=True)

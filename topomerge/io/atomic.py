@@ -31,7 +31,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         folder = Path(tempfile.mkdtemp(prefix=f".{path.stem[:40]}.", suffix=".part", dir=path.parent))
     except OSError as error:
         reason = error.strerror or str(error)
-        raise InputError(f"{path}: can't be written ({reason}); give a path in a folder that exists") from error
+        raise InputError(f"{path}: can't be written ({reason}); give a folder that exists and is yours") from error
     beside = folder / path.name
     try:
         beside.touch()
