@@ -21,7 +21,8 @@ from topomerge.metrics import bootstrap
 Row = dict[str, Any]
 CACHE = Path("cache/merge")
 NAMES = {
-    "ours": "topomerge", "kiss02": "KISS-Matcher 0.2 m", "kiss03": "KISS-Matcher 0.3 m", "fpfh": "FPFH + RANSAC", "fgr": "FGR",
+    "ours": "topomerge", "learned": "topomerge, rooms matched by learning", "kiss02": "KISS-Matcher 0.2 m",
+    "kiss03": "KISS-Matcher 0.3 m", "fpfh": "FPFH + RANSAC", "fgr": "FGR",
 }  # fmt: skip
 BINS = ("40-80", "80-200", ">200")
 

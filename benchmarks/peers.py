@@ -1,8 +1,9 @@
 """Ours, KISS-Matcher (0.2 and 0.3 m), FPFH + RANSAC and FGR on the same pairs, in one run: what is right, and the time it takes.
 
-``python benchmarks/peers.py SECONDS [real]`` works through test pairs (`merge_pairs.py test`, `merge_drawings.py test`) for so
-many seconds of processor, bin by bin and kind by kind in turn, or through the real pairs of TOPOMERGE_DATA. Resumable: a line of
-JSON a pair with all methods in ``cache/merge/peers.jsonl``, ``peers_real.jsonl``; `peers_table.py` makes the tables of them.
+``python benchmarks/peers.py SECONDS [real|heldout]`` works through test pairs (`merge_pairs.py test`, `merge_drawings.py test`)
+for so many seconds of processor, bin by bin and kind by kind in turn; or through the real pairs of TOPOMERGE_DATA; or through the
+maps that `evaluate.py data=heldout` kept, with the learned embedder's merge among the methods. Resumable: a line of JSON a pair
+with all methods in ``cache/merge/peers*.jsonl``; `peers_table.py` makes the tables of them.
 
 Everyone gets the same two clouds, the means of the points of 0.1 m cells, on one core and one thread. Timed, in seconds of
 processor: from these clouds in memory to the pose; ours also from them to the joined map with its rooms (``extract`` of both,
@@ -26,12 +27,14 @@ import numpy as np
 from calibrate_merge import error
 from merge_pairs import GridPair, load
 from register import SCALELESS, open3d_features, real_pairs, upright
+from topomerge.datasets.kept import load_set
 
 from topomerge.fusion.evidence import cell_middles
 from topomerge.types import PointCloud, Sim3, VoxelGrid
 
 CACHE = Path("cache/merge")
-TARGETS = {"": CACHE / "peers.jsonl", "real": CACHE / "peers_real.jsonl"}
+TARGETS = {"": CACHE / "peers.jsonl", "real": CACHE / "peers_real.jsonl", "heldout": CACHE / "peers_heldout.jsonl"}
+HELDOUT = Path("cache/evaluation/heldout.jsonl")
 VOXEL, ITERATIONS = 0.3, 100_000  # of Open3D
 WHOLE = 3  # every third pair goes the whole way to a joined map
 BINS = {"<40 m²": (1.0, 40.0), "40-80 m²": (40.0, 80.0), "≥80 m²": (80.0, np.inf)}
@@ -126,6 +129,29 @@ def open3d(pair: GridPair) -> dict[str, Answer]:
     return out
 
 
+def learned(pair: GridPair) -> Answer:
+    """`merge` of the extracted maps: rooms matched by the embedder that ships propose poses, too."""
+    from topomerge.fusion.merge import merge
+
+    maps = pair.about["kept"].maps()  # type: ignore[attr-defined]
+    began = time.process_time()
+    found = merge(maps)
+    pose = found.registration.transform if found.registration else None
+    return pose, found.merged, time.process_time() - began
+
+
+def kept_pairs() -> Iterator[GridPair]:
+    """Held-out pairs of extracted maps that show something in common, as cells."""
+    for kept in load_set(HELDOUT):
+        if kept.transform is None or kept.about["common"] < 1 or kept.about["scale_free"]:
+            continue
+        maps = kept.maps()
+        a, b = (m.grid.with_properties(mean=m.grid.centroids()) for m in maps)
+        about = {"sensors": kept.about["sensors"], "building": str(kept.about["building"]), "kind": "overlap"}
+        told = {**about, "source": kept.about["source"], "kept": kept}
+        yield GridPair(kept.name, a, b, (maps[0].free, maps[1].free), kept.transform, kept.about["common"], told)
+
+
 def scaled(pair: GridPair) -> GridPair:
     """The pair with b brought to the scale of a."""
     size = pair.truth.scale if pair.truth is not None else 1.0
@@ -143,6 +169,9 @@ def measured(pair: GridPair, all_the_way: bool) -> dict[str, Any]:
     told = {}
     for name, where, (pose, believed, seconds) in (("ours", pair, ours(pair)), *((n, given, a) for n, a in answers.items())):
         told[name] = {"err": None if pose is None else error(pose, where), "believed": believed, "seconds": seconds}
+    if "kept" in pair.about:
+        pose, believed, seconds = learned(pair)
+        told["learned"] = {"err": None if pose is None else error(pose, pair), "believed": believed, "seconds": seconds}
     about = {k: pair.about[k] for k in ("sensors", "building", "kind", "source")}
     return {"name": pair.name, "common": pair.common, **about, "methods": told, "whole": whole(pair) if all_the_way else None}
 
@@ -161,8 +190,9 @@ def chosen() -> Iterator[Path]:
 
 def pairs(which: str, done: set[str]) -> Iterator[tuple[int, GridPair]]:
     """Numbered pairs that are not done."""
-    if which == "real":
-        yield from ((k, pair) for k, pair in enumerate(real_pairs()) if pair.name not in done)
+    if which:
+        every = real_pairs() if which == "real" else kept_pairs()
+        yield from ((k, pair) for k, pair in enumerate(every) if pair.name not in done)
         return
     for k, path in enumerate(list(chosen())):
         if path.stem not in done:
@@ -175,7 +205,7 @@ def run(seconds: float, which: str = "") -> None:
     target = TARGETS[which]
     done = {json.loads(line)["name"] for line in target.read_text().splitlines()} if target.exists() else set()
     for k, pair in pairs(which, done):
-        row = measured(pair, k % WHOLE == 0)
+        row = measured(pair, k % WHOLE == 0 and not which)
         with target.open("a") as out:
             out.write(json.dumps(row) + "\n")
         told = {m: (round(r["seconds"], 1), r["err"] and round(r["err"][0], 2)) for m, r in row["methods"].items()}
