@@ -106,7 +106,7 @@ def section() -> str:
         by(rows, keys[1], kinds, "kind", HEADS, measures),
         f"Bins and kinds in which another method has more right than topomerge: {behind(rows, keys)}.",
         "From two clouds to one cloud is the way to the pose, as measured above: joining the points is the same for all. To one "
-        f"topometric map, on {len(done)} of the pairs: extraction of both maps {seconds['extract']:.1f} s, merge with the joined map "
+        f"topometric map, on {len(done)} pairs: extraction of both {seconds['extract']:.1f} s, merge with the joined map "
         f"and its rooms {seconds['merge']:.1f} s (medians; the longest pair {longest:.1f} s); to the pose alone, on these pairs: "
         + ", ".join(f"{NAMES[m]} {s:.1f} s" for m, s in other.items())
         + ". For a joined map with rooms the others would need the same extraction and joining, too.",
