@@ -72,6 +72,15 @@ def build(cells: NDArray[np.int32], codes: NDArray[np.uint64]) -> Nodes:
 
 
 @njit(cache=True, error_model="numpy")
+def _descend(child, j, stack, top):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Put the children of node j on the stack, the last row's first; returns its new height."""
+    for c in range(child[j + 1] - 1, child[j] - 1, -1):
+        stack[top] = c
+        top += 1
+    return top
+
+
+@njit(cache=True, error_model="numpy")
 def _in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Rows of the cells low <= cell < high into `out`; returns how many."""
     n, count, top = len(cells), 0, 1
@@ -95,9 +104,7 @@ def _in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-
                     out[count] = r
                     count += 1
         else:
-            for c in range(child[j + 1] - 1, child[j] - 1, -1):
-                stack[top] = c
-                top += 1
+            top = _descend(child, j, stack, top)
     return count
 
 
@@ -163,9 +170,7 @@ def _in_ball(cells, child, span, box, centre, square, top, stack, out, fill):  #
                         out[count] = r
                     count += 1
         else:
-            for c in range(child[j + 1] - 1, child[j] - 1, -1):
-                stack[top] = c
-                top += 1
+            top = _descend(child, j, stack, top)
     return count
 
 
