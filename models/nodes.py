@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from topomerge.models.doors import DoorLayer
 from topomerge.models.gat import GatLayer
@@ -11,7 +13,19 @@ from torch import Tensor, nn
 
 from topomerge.embedding.network import Node
 
+KNOTS, DISTANCE = 11, 5  # bumps of the distance between two rooms, which is this column of edge_attr
 EDGE, PAIR, NEAR = 11, 3, 5  # widths of edge_attr and door_attr (`embedding.graph`), and of near_attr (`embedding.door_layout`)
+
+
+def dense(*widths: int) -> nn.Sequential:
+    """Linear layers, each with a layer norm and a ReLU."""
+    return nn.Sequential(*(part for a, b in pairwise(widths) for part in (nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU())))
+
+
+def bumps(distance: Tensor) -> Tensor:
+    """(n,) m -> (n, KNOTS): distances are told as bumps 1 m apart, so that 3 m and 4 m are two things."""
+    knots = torch.arange(KNOTS, dtype=distance.dtype, device=distance.device)
+    return (-((distance[:, None] - knots) ** 2)).exp()
 
 
 class NodeEncoder(nn.Module):
@@ -29,7 +43,8 @@ class NodeEncoder(nn.Module):
         self.edges, self.edge, self.pairs, self.doors = None, None, None, nn.ModuleList()
         if told and settings.kind != "none":
             self.edges = Standardise(EDGE)
-            self.edge = nn.Sequential(nn.Linear(EDGE, told), nn.LayerNorm(told), nn.ReLU())
+            wide = (EDGE + KNOTS, 2 * told) if settings.around else (EDGE,)
+            self.edge = dense(*wide, told)
         if settings.doors and settings.kind != "none":
             pair = NEAR if settings.near else PAIR
             self.pairs = Standardise(pair)
@@ -49,7 +64,8 @@ class NodeEncoder(nn.Module):
     ) -> Tensor:
         edges = None
         if self.edges is not None and self.edge is not None:
-            edges = self.edge(self.edges(edge_attr))
+            scaled = self.edges(edge_attr)
+            edges = self.edge(torch.cat([scaled, bumps(edge_attr[:, DISTANCE])], dim=1) if self.settings.around else scaled)
             for layer in self.doors:
                 assert self.pairs is not None and pair_index is not None and pair_attr is not None
                 edges = layer(edges, pair_index, self.pairs(pair_attr), pair_attr[:, 0])

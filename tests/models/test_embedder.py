@@ -12,7 +12,7 @@ import torch
 from topomerge.models.embedder import Embedder, match_scores
 from topomerge.models.layers import Standardise, segment_softmax
 from topomerge.models.learned import learned
-from topomerge.models.nodes import EDGE, NEAR, PAIR
+from topomerge.models.nodes import EDGE, NEAR, PAIR, bumps
 from topomerge.models.pointnet import farthest, nearest
 from topomerge.models.voxelcnn import crop
 from topomerge.models.weights import read_embedder, save_embedder
@@ -24,6 +24,7 @@ from topomerge.embedding.door_layout import LAYOUT_FEATURES, REACH, door_layout
 from topomerge.embedding.graph import DOOR_FEATURES, EDGE_FEATURES, ROOM_FEATURES, graph_arrays
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import GEOMETRY, Geometry, Network, Node, check, network_from
+from topomerge.embedding.rooms_around import through_doors, with_rooms_around
 from topomerge.errors import InputError
 
 NODES = [
@@ -32,6 +33,7 @@ NODES = [
     Node("sage", 2, edges=False, skip=False, jump="last"),
     Node("gat", 3, doors=1, jump="max"),
 ]
+NODES += [Node("gat", 2, around=10.0), Node("sage", 1, around=5.0, edges=False)]
 NODES += [Node("gat", 2, told=False), Node("gat", 1, edges=False), Node("gat", 2, doors=2, near=True), Node("gat", 4, skip=False)]
 
 
@@ -45,7 +47,7 @@ def test_widths_are_those_of_the_graph():
     assert len(LAYOUT_FEATURES) == NEAR
 
 
-@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}{n.near}")
+@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}{n.near}{n.around}")
 def test_the_order_of_rooms_does_not_matter(node):
     net, one = network("scalars", "pointnet", node=node), graph()
     other, rooms = shuffled(one)
@@ -77,7 +79,7 @@ def test_the_scale_matters():
             assert (net.geometry(one) - net.geometry(big)).abs().max() > 1e-3, part
 
 
-@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}{n.near}")
+@pytest.mark.parametrize("node", NODES, ids=lambda n: f"{n.kind}{n.layers}{n.jump}{n.edges}{n.doors}{n.near}{n.around}")
 @pytest.mark.parametrize("parts", [("scalars", "engineered", "shapedna"), ("pointnet", "voxelcnn"), ("pointnet_local",)])
 def test_gradients_reach_every_weight(parts, node):
     net = network(*parts, node=node).train()
@@ -124,6 +126,8 @@ def test_grouping_and_crop_by_hand():
         ({"node": {"kind": "gcn"}}, "node.kind"),
         ({"node": {"layers": 5}}, "node.layers"),
         ({"node": {"doors": 1, "edges": False}}, "node.edges"),
+        ({"node": {"doors": 1, "around": 10.0}}, "node.around=0"),
+        ({"node": {"around": 1000.0}}, "node.around must be"),
         ({"node": {"heads": 7}}, "geometry.width"),
         ({"node": {"layer": 2}}, "node.layer"),
         ({"node": {"layers": True}}, "node.layers"),
@@ -205,6 +209,26 @@ def test_an_embedder_of_maps():
     assert describe(building(1, 1)).shape == (len(building(1, 1).rooms), 64)
     ours, theirs = describe.probabilities(map, map)
     assert np.allclose(ours.sum(axis=1), 1) and ours.shape == (len(map.rooms), len(map.rooms) + 1) and np.allclose(ours, theirs)
+
+
+def test_rooms_around_by_hand():
+    """Three rooms 4 m and 7 m apart, one of them a step higher, and one 5 m above the first; a door leads from 0 to 1."""
+    map = {
+        "pos": np.array([[0, 0, 1], [4, 0, 1.5], [0, 7, 1], [0, 0, 6]], float),
+        "edge_index": np.array([[0, 1], [1, 0]]),
+        "edge_attr": np.tile(np.array([0.9, 2, 1, 0, 0, 4, 0.5, 2, 2, 0, 1], np.float32), (2, 1)),
+        "edge_pos": np.array([[2, 0, 1], [2, 0, 1]], float),
+    }
+    near = with_rooms_around(map, 7.5)
+    assert near["edge_index"].T.tolist() == [[0, 1], [0, 1], [0, 2], [1, 0], [1, 0], [2, 0]]  # 1 and 2 are 8.1 m apart
+    assert through_doors(near).tolist() == [True, False, False] * 2
+    assert np.allclose(near["edge_attr"][[1, 4]], [[0, 0, 0, 0, 0, 4, s, 0, 0, 0, 1] for s in (0.5, -0.5)])
+    assert np.allclose(near["edge_pos"][[1, 4]], [2, 0, 1.25]) and np.allclose(near["edge_pos"][[0, 3]], [2, 0, 1])
+    assert with_rooms_around(map, 1.0)["edge_index"].tolist() == map["edge_index"].tolist()
+    assert bumps(torch.tensor([0.0, 3.5]))[:, 3].tolist() == pytest.approx([math.exp(-9), math.exp(-0.25)])
+    built = building(2, 2)
+    describe = learned(network("scalars", node=Node("gat", around=10.0)))
+    assert describe(built).shape == (len(built.rooms), 64)
 
 
 def test_layout_of_doors_by_hand():

@@ -65,6 +65,8 @@ def test_a_set_is_packed_once(cache):
             side = "a" if name.startswith("near") else "b"  # the order of pairs of doors is that of the edges
             assert torch.equal(getattr(one, side)[name], getattr(made, side)[name]), name
         assert torch.isfinite(one.a["shapedna"]).all() and one.a["engineered"].shape == (7, 12)
+    around = load_pairs(cache / "some.jsonl", around=100.0)[0].a
+    assert around["edge_index"].shape[1] == 7 * 6 + pair(0).a["edge_index"].shape[1] and "door_index" not in around
     file = min((cache / "packed").glob("some-*.npz"), key=lambda path: len(path.name))  # the others are chunks of descriptors
     assert len(load_pairs(file)) == 10
     with pytest.raises(InputError, match=r"datasets\.build data=none"):

@@ -17,12 +17,14 @@ from topomerge.embedding.door_layout import door_layout
 from topomerge.embedding.graph import POINTS, graph_arrays
 from topomerge.embedding.network import GEOMETRY, Network, needed, pair_tensors, tensors
 from topomerge.embedding.point_features import point_features, point_spectra
+from topomerge.embedding.rooms_around import DISTANCE, with_rooms_around
 from topomerge.embedding.weights import Weights, does_not_fit, read_weights
 from topomerge.errors import InputError
 from topomerge.types import Array, TopometricMap
 
 EXTRAS = {"engineered": point_features, "shapedna": point_spectra}  # reckoned from the points where a network reads them
 KNOTS, STEP = 24, 0.5  # of the distances between doors: `models/doors.py`
+AROUND = 11  # of those between rooms, 1 m apart: `models/nodes.py`
 BOUND = 30  # of scores: `models/layers.py:segment_softmax`
 Run = Callable[[Mapping[str, Array]], tuple[Array, Array]]
 
@@ -85,6 +87,8 @@ class Learned:
         if not len(arrays["x"]):
             return np.zeros((0, self.network.size)), np.zeros(0)
         told, names = dict(arrays), tensors(self.network)
+        if self.network.node.around:
+            told |= with_rooms_around(told, self.network.node.around)
         told |= {n: make(arrays["room_points"]) for n, make in EXTRAS.items() if n in names and n not in arrays}
         if "near_index" in names and "near_index" not in arrays:
             layout = door_layout(*(arrays[n] for n in ("edge_index", "pos", "edge_pos")))
@@ -147,7 +151,13 @@ class Forward:
         node = self.network.node
         if not node.edges or node.kind == "none":
             return None
-        edges = _relu(self._norm("node.edge.1", self._linear("node.edge.0", self._scaled("node.edges", graph["edge_attr"]))))
+        scaled = self._scaled("node.edges", graph["edge_attr"])
+        if node.around:
+            far = np.asarray(graph["edge_attr"], np.float64)[:, DISTANCE, None]
+            scaled = np.concatenate([scaled, np.exp(-((far - np.arange(AROUND)) ** 2))], axis=1)
+        edges = _relu(self._norm("node.edge.1", self._linear("node.edge.0", scaled)))
+        if node.around:
+            edges = _relu(self._norm("node.edge.4", self._linear("node.edge.3", edges)))
         for k in range(node.doors):
             index, attr = pair_tensors(node)
             (first, second), told, count = graph[index], np.asarray(graph[attr], np.float64), len(edges)

@@ -19,6 +19,7 @@ GEOMETRY = {  # part -> width of the rows it reads; 0: it reads the points
 TENSORS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> tensor of the graph that it reads
 GRAPH = ("edge_index", "edge_attr")
 WIDEST = 4096  # more is a mistake, or a file that was made to take all memory
+FARTHEST = 100.0  # m
 NODES = ("none", "sage", "gat")
 JUMPS = ("last", "cat", "max")
 
@@ -52,6 +53,7 @@ class Node:
         told: attention sums them, too (`gat.GatLayer`).
         doors: layers over pairs of doors; needs `edges`.
         near: pairs are all doors within 12 m (`embedding.door_layout`), not only those of one room.
+        around: m; rooms at most that far away are neighbours, too (`embedding.rooms_around`); 0: by doors only.
         skip: add what goes into a layer to what comes out.
         jump: what the last layer says, or all of them joined or their maximum (jumping knowledge: Xu et al. 2018).
         width: of edges.
@@ -64,6 +66,7 @@ class Node:
     told: bool = True
     doors: int = 0
     near: bool = False
+    around: float = 0.0
     skip: bool = True
     jump: str = "cat"
     width: int = 32
@@ -116,6 +119,10 @@ def check(network: Network) -> None:
         raise InputError(f"node.layers must be 1 to 4, not {node.layers}")
     if node.doors and not node.edges:
         raise InputError("node.doors are features of edges: set node.edges=true")
+    if node.doors and node.around:
+        raise InputError("node.doors are of neighbours by doors: set node.around=0")
+    if not 0 <= node.around <= FARTHEST:
+        raise InputError(f"node.around must be 0 to {FARTHEST:g} m, not {node.around}")
     if geometry.canonical and geometry.yaws % 2:
         raise InputError(f"geometry.yaws must be even where canonical is set (an axis has two ends), not {geometry.yaws}")
     least = {"geometry.width": geometry.width, "geometry.yaws": geometry.yaws, "node.heads": node.heads, "size": network.size}

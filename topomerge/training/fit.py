@@ -245,8 +245,9 @@ def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], l
     extras = [part for part in settings.network.geometry.parts if part in EXTRAS]
     extras += ["near"] if settings.network.node.near else []
     with fabric.rank_zero_first():
-        train = load_pairs(_manifest(settings, settings.data), extras, say, settings.limit)
-        watched = load_pairs(_manifest(settings, settings.validation), extras, say) if settings.validation else []
+        around = settings.network.node.around
+        train = load_pairs(_manifest(settings, settings.data), extras, say, settings.limit, around)
+        watched = load_pairs(_manifest(settings, settings.validation), extras, say, around=around) if settings.validation else []
     if settings.overfit:
         some = [pair for pair in train if len(pair.matches)][: settings.batch]
         return some, some

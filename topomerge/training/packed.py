@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from topomerge.embedding.door_layout import door_layout
+from topomerge.embedding.rooms_around import with_rooms_around
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array
@@ -62,7 +63,11 @@ class GraphPair:
 
 
 def load_pairs(
-    manifest: str | Path, extras: Sequence[str] = (), say: Callable[[str], None] = lambda text: None, limit: int = 0
+    manifest: str | Path,
+    extras: Sequence[str] = (),
+    say: Callable[[str], None] = lambda text: None,
+    limit: int = 0,
+    around: float = 0.0,
 ) -> list[GraphPair]:
     """The pairs of a manifest (`datasets.build`), from the packed file, which is made if there is none.
 
@@ -70,6 +75,7 @@ def load_pairs(
         manifest: or a packed file itself.
         extras: what is wanted, too: of `EXTRAS`, or `near`, the layout of doors.
         limit: of the first pairs only; 0: all.
+        around: m within which rooms are neighbours, too (`embedding.rooms_around`); 0: by doors only.
 
     Raises:
         InputError: no such manifest, or a file is damaged.
@@ -79,7 +85,7 @@ def load_pairs(
         arrays = archive.read(path, "packed set")
         if "transform" not in arrays:
             raise InputError(f"{path}: was packed by an earlier version; give its manifest, and it is packed again")
-        return _with_layout(_unpacked(arrays, {})[: limit or None], extras)
+        return _with_layout(_unpacked(arrays, {})[: limit or None], extras, around)
     rows = _rows(path)
     names = [str(row["file"]) for row in rows]
     digest = hashlib.sha256(json.dumps([FORMAT, names]).encode()).hexdigest()[:12]
@@ -91,10 +97,14 @@ def load_pairs(
         archive.write(_packed([archive.read(path.parent / "pairs" / name, "cached pair") for name in names], rows), whole)
     arrays = archive.read(whole, "packed set")
     tables = {name: _extra(name, arrays, whole, say, limit) for name in extras if name in EXTRAS}
-    return _with_layout(_unpacked(arrays, tables)[: limit or None], extras)
+    return _with_layout(_unpacked(arrays, tables)[: limit or None], extras, around)
 
 
-def _with_layout(pairs: list[GraphPair], extras: Sequence[str]) -> list[GraphPair]:
+def _with_layout(pairs: list[GraphPair], extras: Sequence[str], around: float) -> list[GraphPair]:
+    for graph in (g for pair in pairs for g in (pair.a, pair.b)) if around else ():
+        near = with_rooms_around({n: graph[n].numpy() for n in ("pos", "edge_index", "edge_attr", "edge_pos")}, around)
+        graph.update({name: torch.from_numpy(array) for name, array in near.items()})
+        del graph["door_index"], graph["door_attr"]  # of the edges before
     if "near" in extras:
         for graph in (g for pair in pairs for g in (pair.a, pair.b)):
             found = door_layout(*(graph[name].numpy() for name in ("edge_index", "pos", "edge_pos")))

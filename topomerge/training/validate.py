@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from topomerge.embedding.rooms_around import through_doors
 from topomerge.matching.scores import assign_certain, certainty, has_twin, pair_counts, partner_ranks
 from topomerge.models.embedder import Embedder, match_scores
 from topomerge.training.batches import make_batch, seen_well
@@ -68,9 +69,16 @@ def _merged(pair: GraphPair, certain: Array) -> list[bool]:
     truth = pair.transform.numpy()
     if not len(pair.matches) or not abs(truth[2, 2] - 1) < 1e-6:
         return []
-    a, b = ({name: graph[name].numpy() for name in ("pos", "edge_pos", "edge_index")} for graph in (pair.a, pair.b))
+    a, b = (_places(graph) for graph in (pair.a, pair.b))
     pose = pose_of_matches(a, b, certain)
     return [merged_right(pose, truth, b["pos"][pair.matches[:, 1].numpy()].mean(axis=0))]
+
+
+def _places(graph: Mapping[str, Tensor]) -> dict[str, Array]:
+    """Where rooms and doors are; rooms that are neighbours by distance only have none."""
+    known = {name: graph[name].numpy() for name in ("pos", "edge_pos", "edge_index", "edge_attr")}
+    doors = through_doors(known)
+    return {"pos": known["pos"], "edge_pos": known["edge_pos"][doors], "edge_index": known["edge_index"][:, doors]}
 
 
 def scores(ranks: Array, twins: Array, clear: Array, counts: Array) -> dict[str, float]:
