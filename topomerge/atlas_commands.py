@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from topomerge.command import Argument, Command, option
+from topomerge.command import Argument, Command, option, quiet
 from topomerge.console import check_inputs, warn
 from topomerge.errors import InputError
 
@@ -107,11 +107,11 @@ def atlas_verb(read: Read, reading: tuple[Argument, ...], share: Callable[[str],
             option("folder", metavar="DIR", help="the atlas"),
             option("items", nargs="*", metavar="MAP", help="of add: clouds or .tmap; of remove: names, as `list` prints them"),
             option("--scale", choices=("fixed", "free"), help="free: the scales of the maps differ (default fixed)"),
-            option("--threshold", type=share, metavar="P", help="probability from which a link is believed (default 0.9)"),
+            option("--threshold", type=share, metavar="P", help="probability from which a link is believed (default 0.8)"),
             option("--descriptor", dest="embedder", choices=("learned", "engineered", "shapedna", "feather"), help=words),
             *reading,
             option("--json", action="store_true", default=False, help="of list: print atlas.json"),
-            option("-q", "--quiet", action="store_true", default=False, help="print nothing but warnings and what stands apart"),
+            quiet("print nothing but warnings and what stands apart"),
         ),
         paths=("folder", "items"),
         description="Keep many maps together: those that belong to each other are joined, the others stay apart and are named. "

@@ -34,6 +34,16 @@ def option(*flags: str, **settings: Any) -> Argument:
     return flags, settings
 
 
+def output(metavar: str, help: str) -> Argument:
+    """Where to write what a command is for."""
+    return option("-o", "--output", required=True, metavar=metavar, default=None, help=help)
+
+
+def quiet(help: str = "print nothing") -> Argument:
+    """That nobody watches."""
+    return option("-q", "--quiet", action="store_true", default=False, help=help)
+
+
 def count(text: str) -> int:
     """A whole number from 0 on, as the `type` of an argument."""
     if not text.isdecimal():

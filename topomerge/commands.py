@@ -13,7 +13,7 @@ from typing import Any
 
 import topomerge
 from topomerge.atlas_commands import atlas_verb
-from topomerge.command import Command, count, option
+from topomerge.command import Command, count, option, output, quiet
 from topomerge.console import Bars, check_inputs, check_outputs, output_folder, warn, write_all
 from topomerge.errors import InputError
 from topomerge.export_commands import EXPORT, VIEW
@@ -173,7 +173,7 @@ def merge_command(args: argparse.Namespace) -> int:
         try:
             return _merge(args, folder)
         except OSError as error:
-            raise InputError(f"{folder}: can't be written ({error.strerror or error}); make room, or give another") from error
+            raise InputError(f"{folder}: can't be written ({error.strerror or error}); give another place") from error
 
 
 def _merge(args: argparse.Namespace, folder: Path) -> int:
@@ -243,7 +243,7 @@ COMMANDS = (
         "topomerge extract scan.ply -o a.tmap --json a.json --ply a_rooms.ply --figure a.png",
         (
             option("input", metavar="SCAN", help="point cloud, mesh, building model, OctoMap or 2D map"),
-            option("-o", "--output", required=True, metavar="A.tmap", default=None, help="the map to write"),
+            output("A.tmap", "the map to write"),
             option("--json", metavar="A.json", default=None, help="also write rooms, doors and storeys as JSON"),
             option("--ply", metavar="A.ply", default=None, help="also write the occupied cells with their room as PLY"),
             option("--figure", metavar="A.png", default=None, help="also draw the plan of each storey"),
@@ -251,7 +251,7 @@ COMMANDS = (
             option("--voxel-size", type=_above_zero, metavar="E", help="edge length of a cell, m (default 0.1)"),
             option("--preset", choices=("default", "thesis"), help="parameters: ours (default) or those of the thesis"),
             *READING,
-            option("-q", "--quiet", action="store_true", default=False, help="no table, no progress; only warnings"),
+            quiet("no table, no progress; only warnings"),
         ),
         paths=("input", "output", "json", "ply", "figure", "report"),
         description="Find the rooms, doors and storeys of one partial map, and print a table of them.",
@@ -275,9 +275,9 @@ COMMANDS = (
         "topomerge embed a.tmap --descriptor shapedna --k 1 -o a.npy",
         (
             option("input", metavar="A", help="a .tmap, or a cloud, which is extracted first"),
-            option("-o", "--output", required=True, metavar="A.npy", default=None, help="NumPy array, a row for each room"),
+            output("A.npy", "NumPy array, a row for each room"),
             *MAPS,
-            option("-q", "--quiet", action="store_true", default=False, help="print nothing"),
+            quiet(),
         ),
         paths=("input", "output"),
         description="Describe each room of a map by numbers: rooms that look alike get rows that are close.",
@@ -312,14 +312,7 @@ COMMANDS = (
         "topomerge merge a.ply b.laz -o merged/",
         (
             option("inputs", nargs="+", metavar="MAP", help="clouds or .tmap, two or more, in any mix"),
-            option(
-                "-o",
-                "--output",
-                required=True,
-                metavar="DIR",
-                default=None,
-                help="folder for merge.json, merged.ply, map.tmap, report.html",
-            ),
+            output("DIR", "folder for merge.json, merged.ply, map.tmap, report.html"),
             option(
                 "--scale",
                 dest="scale_of_b",
@@ -334,9 +327,9 @@ COMMANDS = (
                 help="rooms: only of matched rooms by their surfaces, as the thesis does; two maps",
             ),
             option("--force", action="store_true", help="write the best merge even if it is not believed (status 2 stays)"),
-            option("--threshold", type=_share, metavar="P", help="probability from which a merge is believed (default 0.9)"),
+            option("--threshold", type=_share, metavar="P", help="probability from which a merge is believed (default 0.8)"),
             *(o for o in MAPS if o[0][0] != "--k"),
-            option("-q", "--quiet", action="store_true", default=False, help="print nothing but warnings and a refusal"),
+            quiet("print nothing but warnings and a refusal"),
         ),
         paths=("inputs", "output"),
         description="Bring maps together: status 0 and a joined map, or status 2 and the reason why it is not believed. Of more "
@@ -358,10 +351,8 @@ COMMANDS = (
             option("--rooms", type=count, metavar="N", help="of each map, at most (default 15; all, of a single cloud)"),
             option("--scale", choices=("free", "known"), default="known", help="free: the scale of b is unknown"),
             option("--hard", choices=("other-building", "other-storey", "twin-wing"), help="b is of a place that looks like a's"),
-            option(
-                "-o", "--output", required=True, metavar="DIR", default=None, help="folder for a.ply, b.ply, truth.json, plan.png"
-            ),
-            option("-q", "--quiet", action="store_true", default=False, help="print nothing"),
+            output("DIR", "folder for a.ply, b.ply, truth.json, plan.png"),
+            quiet(),
         ),
         paths=("output",),
         description="Make partial maps of a building from a seed: clouds in random frames, the truth about them, and a picture.",

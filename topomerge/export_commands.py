@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from topomerge.command import Command, count, option
+from topomerge.command import Command, count, option, quiet
 from topomerge.console import check_inputs, check_outputs, output_folder, warn, write_all
 from topomerge.errors import InputError
 
@@ -186,7 +186,7 @@ EXPORT = Command(
             help="geojson: where (0, 0) of the map lies, and how far its y axis is turned clockwise from north, degrees",
         ),
         option("--storey", type=count, metavar="N", help="geojson, ros: only this storey"),
-        option("-q", "--quiet", action="store_true", default=False, help="print nothing"),
+        quiet(),
     ),
     paths=("input", "output"),
     description="Write a map in the formats of other tools: rooms as polygons, doors, storeys, their graph, grids to drive by.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from topomerge.command import Command, option
+from topomerge.command import Command, option, output, quiet
 from topomerge.console import output_folder
 from topomerge.errors import InputError
 
@@ -35,9 +35,9 @@ EXPORT_EMBEDDER = Command(
     "topomerge export-embedder runs/x -o embedder/",
     (
         option("run_folder", metavar="RUN", help="folder of a run of train.py, or its best/ or last/"),
-        option("-o", "--output", required=True, metavar="DIR", default=None, help="folder for the files"),
+        output("DIR", "folder for the files"),
         option("--onnx", action="store_true", default=False, help="also write embedder.onnx, for any number of rooms and doors"),
-        option("-q", "--quiet", action="store_true", default=False, help="print nothing"),
+        quiet(),
     ),
     paths=("run_folder", "output"),
     description="Write the best embedder of a run as embedder.safetensors and embedder.json; topomerge.load_embedder reads them.",
