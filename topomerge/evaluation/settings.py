@@ -150,16 +150,20 @@ def run_name(run: str) -> str:
 
 
 def run_title(run: str) -> str:
-    """What a run is made of: geometry, node encoder with features of edges or without (bare), loss, and the seed if it is not 0.
+    """What a run is made of: geometry, node encoder, loss, and the seed if it is not 0.
+
+    Node encoders: `bare` has no features of edges, `paper` has them in the attention only, `doors` pairs of doors, `around` the
+    rooms nearby.
 
     Raises:
         InputError: no trained embedder there.
     """
     network, _, about = read_weights(run)
     node = network.node
-    edges = "" if node.kind == "none" or node.edges else " bare"
+    told = {"bare": not node.edges, "paper": not node.told, "doors": node.doors, "around": node.around}
+    words = [node.kind, *(word for word, so in told.items() if so and node.kind != "none")]
     seed = f", seed {about['seed']}" if about.get("seed") else ""
-    return f"{' + '.join(network.geometry.parts)}, {node.kind}{edges}, {about.get('loss', 'infonce')}{seed}"
+    return f"{' + '.join(network.geometry.parts)}, {' '.join(words)}, {about.get('loss', 'infonce')}{seed}"
 
 
 def folder_of(settings: Evaluation) -> Path:

@@ -69,6 +69,8 @@ def _best(run: Path) -> dict[str, Any] | None:
         if node["doors"] and node["near"]
         else "doors"
         if node["doors"]
+        else f"rooms within {node['around']:g} m"
+        if node.get("around")
         else "yes",
         "loss": told["loss"]["kind"],
         "seed": told["seed"],
