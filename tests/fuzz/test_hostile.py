@@ -75,6 +75,13 @@ def test_arrays_that_unpack_to_gigabytes(worker: Worker, tmp_path: Path) -> None
     assert "claims" in text
 
 
+def test_names_without_end_are_not_said_again(worker: Worker, tmp_path: Path) -> None:
+    refused(worker, tmp_path / "a.npz", packed({f"{k}{'x' * 5000}.npy": npy((4,), data=bytes(32)) for k in range(3)}))
+    refused(worker, tmp_path / "a.pcd", f"VERSION .7\nFIELDS {'field ' * 900}\nDATA ascii\n")
+    refused(worker, tmp_path / "a.ply", f"ply\nformat {'word ' * 900}\nend_header\n")
+    refused(worker, tmp_path / "a.yaml", f"image: a.png\nresolution: {'word ' * 900}\n")
+
+
 def test_an_archive_that_lies_about_its_sizes(worker: Worker, tmp_path: Path) -> None:
     data = packed({"points.npy": npy((1000, 3), data=bytes(24_000))})
     for at in (data.find(b"PK\1\2") + 24, 22):  # unpacked size in the directory and beside the member

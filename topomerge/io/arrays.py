@@ -83,7 +83,8 @@ def _read_npz(path: Path) -> Piece:
         raise damaged(path, "an npz archive", error) from error
     name = next((n for n in (*POINTS, *arrays) if n in arrays), None)
     if name is None or (name not in POINTS and len(arrays) > 1):
-        raise InputError(f"{path}: has no array named points (it has {', '.join(list(members)[:8]) or 'none'})")
+        held = ", ".join(name[:40] for name in list(members)[:8]) or "none"
+        raise InputError(f"{path}: has no array named points (it has {held}); save them under that name")
     return _piece(path, name, arrays)
 
 

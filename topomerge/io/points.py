@@ -21,6 +21,7 @@ from topomerge.io.piece import Options, Piece, damaged
 from topomerge.types import PointCloud
 
 Progress = Callable[[float, str], None]
+LONGEST = 500  # letters of a message beside the path: what it quotes of a damaged file may be long
 log = logging.getLogger(__name__)
 
 
@@ -180,7 +181,10 @@ def _pieces(path: Path, file_format: Format, options: Options) -> Iterator[Piece
     try:
         reader = importlib.import_module(f"topomerge.io.{file_format.module}")
         yield from reader.read(path, options)
-    except (InputError, GeneratorExit, KeyboardInterrupt, SystemExit):
+    except InputError as error:
+        text, most = str(error), len(str(path)) + LONGEST
+        raise error if len(text) <= most else InputError(f"{text[:most]} ...") from error.__cause__
+    except (GeneratorExit, KeyboardInterrupt, SystemExit):
         raise
     except ImportError as error:
         package = f"topomerge[{file_format.extra}]" if file_format.extra else "topomerge"
