@@ -100,7 +100,7 @@ def section() -> str:
     other = {m: float(np.median(s)) for m, s in taken.items() if s}
     return "\n\n".join([
         "`python benchmarks/merge_pairs.py test 175; python benchmarks/merge_drawings.py test 110; "
-        "python benchmarks/peers.py 900; python benchmarks/peers_table.py docs/results.md`",
+        "python benchmarks/peers.py 9000; python benchmarks/peers_table.py docs/results.md`",
         TEXT,
         by(rows, keys[0], list(BINS), "in common", HEADS, measures),
         by(rows, keys[1], kinds, "kind", HEADS, measures),
