@@ -70,15 +70,15 @@ class Learned:
         self.run, self.network, self.temperature, self.about = run, network, temperature, dict(about or {})
 
     def __call__(self, map: TopometricMap) -> Array:
-        return self.graph(self._arrays(map))[0]
+        return self.graph(self.arrays(map))[0]
 
     def matchability(self, map: TopometricMap) -> Array:
         """(R,) float64: how alike a room of another map must at least be, as a cosine, before it is rather this one than none."""
-        return self.temperature * self.graph(self._arrays(map))[1]
+        return self.temperature * self.graph(self.arrays(map))[1]
 
     def probabilities(self, a: TopometricMap, b: TopometricMap) -> tuple[Array, Array]:
         """That each room of a (R_a, R_b + 1) is each of b, in the last place none of them; and of b likewise (R_b, R_a + 1)."""
-        (ea, da), (eb, db) = (self.graph(self._arrays(m)) for m in (a, b))
+        (ea, da), (eb, db) = (self.graph(self.arrays(m)) for m in (a, b))
         logits = ea @ eb.T / self.temperature
         return _softmax(np.column_stack([logits, da])), _softmax(np.column_stack([logits.T, db]))
 
@@ -95,7 +95,8 @@ class Learned:
             told |= dict(zip(("near_index", "near_attr"), layout, strict=True))
         return self.run({name: told[name] for name in names})
 
-    def _arrays(self, map: TopometricMap) -> dict[str, Array]:
+    def arrays(self, map: TopometricMap) -> dict[str, Array]:
+        """What `graph` takes, of a map."""
         return graph_arrays(map, POINTS if set(self.network.geometry.parts) != {"scalars"} else 1)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 import topomerge
 from topomerge.embedding.embedders import embedder
+from topomerge.embedding.learned import EXTRAS
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.evaluation.settings import Evaluation, Variant
 from topomerge.io import archive
@@ -54,13 +55,41 @@ def trained(run: str) -> Any:
     return topomerge.load_embedder(run)
 
 
-def described(variant: Variant, maps: Maps, path: Path, settings: Evaluation) -> tuple[tuple[Array, Array], float]:
+class Inputs:
+    """What networks read of the maps of a pair: made once, as several read the same; the seconds count for each that reads it."""
+
+    def __init__(self) -> None:
+        self.arrays: dict[tuple[int, bool], dict[str, Array]] = {}
+        self.seconds: dict[tuple[int, bool, str], float] = {}
+
+    def rows(self, learned: Any, side: int, m: TopometricMap) -> tuple[Array, float]:
+        """Descriptors of a map by a network, and the seconds."""
+        key = (side, set(learned.network.geometry.parts) == {"scalars"})  # which needs no points
+        if key not in self.arrays:
+            began = time.process_time()
+            self.arrays[key] = learned.arrays(m)
+            self.seconds[*key, ""] = time.process_time() - began
+        known = self.arrays[key]
+        extras = [name for name in EXTRAS if name in learned.network.geometry.parts]
+        for name in extras:
+            if name not in known and len(known["x"]):
+                began = time.process_time()
+                known[name] = EXTRAS[name](known["room_points"])
+                self.seconds[*key, name] = time.process_time() - began
+        began = time.process_time()
+        rows = np.asarray(learned.graph(known)[0])
+        spent = sum(self.seconds.get((*key, name), 0.0) for name in ("", *extras))
+        return rows, time.process_time() - began + spent
+
+
+def described(
+    variant: Variant, maps: Maps, path: Path, settings: Evaluation, inputs: Inputs
+) -> tuple[tuple[Array, Array], float]:
     """Descriptors (R, D) of both maps of the pair `path`, and the seconds that making them took."""
     if variant.run:
-        began = time.process_time()
         learned = trained(variant.run)
-        a, b = (np.asarray(learned(m)) for m in maps)
-        return (a, b), time.process_time() - began
+        (a, first), (b, second) = (inputs.rows(learned, side, m) for side, m in enumerate(maps))
+        return (a, b), first + second
     options = settings.descriptors[variant.descriptor]
     top = max(settings.k) if variant.k and variant.context == "join" else 0
     found, seconds = [], 0.0

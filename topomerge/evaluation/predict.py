@@ -17,7 +17,7 @@ import topomerge
 from topomerge.datasets.kept import KeptPair, load_kept
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
-from topomerge.evaluation.describe import UNTRAINED, Maps, code, described, trained
+from topomerge.evaluation.describe import UNTRAINED, Inputs, Maps, code, described, trained
 from topomerge.evaluation.settings import Evaluation, Variant, variants
 from topomerge.fusion.merge import merge
 from topomerge.fusion.verify import model
@@ -41,7 +41,8 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
     some = list(variants(settings))
     arrays: dict[str, Array] = {}
     told: dict[str, Any] = {"pair": kept.name, "version": topomerge.__version__, "code": code(*CODE)}
-    rows = {v.name: described(v, maps, path, settings) for v in some}
+    inputs = Inputs()
+    rows = {v.name: described(v, maps, path, settings, inputs) for v in some}
     told["seconds"] = {name: seconds for name, (_, seconds) in rows.items()}
     for v in some:
         a, b = rows[v.name][0]
