@@ -176,6 +176,17 @@ def test_options_reach_their_functions(run: Run, stages: dict[str, Any]) -> None
     assert {"voxel_size": 0.05, "preset": "thesis"}.items() <= stages["extract"].items()
 
 
+def from_a_signal(signal: BaseException) -> InputError:
+    """As it comes out of a reader that was running compiled code."""
+    try:
+        try:
+            raise SystemError("returned a result with an exception set") from signal
+        except SystemError as error:
+            raise InputError("scan.ply: damaged") from error
+    except InputError as error:
+        return error
+
+
 @pytest.mark.parametrize(
     ("error", "status", "said"),
     [
@@ -185,6 +196,8 @@ def test_options_reach_their_functions(run: Run, stages: dict[str, Any]) -> None
         (PermissionError(13, "Permission denied", "scan.ply"), 1, "topomerge: scan.ply: Permission denied\n"),
         (KeyboardInterrupt(), 130, "topomerge: interrupted\n"),
         (SystemExit(143), 143, ""),
+        (from_a_signal(SystemExit(143)), 143, ""),
+        (from_a_signal(KeyboardInterrupt()), 130, "topomerge: interrupted\n"),
     ],
 )
 def test_failures(run: Run, stages: dict[str, Any], tmp_path: Path, error: Any, status: int, said: str) -> None:

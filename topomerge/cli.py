@@ -95,6 +95,13 @@ def _named_paths(args: argparse.Namespace) -> list[str]:
     return [str(path) for value in given for path in (value if isinstance(value, list) else [value])]
 
 
+def _signal_behind(error: BaseException | None) -> BaseException | None:
+    """The Ctrl-C or SIGTERM that an error comes from, if any: one during compiled code comes out as a SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
+        error = error.__cause__ or error.__context__
+    return error
+
+
 def _refuse_empty_names(args: argparse.Namespace) -> None:
     """An empty name is what a script's unset variable leaves; pathlib would take it for the current folder."""
     for name in args.paths:
@@ -127,10 +134,13 @@ def _run(args: argparse.Namespace) -> int:
         # The interpreter flushes stdout once more at exit: give it a place where that succeeds.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except KeyboardInterrupt:
-        print("topomerge: interrupted", file=sys.stderr)
-        return 130
-    except Exception as error:
+    except (KeyboardInterrupt, Exception) as error:
+        signalled = _signal_behind(error)
+        if isinstance(signalled, SystemExit):
+            raise signalled from None
+        if signalled is not None:
+            print("topomerge: interrupted", file=sys.stderr)
+            return 130
         if debug:
             traceback.print_exc()
         print(_failure(error, _named_paths(args)), file=sys.stderr)
