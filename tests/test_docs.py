@@ -99,6 +99,13 @@ def test_every_command_in_the_docs_exists() -> None:
                     assert name.startswith("-") or flags <= known[name], f"{page.name}:{example.line}: {command}"
 
 
+def test_links_and_pictures_lead_somewhere() -> None:
+    """MkDocs says nothing of a picture that is missing."""
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")):
+        for target in re.findall(r"\]\(([^)\s#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+            assert "://" in target or (page.parent / target).exists(), f"{page.name}: {target}"
+
+
 def test_the_exit_statuses_are_told_alike() -> None:
     page = (ROOT / "docs" / "cli.md").read_text()
     for status in re.findall(r"(?m)^  (\d+) ", cli.EXIT_STATUSES):
