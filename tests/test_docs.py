@@ -102,7 +102,8 @@ def test_every_command_in_the_docs_exists() -> None:
 def test_links_and_pictures_lead_somewhere() -> None:
     """MkDocs says nothing of a picture that is missing."""
     for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")):
-        for target in re.findall(r"\]\(([^)\s#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        prose = re.sub(r"(?s)```.*?```|`[^`]*`", "", page.read_text(encoding="utf-8"))
+        for target in re.findall(r"\]\(([^)\s#]+)[^)]*\)", prose):
             assert "://" in target or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
