@@ -114,6 +114,6 @@ def _turned(points: Array, yaw: Array) -> Array:
     return np.stack([c * points[..., 0] - s * points[..., 1], s * points[..., 0] + c * points[..., 1], points[..., 2]], axis=-1)
 
 
-def _near(to: Array, points: Array, yaw: float, shift: Array) -> Array:
-    near: Array = ((_turned(points, np.float64(yaw)) + shift - to) ** 2).sum(axis=1) < INLIER**2
+def _near(to: Array, points: Array, yaw: Array, shift: Array) -> Array:
+    near: Array = ((_turned(points, yaw) + shift - to) ** 2).sum(axis=1) < INLIER**2
     return near
