@@ -260,6 +260,16 @@ def test_info(run: Run, tmp_path: Path) -> None:
     assert (status, out) == (1, "") and err.startswith("topomerge: bad.tmap: damaged") and err.count("\n") == 1
 
 
+def test_a_strangers_map_does_not_steer_the_terminal(run: Run, tmp_path: Path) -> None:
+    text = "\x1b[31mred\x07\x9b\u202e\x00\ud800.ply"
+    save_map(replace(building(1, 1), source=text, warnings=(text,)), tmp_path / "a.tmap")
+    status, out, err = run("info", "a.tmap")
+    assert status == 0 and "red" in out and "red" in err
+    assert all(c.isprintable() or c == "\n" for c in out + err)
+    status, out, err = run("info", "\x1b[31mno.tmap")
+    assert status == 1 and "\x1b" not in err
+
+
 def test_info_into_a_pipe_that_closed(tmp_path: Path) -> None:
     save_map(replace(building(1, 1), warnings=()), tmp_path / "a.tmap")
     reader, writer = os.pipe()

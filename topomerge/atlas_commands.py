@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.command import Argument, Command, option, quiet
-from topomerge.console import check_inputs, warn
+from topomerge.console import check_inputs, say, warn
 from topomerge.errors import InputError
 
 Read = Callable[[str, argparse.Namespace], Any]  # path, options -> map
@@ -61,9 +61,9 @@ def _told(found: Any, args: argparse.Namespace) -> int:
     warn(found.warnings)
     refused = found.status == "abstained"
     if not args.quiet:
-        print(f"{found.words()} -> {args.folder}")
+        say(f"{found.words()} -> {args.folder}")
     elif found.alone and len(found.names) > 1:
-        print(f"topomerge: {found.words()}", file=sys.stderr)
+        say(f"topomerge: {found.words()}", sys.stderr)
     return 2 if refused else 0
 
 
@@ -76,7 +76,7 @@ def _list(args: argparse.Namespace) -> int:
     if args.json:
         sys.stdout.write(json.dumps(told, indent=1, ensure_ascii=False) + "\n")
         return 0
-    print(f"{args.folder}: {told['reason']}")
+    say(f"{args.folder}: {told['reason']}")
     rows = [("map", "rooms", "storeys", "where", "source")]
     where = {k: n for n, c in enumerate(told["components"]) for k in c["maps"] if len(c["maps"]) > 1}
     for k, m in enumerate(told["maps"]):
@@ -84,7 +84,7 @@ def _list(args: argparse.Namespace) -> int:
         rows.append((m["name"], str(m["rooms"]), str(m["storeys"]), place, m["source"]))
     widths = [max(len(row[c]) for row in rows) for c in range(4)]
     for row in rows:
-        print("  ".join([*(text.ljust(w) for text, w in zip(row, widths, strict=False)), row[-1]]).rstrip())
+        say("  ".join([*(text.ljust(w) for text, w in zip(row, widths, strict=False)), row[-1]]).rstrip())
     return 0
 
 

@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 from topomerge import __version__
 from topomerge.command import Command
 from topomerge.commands import COMMANDS
+from topomerge.errors import printable
 
 EXIT_STATUSES = """\
 exit status:
@@ -86,7 +87,7 @@ def _failure(error: BaseException, paths: Sequence[str]) -> str:
     text = " ".join(text.split()) or type(error).__name__
     if paths and not any(path in text for path in paths):
         text = f"{paths[0]}: {text}"
-    return f"topomerge: {text}"
+    return printable(f"topomerge: {text}")
 
 
 def _named_paths(args: argparse.Namespace) -> list[str]:

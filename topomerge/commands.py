@@ -14,7 +14,7 @@ from typing import Any
 import topomerge
 from topomerge.atlas_commands import atlas_verb
 from topomerge.command import Command, count, option, output, quiet
-from topomerge.console import Bars, check_inputs, check_outputs, output_folder, warn, write_all
+from topomerge.console import Bars, check_inputs, check_outputs, output_folder, say, warn, write_all
 from topomerge.errors import InputError
 from topomerge.export_commands import EXPORT, VIEW
 from topomerge.learn_commands import EXPORT_EMBEDDER
@@ -79,7 +79,7 @@ def extract_command(args: argparse.Namespace) -> int:
     if not args.quiet:
         from topomerge.io.listing import map_to_text
 
-        print(map_to_text(found))
+        say(map_to_text(found))
     return 0
 
 
@@ -99,7 +99,10 @@ def info_command(args: argparse.Namespace) -> int:
 
     found = load_map(args.input)
     warn(found.warnings)
-    sys.stdout.write(json_text(map_to_json(found)) if args.json else map_to_text(found) + "\n")
+    if args.json:
+        sys.stdout.write(json_text(map_to_json(found)))
+    else:
+        say(map_to_text(found))
     return 0
 
 
@@ -200,9 +203,9 @@ def _merge(args: argparse.Namespace, folder: Path) -> int:
     result.save(folder)
     if not args.quiet:
         joined = f"; {len(result.matches)} matches, {len(result.map.rooms)} rooms in all" if result.map else ""
-        print(f"{result.reason}{joined} -> {folder}")
+        say(f"{result.reason}{joined} -> {folder}")
     elif not result.merged:
-        print(f"topomerge: {result.reason}", file=sys.stderr)
+        say(f"topomerge: {result.reason}", sys.stderr)
     return 0 if result.merged else 2
 
 

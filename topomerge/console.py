@@ -7,9 +7,9 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
-from topomerge.errors import InputError
+from topomerge.errors import InputError, printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -79,10 +79,15 @@ class Bars:
             self._shown.update(self._rows[title], completed=fraction, description=text or title)
 
 
+def say(text: str, stream: TextIO | None = None) -> None:
+    """Print what may quote a stranger's file; to stdout by default."""
+    print(printable(text), file=stream)
+
+
 def warn(messages: Iterable[str]) -> None:
     """Print warnings to stderr, one line each."""
     for message in messages:
-        print(f"topomerge: warning: {' '.join(message.split())}", file=sys.stderr)
+        say(f"topomerge: warning: {' '.join(message.split())}", sys.stderr)
 
 
 class _Probe(Exception):
