@@ -140,13 +140,15 @@ def test_bad_networks_name_their_key(told, said):
         network_from(told)
 
 
-def test_a_file_gives_the_same_network(tmp_path):
-    net = network("scalars", "pointnet")
+@pytest.mark.parametrize("part", ["pointnet", "pointnet_local", "voxelcnn"])
+def test_a_file_gives_the_same_network(tmp_path, part):
+    net = network("scalars", part)
     save_embedder(net, tmp_path / "best", {"data": "x"})
     read, about = read_embedder(tmp_path)  # a run: its best
     assert about == {"data": "x"} and asdict(read.network) == asdict(net.network)
     with torch.no_grad():
         assert torch.equal(read(graph())[0], net(graph())[0])
+    assert load_embedder(tmp_path)(building(1, 1)).shape == (len(building(1, 1).rooms), 64)
 
 
 def spoil(path, change) -> None:

@@ -92,7 +92,7 @@ def _array(data: bytes, start: int, name: str, told: Any) -> Array:
     """One array, if what the header tells of it is possible."""
     shape, ends = (told.get(key) if isinstance(told, dict) else None for key in ("shape", "data_offsets"))
     whole = [n for some in (shape, ends) if isinstance(some, list) for n in some]
-    if not isinstance(shape, list) or not isinstance(ends, list) or len(ends) != 2 or len(shape) > 4:
+    if not isinstance(shape, list) or not isinstance(ends, list) or len(ends) != 2 or len(shape) > 5:
         raise ValueError(f"{name[:60]}: the header tells no shape and place")
     if told.get("dtype") != "F32" or not all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in whole):
         raise ValueError(f"{name[:60]}: is no float32")
