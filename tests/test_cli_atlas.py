@@ -51,6 +51,40 @@ def test_listing(run: Run) -> None:
     assert status == 0 and json.loads(out)["components"][0]["names"] == ["west", "east"]
 
 
+STRANGE = [
+    {"maps": None}, {"maps": [{}]}, {"components": 3}, {"components": [{"maps": [[], []]}]}, {"reason": None}, {"format": [1]},
+    {"settings": 1e999}, {"maps": [{"name": [], "key": "", "source": {}, "rooms": 1e999, "storeys": -1}]},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("change", STRANGE)
+def test_a_strangers_listing(run: Run, folder: Path, change: dict[str, object]) -> None:
+    told = json.loads((folder / "house" / "atlas.json").read_text())
+    (folder / "strange").mkdir(exist_ok=True)
+    for changed in (told | change, {k: v for k, v in told.items() if k not in change}):
+        (folder / "strange" / "atlas.json").write_text(json.dumps(changed))
+        status, out, err = run("atlas", "list", "strange")
+        assert status == 0 or (status == 1 and err.count("\n") == 1 and out == ""), err
+        assert status == 0 or "damaged" in err or "of format" in err, err
+
+
+@pytest.mark.parametrize("found", [[], {"features": []}, {"yaw": 10**400}, {"translation": 3}, {"scale": 0}, {"probability": 7}])
+def test_strange_registrations_are_made_anew(run: Run, folder: Path, found: object) -> None:
+    from topomerge.fusion.atlas_store import _pairs, read_atlas
+
+    path = folder / "house" / "pairs.json"
+    before = path.read_text()
+    told = json.loads(before)
+    assert len(_pairs(read_atlas(folder / "house"))) == len(told["pairs"]) > 0
+    try:
+        good = next(p["hypotheses"][0] for p in told["pairs"] if p["hypotheses"])
+        told["pairs"][0]["hypotheses"] = [good | found if isinstance(found, dict) else found]
+        path.write_text(json.dumps(told))
+        assert _pairs(read_atlas(folder / "house")) == {}
+    finally:
+        path.write_text(before)
+
+
 def test_nothing_connected_is_status_two(run: Run, folder: Path) -> None:
     status, out, err = run("atlas", "add", "two", "west.tmap", "stranger.tmap")
     assert status == 2 and "nothing could be connected: all 2 maps stand apart" in out and err == ""

@@ -76,16 +76,25 @@ def _list(args: argparse.Namespace) -> int:
     if args.json:
         sys.stdout.write(json.dumps(told, indent=1, ensure_ascii=False) + "\n")
         return 0
-    say(f"{args.folder}: {told['reason']}")
+    try:
+        table = _table(told)
+    except (KeyError, TypeError) as error:
+        reason = f"{type(error).__name__}: {error}"[:120]
+        raise InputError(f"{args.folder}: its atlas.json is damaged ({reason}); make the atlas again from its maps") from error
+    say(f"{args.folder}: {table}")
+    return 0
+
+
+def _table(told: dict[str, Any]) -> str:
+    """What atlas.json tells, as text."""
     rows = [("map", "rooms", "storeys", "where", "source")]
     where = {k: n for n, c in enumerate(told["components"]) for k in c["maps"] if len(c["maps"]) > 1}
     for k, m in enumerate(told["maps"]):
         place = f"map_{where[k]}.tmap" if k in where else "apart"
-        rows.append((m["name"], str(m["rooms"]), str(m["storeys"]), place, m["source"]))
+        rows.append((str(m["name"]), str(m["rooms"]), str(m["storeys"]), place, str(m["source"])))
     widths = [max(len(row[c]) for row in rows) for c in range(4)]
-    for row in rows:
-        say("  ".join([*(text.ljust(w) for text, w in zip(row, widths, strict=False)), row[-1]]).rstrip())
-    return 0
+    lines = ["  ".join([*(text.ljust(w) for text, w in zip(row, widths, strict=False)), row[-1]]).rstrip() for row in rows]
+    return "\n".join([str(told["reason"]), *lines])
 
 
 def atlas_verb(read: Read, reading: tuple[Argument, ...], share: Callable[[str], float]) -> Command:

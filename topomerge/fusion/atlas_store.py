@@ -93,7 +93,7 @@ def read_atlas(folder: str | Path) -> Stored:
             raise ValueError("a file lies elsewhere")
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:120]
         raise InputError(f"{path}: damaged ({reason}); make the atlas again from the maps in {folder / 'maps'}") from error
     return stored
@@ -265,7 +265,7 @@ def _pairs(stored: Stored) -> Known:
         if told["format"] != FORMAT or told["stamp"] != _stamp(stored):
             return {}
         return {(p["maps"][0], p["maps"][1]): tuple(_hypothesis(h) for h in p["hypotheses"]) for p in told["pairs"]}
-    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError):
         return {}
 
 
