@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -85,7 +85,7 @@ def _list(args: argparse.Namespace) -> int:
     return 0
 
 
-def _table(told: dict[str, Any]) -> str:
+def _table(told: Mapping[str, Any]) -> str:
     """What atlas.json tells, as text."""
     rows = [("map", "rooms", "storeys", "where", "source")]
     where = {k: n for n, c in enumerate(told["components"]) for k in c["maps"] if len(c["maps"]) > 1}
