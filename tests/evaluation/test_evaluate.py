@@ -104,8 +104,8 @@ def test_runs_are_called_by_what_they_are_made_of() -> None:
     run = "topomerge/embedding/pretrained"
     assert run_title(run) == "scalars, gat around, infonce"
     settings = Evaluation(SMALL, run=[run], titles=True, mergers=[])
-    assert [v.name for v in variants(settings)] == ["scalars, gat, infonce"] == list(told(settings)["run"])
-    with pytest.raises(InputError, match="two are called 'scalars, gat, infonce'"):
+    assert [v.name for v in variants(settings)] == ["scalars, gat around, infonce"] == list(told(settings)["run"])
+    with pytest.raises(InputError, match="two are called 'scalars, gat around, infonce'"):
         check(replace(settings, run=[run, f"{run}/embedder.json"]))
 
 
