@@ -32,9 +32,9 @@ REAL = (
 
 
 KEPT = (
-    "Held-out pairs of [learned against untrained](#learned-against-untrained-from-scans-to-merged-maps), all methods on the "
-    "cells of the extracted maps (`python benchmarks/peers.py 9000 heldout`): topomerge on the cells alone, and with the rooms "
-    "that the embedder that ships matches, joined map included where it is believed."
+    "Held-out pairs of [learned against untrained](#learned-against-untrained-from-scans-to-merged-maps), all methods on "
+    "the cells of the extracted maps (`python benchmarks/peers.py 9000 heldout`, the first by name): topomerge on the cells "
+    "alone, and with the rooms that the embedder that ships matches, joined map included where it is believed."
 )
 
 
