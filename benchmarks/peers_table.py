@@ -26,8 +26,8 @@ TEXT = (
 
 
 REAL = (
-    "The real pairs (`python benchmarks/peers.py 9000 real`). The scale of Halmstad's maps is unknown: topomerge finds it, the "
-    "others cannot and are given the true one."
+    "The real pairs (`python benchmarks/peers.py 9000 real`), as many as were reached: large grids cost Open3D minutes. The "
+    "scale of Halmstad's maps is unknown: topomerge finds it, the others cannot and are given the true one."
 )
 
 
