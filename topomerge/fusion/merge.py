@@ -22,6 +22,7 @@ from topomerge.fusion.verify import model
 from topomerge.fusion.words import why
 from topomerge.matching.match import match
 from topomerge.matching.odds import match_probability
+from topomerge.matching.result import Matching
 from topomerge.types import Array, Sim3, TopometricMap
 
 POSES = ("search", "rooms")
@@ -67,7 +68,7 @@ def merge(
     if not 0 <= limit <= 1:
         raise InputError(f"threshold must be a probability between 0 and 1, not {threshold}")
     clock = _Clock()
-    known = (_hypotheses if poses == "search" else _rooms_alone)(a, b, embedder, scale, clock)
+    known = _hypotheses(a, b, embedder, scale, poses, clock)
     found = register(a, b, scale=scale, hypotheses=known, searched=poses == "search")
     believed = found.transform is not None and found.probability >= limit
     result = MergeResult(
@@ -157,31 +158,30 @@ def _storey_height(m: TopometricMap) -> float:
     return float(np.median(height)) if len(height) else 0.0
 
 
-def _hypotheses(a: TopometricMap, b: TopometricMap, embedder: str | Descriptor, scale: str, clock: _Clock) -> list[Sim3]:
-    """Poses T_ab of matched rooms."""
+def _hypotheses(
+    a: TopometricMap, b: TopometricMap, embedder: str | Descriptor, scale: str, poses: str, clock: _Clock
+) -> list[Sim3]:
+    """Poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "rooms") of each by its surfaces."""
     if not len(a.rooms) or not len(b.rooms):
         return []
     if _order(b) < _order(a):  # as registration: nothing may depend on which comes first
-        return [h.inverse() for h in _hypotheses(b, a, embedder, scale, clock)]
+        return [h.inverse() for h in _hypotheses(b, a, embedder, scale, poses, clock)]
+    describe = _timed(embedder, clock)
     with clock("match"):
-        found = match(a, b, _timed(embedder, clock), scale_free=scale == "free")
-        return [h.transform for h in found.alternatives]
+        if poses == "rooms":
+            return _of_rooms(a, b, match(a, b, describe, "growing"))
+        return [h.transform for h in match(a, b, describe, scale_free=scale == "free").alternatives]
 
 
-def _rooms_alone(a: TopometricMap, b: TopometricMap, embedder: str | Descriptor, scale: str, clock: _Clock) -> list[Sim3]:
-    """Poses T_ab of the rooms that any hypothesis of growing matches, each pair by its surfaces."""
-    if not len(a.rooms) or not len(b.rooms):
-        return []
-    if _order(b) < _order(a):
-        return [h.inverse() for h in _rooms_alone(b, a, embedder, scale, clock)]
-    with clock("match"):
-        likely: dict[tuple[int, ...], float] = {}
-        for h in match(a, b, _timed(embedder, clock), "growing").alternatives:
-            for pair in h.rooms.tolist():
-                likely[tuple(pair)] = likely.get(tuple(pair), 0.0) + h.probability
-        rooms = np.array(sorted(likely), np.int64).reshape(-1, 2)
-        weights = np.array([likely[i, j] for i, j in rooms.tolist()])
-        return [pose for pose, _ in room_poses(a, b, rooms, weights)]
+def _of_rooms(a: TopometricMap, b: TopometricMap, found: Matching) -> list[Sim3]:
+    """Poses of the pairs of rooms that any hypothesis holds, each pair by its surfaces."""
+    likely: dict[tuple[int, ...], float] = {}
+    for h in found.alternatives:
+        for pair in h.rooms.tolist():
+            likely[tuple(pair)] = likely.get(tuple(pair), 0.0) + h.probability
+    rooms = np.array(sorted(likely), np.int64).reshape(-1, 2)
+    weights = np.array([likely[i, j] for i, j in rooms.tolist()])
+    return [pose for pose, _ in room_poses(a, b, rooms, weights)]
 
 
 def _timed(embedder: str | Descriptor, clock: _Clock) -> Descriptor:
