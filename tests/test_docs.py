@@ -15,7 +15,9 @@ from pathlib import Path
 import pytest
 
 from tests.docs_examples import ROOT, Example, commands, examples, pages
-from topomerge import cli
+from topomerge.cli.commands import COMMANDS
+from topomerge.cli.main import EXIT_STATUSES
+from topomerge.cli.main import main as cli
 
 QUICK = ("cli.md",)  # pages whose examples need no scans; those of all others are slow
 
@@ -25,7 +27,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the examples find in their folder: two scans of an office."""
     folder = tmp_path_factory.mktemp("workshop")
     small = ["--building", "office", "--seed", "5", "--rooms", "8", "--overlap", "0.7", "--quiet"]
-    assert cli.main(["simulate", *small, "-o", str(folder / "pair")]) == 0
+    assert cli(["simulate", *small, "-o", str(folder / "pair")]) == 0
     for name, other in (("a.ply", "scan.ply"), ("b.ply", "other.ply")):
         shutil.move(folder / "pair" / name, folder / other)
     shutil.rmtree(folder / "pair")
@@ -89,7 +91,7 @@ def test_python_examples_can_be_read(page: Path) -> None:
 
 def test_every_command_in_the_docs_exists() -> None:
     """Also those that are not run: the command and its options are known to the parser."""
-    known = {c.name: {f for flags, _ in c.arguments for f in flags} for c in cli.COMMANDS}
+    known = {c.name: {f for flags, _ in c.arguments for f in flags} for c in COMMANDS}
     for page in pages():
         for example in examples(page):
             for command in commands(example) if example.kind == "console" else ():
@@ -109,7 +111,7 @@ def test_links_and_pictures_lead_somewhere() -> None:
 
 def test_the_exit_statuses_are_told_alike() -> None:
     page = (ROOT / "docs" / "cli.md").read_text()
-    for status in re.findall(r"(?m)^  (\d+) ", cli.EXIT_STATUSES):
+    for status in re.findall(r"(?m)^  (\d+) ", EXIT_STATUSES):
         assert f"| {status} |" in page
 
 

@@ -28,14 +28,7 @@ RANKS = {
     "checkpoint": 9,
     "training": 10,
     "evaluation": 10,
-    "console": 11,
-    "completion": 11,
-    "command": 11,
-    "export_commands": 12,
-    "learn_commands": 12,
-    "atlas_commands": 12,
-    "commands": 13,
-    "cli": 14,
+    "cli": 13,
     "__main__": 15,
 }
 HEAVY = ("torch", "torch_geometric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell", "trimesh", "lightning")

@@ -30,7 +30,7 @@ def replace(self, target):
         os._exit(9)
     return plain(self, target)
 pathlib.Path.replace = replace
-from topomerge.cli import main
+from topomerge.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -87,7 +87,7 @@ def test_killed_between_two_renames(tmp_path: Path) -> None:
         folder.mkdir()
         for name in names:
             (folder / name).write_text("old")
-        code = AT_A_RENAME.replace("topomerge.cli import main", "topomerge.console import write_all").replace(
+        code = AT_A_RENAME.replace("topomerge.cli.main import main", "topomerge.cli.console import write_all").replace(
             "sys.exit(main(sys.argv[1:]))",
             "write_all([(n, lambda path: path.write_text('new')) for n in sys.argv[1:]])",
         )

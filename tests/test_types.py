@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from grids import COMPILED, cell_lists, grids, random_grid
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.grids import COMPILED, cell_lists, grids, random_grid
 from topomerge.kernels import morton
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, PointCloud, Sim3, TopometricMap, VoxelGrid
 

@@ -22,7 +22,7 @@ class Refuse:
         if name.split(".")[0] in ("torch", "torch_geometric", "hydra", "omegaconf", "lightning", "open3d", "laspy", "pye57"):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Refuse())
-from topomerge.cli import main
+from topomerge.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
 

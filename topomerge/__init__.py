@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from topomerge.extraction.extract import PRESETS as PRESETS
     from topomerge.extraction.extract import extract as extract
     from topomerge.extraction.voxels import voxelise as voxelise
-    from topomerge.fusion.atlas import AtlasResult as AtlasResult
-    from topomerge.fusion.atlas import atlas as atlas
+    from topomerge.fusion.atlas.solve import AtlasResult as AtlasResult
+    from topomerge.fusion.atlas.solve import atlas as atlas
     from topomerge.fusion.merge import merge as merge
     from topomerge.fusion.result import MergeResult as MergeResult
     from topomerge.io.exports import save_export as save_export
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "AtlasResult": "topomerge.fusion.atlas",
+    "AtlasResult": "topomerge.fusion.atlas.solve",
     "InputError": "topomerge.errors",
     "MergeResult": "topomerge.fusion.result",
     "PRESETS": "topomerge.extraction.extract",
@@ -51,7 +51,7 @@ _HOMES = {
     "Sim3": "topomerge.types",
     "TopometricMap": "topomerge.types",
     "VoxelGrid": "topomerge.types",
-    "atlas": "topomerge.fusion.atlas",
+    "atlas": "topomerge.fusion.atlas.solve",
     "atlas_html": "topomerge.viz.atlas_report",
     "extract": "topomerge.extraction.extract",
     "load_embedder": "topomerge.embedding.learned",

@@ -2,7 +2,7 @@
 
 import sys
 
-from topomerge.cli import main
+from topomerge.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

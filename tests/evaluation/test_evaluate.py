@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topomerge.datasets.degrade import degraded
-from topomerge.datasets.kept import load_kept
-from topomerge.datasets.pairs import Pair
-from topomerge.datasets.recipe import check as check_recipe
+from topomerge.datasets.pairs.degrade import degraded
+from topomerge.datasets.pairs.evaluation_pair import load_kept
+from topomerge.datasets.pairs.pairs import Pair
+from topomerge.datasets.pairs.recipe import check as check_recipe
 
 from topomerge.config import compose
 from topomerge.errors import InputError

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from topomerge.datasets.kept import KeptPair, twins
+from topomerge.datasets.pairs.evaluation_pair import KeptPair, twins
 
 from topomerge.errors import InputError
 from topomerge.evaluation.groups import calibration, draws, gain, value

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from grids import COMPILED, grids, random_grid, row_of
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.grids import COMPILED, grids, random_grid, row_of
 from topomerge.extraction import convolution as conv
 from topomerge.extraction.convolution import Kernel, any_at, convolve, count_at
 from topomerge.types import VoxelGrid

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scenes
 
+from tests import scenes
 from topomerge.errors import InputError
 from topomerge.extraction.extract import PRESETS, Preset, extract
 from topomerge.extraction.voxels import voxelise

@@ -15,7 +15,7 @@ from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.extraction.floors import floor_components, largest_component
 from topomerge.extraction.gaps import bridge_gaps
 from topomerge.extraction.unobstructed import unobstructed
-from topomerge.extraction.views import best_of_tiles, local_maxima, raise_views
+from topomerge.extraction.views.views import best_of_tiles, local_maxima, raise_views
 from topomerge.types import VoxelGrid
 
 

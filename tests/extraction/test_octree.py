@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from grids import COMPILED, grids, interleave, random_grid
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.grids import COMPILED, grids, interleave, random_grid
 from topomerge.extraction.octree import SparseVoxelOctree
 from topomerge.types import VoxelGrid
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scenes import HEIGHT, Scene
 
-from topomerge.fusion.evidence import with_means
+from tests.scenes import HEIGHT, Scene
+from topomerge.fusion.storey_plan import with_means
 from topomerge.types import Sim3, VoxelGrid
 
 MOVE = Sim3(2.1, (7.0, -3.0, 0.4))

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plans_of import MOVE, off, office, part
-from scenes import Scene, two_rooms
 from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import topomerge as tm
+from tests.fusion.plans_of import MOVE, off, office, part
+from tests.scenes import Scene, two_rooms
 from topomerge.errors import InputError
 from topomerge.fusion.fuse import fuse, join, resampled, room_of_rooms, rooms_in_common
 from topomerge.fusion.result import STEPS, MergeResult, merge_to_json

@@ -6,14 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from plans_of import MOVE, doubled, grid_of, off, office, part
-from scenes import HEIGHT, Scene
 
+from tests.fusion.plans_of import MOVE, doubled, grid_of, off, office, part
+from tests.scenes import HEIGHT, Scene
 from topomerge.errors import InputError
-from topomerge.fusion.evidence import plans
 from topomerge.fusion.refine import refine_pose, surface
 from topomerge.fusion.registration import register
 from topomerge.fusion.search import View, direction_profile, yaw_candidates
+from topomerge.fusion.storey_plan import plans
 from topomerge.fusion.verify import Judge
 from topomerge.kernels import align
 from topomerge.types import Sim3, VoxelGrid

@@ -49,7 +49,7 @@ def read_map(path: Path) -> int:
 
 def read_plans(path: Path) -> int:
     """Read a file of floor plans of a data set."""
-    from topomerge.datasets.floorplans import Refusal, iter_plans
+    from topomerge.datasets.plans.floorplans import Refusal, iter_plans
 
     found = [plan for _, plan in iter_plans(path)]
     refused = [plan.reason for plan in found if isinstance(plan, Refusal)]
@@ -60,7 +60,7 @@ def read_plans(path: Path) -> int:
 
 def read_atlas(path: Path) -> int:
     """Read the listing of an atlas."""
-    from topomerge.fusion.atlas_store import read_atlas
+    from topomerge.fusion.atlas.store import read_atlas
 
     return len(read_atlas(path.parent).entries)
 
@@ -117,7 +117,7 @@ def write_corpus(folder: Path) -> dict[str, Path]:
 
 def write_plans(folder: Path) -> dict[str, Path]:
     """Plans of four data sets."""
-    from tests.datasets import plan_files
+    from tests.datasets.plans import plan_files
 
     found = {name: folder / name for name in ("plan.xml", "plan.building.yaml", "plan.vectormap.json", "plans.tar.xz")}
     plan_files.campus(found["plan.xml"])
@@ -146,7 +146,7 @@ def write_embedder(folder: Path) -> dict[str, Path]:
 
 def write_atlas(folder: Path) -> dict[str, Path]:
     """The listing of an atlas of one map."""
-    from topomerge.fusion.atlas_store import add
+    from topomerge.fusion.atlas.store import add
 
     add(folder / "atlas", [("house", building(2, 2))])
     shutil.copy(folder / "atlas" / "atlas.json", folder / "atlas.json")

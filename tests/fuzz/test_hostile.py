@@ -233,8 +233,8 @@ def test_an_atlas_of_a_stranger_deletes_and_writes_nothing_elsewhere(tmp_path: P
     """What looks like a change that was interrupted names files of other folders."""
     from tests.scenes_map import building
     from topomerge.errors import InputError
-    from topomerge.fusion.atlas_folder import GONE, NEXT
-    from topomerge.fusion.atlas_store import add, read_atlas
+    from topomerge.fusion.atlas.folder import GONE, NEXT
+    from topomerge.fusion.atlas.store import add, read_atlas
 
     folder = tmp_path / "atlas"
     add(folder, [("house", building(2, 2))])

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from samples import write_all
+
+from tests.samples import write_all
 
 
 @pytest.fixture(scope="session")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import box_colors, box_points, write_e57, write_las, write_ply
 
+from tests.samples import box_colors, box_points, write_e57, write_las, write_ply
 from topomerge.errors import InputError
 from topomerge.io import read_chunks, read_points
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from samples import octomap_node, write_octomap
 
+from tests.samples import octomap_node, write_octomap
 from topomerge.errors import InputError
 from topomerge.io import grid, read_points
 

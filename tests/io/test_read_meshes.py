@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import write_ifc
 
+from tests.samples import write_ifc
 from topomerge.errors import InputError
 from topomerge.io import read_points
 from topomerge.io.ifc import area, outline

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import box_points
 
+from tests.samples import box_points
 from topomerge.errors import InputError
 from topomerge.io import frame, read_chunks, read_points
 from topomerge.io.checks import Sample, warn_about

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from grids import COMPILED, cell_lists, grids, random_grid, row_of
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.grids import COMPILED, cell_lists, grids, random_grid, row_of
 from topomerge.kernels import lookup, stencil
 from topomerge.types import VoxelGrid
 

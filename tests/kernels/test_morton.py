@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from grids import COMPILED, interleave
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.grids import COMPILED, interleave
 from topomerge.kernels import morton
 
 AXIS = st.integers(0, morton.LIMIT - 1)

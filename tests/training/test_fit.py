@@ -69,7 +69,7 @@ def test_a_set_is_packed_once(cache):
     assert around["edge_index"].shape[1] == 7 * 6 + pair(0).a["edge_index"].shape[1] and "door_index" not in around
     file = min((cache / "packed").glob("some-*.npz"), key=lambda path: len(path.name))  # the others are chunks of descriptors
     assert len(load_pairs(file)) == 10
-    with pytest.raises(InputError, match=r"datasets\.build data=none"):
+    with pytest.raises(InputError, match=r"datasets\.pairs\.build data=none"):
         load_pairs(cache / "none.jsonl")
 
 

@@ -18,7 +18,7 @@ from tests.scenes import two_rooms
 from tests.scenes_map import HEIGHT, building
 from tests.viz.chromium import browser
 from tests.viz.test_figures import without_rooms
-from topomerge.cli import main
+from topomerge.cli.main import main
 from topomerge.errors import InputError
 from topomerge.types import AREA_DTYPE, EDGE_DTYPE, TopometricMap, VoxelGrid
 from topomerge.viz.markup import element, join, json_data

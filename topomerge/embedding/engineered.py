@@ -1,7 +1,8 @@
 """Engineered features of a room: the twelve of the thesis, and its place in the graph (seeds 3.1.1; method, section 2).
 
 Lengths are metres and nothing depends on the frame. Sizes are taken as logarithms, then all is scaled by statistics of a training
-set, kept in `engineered.json` (made by ``python benchmarks/engineered_scale.py``): either every feature by its spread over rooms
+set, kept in `engineered.json` (made by ``python -m benchmarks.training.engineered_scale``): either every feature by its spread
+over rooms
 (``"standard"``), or all of them by how much they differ between two maps' views of one room (``"matched"``: features that a
 partial view changes count less).
 """
@@ -90,7 +91,7 @@ def _statistics() -> tuple[Array, Array, Array]:
     text = resources.files("topomerge.embedding").joinpath("engineered.json").read_text(encoding="utf-8")
     known = json.loads(text)
     if tuple(known["features"]) != FEATURES:
-        raise RuntimeError("engineered.json is of other features: run benchmarks/engineered_scale.py")
+        raise RuntimeError("engineered.json is of other features: run benchmarks/training/engineered_scale.py")
     return np.array(known["mean"]), np.array(known["spread"]), np.array(known["differences"])
 
 

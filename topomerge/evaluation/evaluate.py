@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from topomerge.datasets.build import Build, build
-from topomerge.datasets.real_maps import keep_real
-from topomerge.datasets.recipe import Recipe
+from topomerge.datasets.pairs.build import Build, build
+from topomerge.datasets.pairs.recipe import Recipe
+from topomerge.datasets.real.maps import keep_real
 from topomerge.errors import InputError
 from topomerge.evaluation.describe import code
 from topomerge.evaluation.figures import save_figures

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import topomerge
-from topomerge.datasets.kept import KeptPair, load_kept
+from topomerge.datasets.pairs.evaluation_pair import KeptPair, load_kept
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
 from topomerge.evaluation.describe import UNTRAINED, Inputs, Maps, code, described, trained

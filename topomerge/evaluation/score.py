@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.datasets.kept import KeptPair, load_kept
+from topomerge.datasets.pairs.evaluation_pair import KeptPair, load_kept
 from topomerge.evaluation.settings import Evaluation, variants
 from topomerge.io import archive
 from topomerge.types import Array, Sim3

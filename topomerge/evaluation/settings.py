@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from topomerge.datasets.recipe import Recipe
+from topomerge.datasets.pairs.recipe import Recipe
 from topomerge.embedding.context import HOWS
 from topomerge.embedding.embedders import EMBEDDERS
 from topomerge.embedding.weights import read_weights

@@ -13,7 +13,6 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.extraction.assumed import any_ceiling, extruded, has_floor, is_slice, with_assumed_floor
 from topomerge.extraction.ceilings import without_ceilings
-from topomerge.extraction.clustering import INFLATIONS, cluster_views
 from topomerge.extraction.convolution import Kernel, sphere, stick
 from topomerge.extraction.dilation import dilate_upwards
 from topomerge.extraction.distance_field import horizontal_distance_field
@@ -21,15 +20,16 @@ from topomerge.extraction.floors import floor_components, largest_component
 from topomerge.extraction.free_space import carve_rays, carve_views
 from topomerge.extraction.gaps import bridge_gaps
 from topomerge.extraction.noise import without_flying_cells, without_gaps
-from topomerge.extraction.plan_rooms import rooms_of_plans
-from topomerge.extraction.propagation import propagate_labels
+from topomerge.extraction.plans.plan_rooms import rooms_of_plans
 from topomerge.extraction.rooms import Floor, navigable_floor, split_rooms
-from topomerge.extraction.similarity import jaccard_similarity
 from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.unobstructed import unobstructed
-from topomerge.extraction.views import best_of_tiles, local_maxima, raise_views
-from topomerge.extraction.visibility import visible_cells
-from topomerge.extraction.votes import vote
+from topomerge.extraction.views.clustering import INFLATIONS, cluster_views
+from topomerge.extraction.views.propagation import propagate_labels
+from topomerge.extraction.views.similarity import jaccard_similarity
+from topomerge.extraction.views.views import best_of_tiles, local_maxima, raise_views
+from topomerge.extraction.views.visibility import visible_cells
+from topomerge.extraction.views.votes import vote
 from topomerge.extraction.voxels import voxelise
 from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid
 

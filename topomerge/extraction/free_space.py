@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from topomerge.extraction.distance_field import horizontal_distance_field
-from topomerge.extraction.views import best_of_tiles, raise_views
+from topomerge.extraction.views.views import best_of_tiles, raise_views
 from topomerge.kernels.carve import carve, sweep
 from topomerge.types import Array, VoxelGrid
 

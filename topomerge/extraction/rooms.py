@@ -8,7 +8,7 @@ import numpy as np
 
 from topomerge.extraction.components import connected_components, spread_labels
 from topomerge.extraction.convolution import moore
-from topomerge.extraction.segment import Told
+from topomerge.extraction.plans.plan_network import Told
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.types import Array, VoxelGrid
 

@@ -7,8 +7,8 @@ from scipy import ndimage
 
 from topomerge.extraction.completeness import GLIMPSED, completeness
 from topomerge.extraction.doors import find_edges
+from topomerge.extraction.plans.plan_network import through_wall
 from topomerge.extraction.rooms import Floor
-from topomerge.extraction.segment import through_wall
 from topomerge.extraction.storeys import ceiling_height, floor_to_ceiling, lowest_of_column
 from topomerge.types import AREA_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid
 

@@ -13,13 +13,13 @@ from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
-from topomerge.fusion.atlas_join import join_many
+from topomerge.fusion.atlas.join import join_many
+from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import rooms_in_common
 from topomerge.fusion.registration import Registration, _order, register
 from topomerge.fusion.result import STEPS, MergeResult, RoomMatch
-from topomerge.fusion.room_poses import room_poses
+from topomerge.fusion.thesis.room_poses import room_poses
 from topomerge.fusion.verify import model
-from topomerge.fusion.words import why
 from topomerge.matching.match import match
 from topomerge.matching.odds import match_probability
 from topomerge.matching.result import Matching
@@ -60,7 +60,7 @@ def merge(
     if poses == "rooms" and (len(maps) > 2 or scale != "fixed"):
         raise InputError("poses of rooms alone are for two maps of one scale; leave them out (--poses search)")
     if len(maps) > 2:
-        from topomerge.fusion.atlas_merge import merge_many  # it stands above this file
+        from topomerge.fusion.atlas.merge import merge_many  # it stands above this file
 
         return merge_many(maps, scale=scale, force=force, threshold=threshold, embedder=embedder)
     a, b = _checked(maps, scale)

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.fusion.closer import closer
-from topomerge.fusion.evidence import cell_middles, plans
 from topomerge.fusion.refine import Surface, refine_pose, surface
 from topomerge.fusion.scale import search_scaled
 from topomerge.fusion.search import Candidate, View, search
 from topomerge.fusion.search import refined as moved
+from topomerge.fusion.storey_plan import cell_middles, plans
 from topomerge.fusion.verify import MARGIN_CAP, Judge, Ranked, model, probability, rank
+from topomerge.fusion.winner_features import closer
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from topomerge.io.listing import plain
 from topomerge.types import Sim3, TopometricMap
 
 if TYPE_CHECKING:
-    from topomerge.fusion.atlas import AtlasResult
+    from topomerge.fusion.atlas.solve import AtlasResult
 
 FORMAT = 1
 STEPS = ("read", "extract", "embed", "match", "fuse")

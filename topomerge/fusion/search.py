@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy import fft, ndimage
 
-from topomerge.fusion.evidence import BAND, LOW, Plan
+from topomerge.fusion.storey_plan import BAND, LOW, Plan
 from topomerge.kernels import align
 from topomerge.types import Array, Sim3
 

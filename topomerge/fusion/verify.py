@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from topomerge.fusion.evidence import BODY
 from topomerge.fusion.search import MARGIN, Candidate, View, distinct, pairs_at
+from topomerge.fusion.storey_plan import BODY
 from topomerge.kernels import align
 from topomerge.types import Array, Sim3
 
@@ -238,7 +238,8 @@ def vector(f: Features) -> Array:
 
 @cache
 def model() -> dict[str, Any]:
-    """Coefficients and the threshold, fitted on simulated training pairs (benchmarks/calibrate_merge.py): of two models each for
+    """Coefficients and the threshold, fitted on simulated training pairs (benchmarks/training/calibrate_merge.py): of two
+    models each for
     pairs of maps with heights (``solid``) and for those of which one is a slice or a drawing (``flat``)."""
     text = resources.files("topomerge.fusion").joinpath("calibration.json").read_text(encoding="utf-8")
     found: dict[str, Any] = json.loads(text)

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.apart import read_apart
 from topomerge.io.pcd import pose
 from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
+from topomerge.io.subprocess_reader import read_apart
 from topomerge.kernels.codecs import crc32c
 from topomerge.types import Array
 

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.apart import read_apart
 from topomerge.io.mesh import sample
 from topomerge.io.piece import Options, Piece, damaged
 from topomerge.io.step import check_references
+from topomerge.io.subprocess_reader import read_apart
 from topomerge.types import Array, TrueRoom
 
 # What has a shape but is not built, or is cut out of something else.

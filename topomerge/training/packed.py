@@ -116,7 +116,7 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        made = f"make it with python -m topomerge.datasets.build data={path.stem}"
+        made = f"make it with python -m topomerge.datasets.pairs.build data={path.stem}"
         raise InputError(f"{path}: {error.strerror or error}; {made}") from error
     rows = [json.loads(line) for line in text.splitlines()]
     if not rows:

@@ -135,7 +135,7 @@ def known() -> type[Training]:
 
 def with_recipe() -> type[Training]:
     """`Training` with all of `configs/data/<name>.yaml` in the place of its name, as Hydra composes it."""
-    from topomerge.datasets.recipe import Recipe
+    from topomerge.datasets.pairs.recipe import Recipe
 
     return make_dataclass("Training", [("data", Recipe, field(default_factory=Recipe))], bases=(Training,))
 

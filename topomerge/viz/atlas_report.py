@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.fusion.atlas import AtlasResult
-from topomerge.fusion.words import chance
+from topomerge.fusion.atlas.solve import AtlasResult
+from topomerge.fusion.explanation import chance
 from topomerge.types import Array, Sim3, TopometricMap
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.report import page, plan_view, scene_view, scroller, section, warnings

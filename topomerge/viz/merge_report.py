@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row
 from topomerge.fusion.fuse import room_of_rooms
 from topomerge.fusion.registration import Registration
 from topomerge.fusion.result import MergeResult, merge_to_json
-from topomerge.fusion.words import chance, evidence_rows, hypothesis_row
 from topomerge.io.atomic import replacing
 from topomerge.io.listing import json_text
 from topomerge.io.maps import save_map

@@ -1,0 +1,97 @@
+"""One case of the extraction's benchmark: the map is made and judged."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from benchmarks.extraction.agree import keep
+from benchmarks.extraction.scans import Case, Scan, load
+
+Row = dict[str, Any]
+NAN = float("nan")
+NOTHING: Row = {
+    "iou": 0.0, "mcc": 0.0, "precision": NAN, "recall": 0.0, "door_precision": NAN, "door_recall": 0.0, "edge_precision": NAN,
+    "edge_recall": 0.0, "storeys": 0.0,
+}  # fmt: skip
+
+
+def measure(case: Case, preset: str, key: str, scans: Path, data: Path | None, out: Path, picture: bool) -> Row:
+    """Run a case in this process."""
+    from topomerge.datasets.pairs.example import one_thread
+
+    row: Row = {"key": key, "preset": preset, "picture": picture, "error": ""}
+    with one_thread():
+        warm(preset)
+        try:
+            scan = load(case, scans, data)
+        except Exception as error:
+            return {**row, "key": "", "missing": f"{type(error).__name__}: {error}"}
+        row["points"] = len(scan.cloud)
+        return _rounded({**row, **_measured(scan, preset, case, out, picture, key)})
+
+
+@cache
+def warm(preset: str) -> None:
+    """Load what is compiled, so that the first map's seconds are like the others'."""
+    from topomerge.errors import InputError
+    from topomerge.extraction.extract import extract
+
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0, 4, 0.05), np.arange(0, 4, 0.05)))
+    box = [np.column_stack([x, y, np.full(len(x), z)]) for z in (0.0, 2.5)]
+    box += [np.column_stack([np.full(len(x), z), x, 2.5 / 4 * y]) for z in (0.0, 4.0)]
+    with suppress(InputError):
+        extract(np.concatenate([*box, *(b[:, [1, 0, 2]] for b in box[2:])]), preset=preset)
+
+
+def _measured(scan: Scan, preset: str, case: Case, out: Path, picture: bool, key: str) -> Row:
+    from topomerge.extraction.extract import extract
+
+    began = process_time()
+    try:
+        found = extract(scan.cloud, preset=preset, voxel_size=case.voxel)
+    except Exception as error:  # a map that fails altogether counts as nothing found
+        row = {"error": f"{type(error).__name__}: {error}", "seconds": process_time() - began}
+        return row if scan.truth is None else {**NOTHING, **row}
+    row = {"seconds": process_time() - began, "found": int((~found.rooms["glimpsed"]).sum()), "doors_found": len(found.edges)}
+    row |= {"levels_found": len(found.storeys)}
+    path = out / "pictures" / f"{case.name}-{preset}.png"
+    if scan.truth is None:
+        if picture:
+            from topomerge.viz.figures import save_figure
+
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_figure(found, path)
+        return row
+    return {**row, **_judged(scan, found, f"{case.name}  {preset}", path if picture else None, out / "said" / f"{key}.npz")}
+
+
+def _judged(scan: Scan, found: Any, name: str, picture: Path | None, said_to: Path) -> Row:
+    from topomerge.datasets.simulation.floor_truth import judge, said
+
+    assert scan.truth is not None
+    columns = said(found, scan.truth)
+    keep(said_to, columns, scan.truth)
+    verdict = judge(found, scan.truth, columns)
+    rooms, doors, edges = verdict.rooms, verdict.doors, verdict.edges
+    row: Row = {"iou": rooms.iou, "mcc": rooms.mcc, "precision": rooms.precision, "recall": rooms.recall}
+    row |= {"door_precision": doors.precision, "door_recall": doors.recall}
+    row |= {"edge_precision": edges.precision, "edge_recall": edges.recall, "storeys": float(verdict.storeys)}
+    row |= {"rooms": verdict.true_rooms, "doors": doors.true, "levels": verdict.true_storeys}
+    order = [i for i in np.argsort(rooms.each, kind="stable") if scan.truth.visited[i]][:4]
+    row["worst"] = {scan.rooms[i].name or str(i): round(float(rooms.each[i]), 2) for i in order}
+    if picture:
+        from benchmarks.extraction.picture import save
+
+        title = f"{name}: IoU {rooms.iou:.2f}, MCC {rooms.mcc:.2f}, doors {doors.precision:.2f}/{doors.recall:.2f}"
+        save(scan, found, columns, verdict, f"{title}, rooms {verdict.found_rooms}/{verdict.true_rooms}", picture)
+    return row
+
+
+def _rounded(row: Row) -> Row:
+    return {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}

@@ -1,0 +1,106 @@
+"""What a descriptor of rooms saves a merge: `python -m benchmarks.merging.hypotheses cache/evaluation/heldout.jsonl --limit 24`.
+
+Rooms that look alike propose poses, which cost time to verify. For each descriptor: seconds to describe both maps, the poses
+that are proposed, how many would be verified, most promising first, until one is right (1 m, 10 degrees: the refinement does
+the rest), for how many pairs one is among the first 10 and 60, and what comes out of matching and merging. Pairs are of
+`datasets.build` with data.maps=true, of known scale, with rooms in common. Seconds are of the processor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from topomerge.datasets.pairs.evaluation_pair import KeptPair, load_set
+
+from topomerge.embedding.embedders import embedder
+from topomerge.evaluation.score import FLAT, pose_error, within
+from topomerge.fusion.merge import merge
+from topomerge.matching.consistency import CANDIDATES, candidate_poses, distinct, votes
+from topomerge.matching.costs import best_partners, descriptor_costs, similarities
+from topomerge.matching.match import match
+from topomerge.matching.topdown import TopDown, top_down
+from topomerge.types import Array, Sim3, TopometricMap
+
+NEAR, RIGHT = (1.0, 10.0), (0.5, 5.0)  # m, degrees
+PARTNERS = (1, 2, 3, CANDIDATES)  # of a room
+MOST = 1000  # poses that are looked through
+
+
+def right(pose: Sim3, kept: KeptPair, limits: tuple[float, float]) -> bool:
+    """Is a pose near the true one, in the middle of what both maps saw?"""
+    assert kept.transform is not None
+    flat = any(sensor in FLAT for sensor in kept.about["sensors"])
+    return within(pose_error(pose, kept.transform, kept.anchor), flat, limits)
+
+
+def proposed(
+    a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], cost: Array, partners: int, kept: KeptPair
+) -> tuple[int, float]:
+    """Number of poses, and the place of the first right one in the order of how many rooms speak for each; inf without one."""
+    pairs = best_partners(cost, partners)
+    weight = similarities(cost)[tuple(pairs.T)] + 1e-3
+    poses = candidate_poses(a, b, plans, pairs, weight, False)
+    order = distinct(poses, votes(poses), MOST) if len(poses.yaw) else []
+    for place, h in enumerate(order, 1):
+        if right(Sim3(float(poses.yaw[h]), tuple(poses.shift[h].tolist())), kept, NEAR):  # type: ignore[arg-type]
+            return len(poses.yaw), float(place)
+    return len(poses.yaw), np.inf
+
+
+def measured(kept: KeptPair, name: str, merged: bool) -> dict[str, Any]:
+    """A row of a pair and a descriptor."""
+    (a, b), describe = kept.maps(), embedder(name)
+    began = time.process_time()
+    rows = describe(a), describe(b)
+    out: dict[str, Any] = {"embed": time.process_time() - began}
+    known = {id(a): rows[0], id(b): rows[1]}
+    plans, cost = (top_down(a), top_down(b)), descriptor_costs(*rows)
+    out["proposed"] = {n: proposed(a, b, plans, cost, n, kept) for n in PARTNERS}
+    found = match(a, b, lambda m: known[id(m)]).alternatives
+    out["matched"] = bool(found) and right(found[0].transform, kept, RIGHT)
+    if merged:
+        began = time.process_time()
+        result = merge([a, b], embedder=name)
+        best = result.registration.transform if result.registration else None
+        good = best is not None and right(best, kept, RIGHT)
+        out |= {"merge": time.process_time() - began, "best": good, "said": result.merged}
+    return out
+
+
+def main() -> None:
+    """Print a line a pair, and a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("manifest", type=Path)
+    parser.add_argument("--limit", type=int, default=24)
+    parser.add_argument("--merges", type=int, default=8, help="pairs that are merged, too")
+    parser.add_argument("--descriptors", nargs="+", default=["engineered", "learned"])
+    args = parser.parse_args()
+    pairs = [k for k in load_set(args.manifest) if k.transform and len(k.matches) and not k.about["scale_free"]][: args.limit]
+    embedder("engineered")(pairs[0].maps()[0])  # compiles
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in args.descriptors}
+    for number, kept in enumerate(pairs):
+        for name in args.descriptors:
+            rows[name].append(measured(kept, name, number < args.merges))
+            print(kept.name[:8], name, rows[name][-1], flush=True)
+    heads = "pairs | s to describe | partners a room | poses | until right: median / 90 % | right in 10 | in 60 | matching right"
+    print(f"| descriptor | {heads} |\n|{'---|' * 9}")
+    for name, some in rows.items():
+        took, good = np.median([r["embed"] for r in some]), np.mean([r["matched"] for r in some])
+        for n in PARTNERS:
+            poses, place = np.array([r["proposed"][n] for r in some]).T
+            most = " / ".join(f"{np.sort(place)[int(q * (len(place) - 1))]:.0f}" for q in (0.5, 0.9))
+            cells = [f"{np.median(poses):.0f}", most, *(f"{np.mean(place <= k):.2f}" for k in (10, 60))]
+            matched = f"{good:.2f}" if n == CANDIDATES else "–"
+            print(f"| {name} | {len(some)} | {took:.3f} | {n} | {' | '.join(cells)} | {matched} |")
+    for name, some in rows.items():
+        done = [r for r in some if "merge" in r]
+        words = [f"{sum(r[k] for r in done)} {text}" for k, text in (("best", "best pose right"), ("said", "believed"))]
+        print(f"{name}: {len(done)} merges, {', '.join(words)}, {sum(r['merge'] for r in done):.1f} s in all")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""Registration of whole maps beside KISS-Matcher and Open3D: what is merged right and wrong, and how fast.
+
+``python -m benchmarks.merging.register [split] [limit] [methods]``: cached simulated pairs (``merge_pairs.py``; split
+``train`` for
+development, ``test`` for final runs only; ``test_drawings`` for maps and their floor plans), or ``real`` for the real pairs of
+TOPOMERGE_DATA. Methods: ours, kiss02, kiss03, fpfh, fgr (comma-separated; default all). Resumable: a line of JSON a pair and
+method in ``cache/merge/results_<split>.jsonl``; the first `limit` pairs are run (0: none, only the table). Peers get the means
+of the points of 0.1 m cells and a voxel size; `peers.py` compares them with more care.
+
+Right: within 0.5 m and 5 degrees (fine: 0.1 m, 1 degree) in the middle of what both maps saw; of slices, horizontally. Seconds
+are of the processor, so that other jobs on the machine do not count.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from topomerge.datasets.pairs.pairs import Pair
+from topomerge.datasets.real.sources import iter_real_pairs
+
+from benchmarks.merging.pairs import GridPair, common_area, free_of, grid_of, load
+from benchmarks.training.calibrate_merge import error, kind_of, right
+from topomerge.fusion.registration import register
+from topomerge.fusion.storey_plan import cell_middles
+from topomerge.types import Array, Sim3, VoxelGrid
+
+SCALELESS = ("halmstad",)  # no metres per pixel are known
+Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, how much
+
+
+def ours(pair: GridPair) -> Answer:
+    """`register` with cells only, as maps have them; the scale is free where that of the source is unknown."""
+    a, b = (VoxelGrid(g.cells, g.origin, g.edge, g.shape) for g in (pair.a, pair.b))
+    scaled = pair.about["source"] in SCALELESS or pair.about.get("scaled")
+    found = register(a, b, free=pair.free, scale="free" if scaled else "fixed")
+    return found.transform, found.accepted, found.probability
+
+
+def kiss(voxel: float) -> Callable[[GridPair], Answer]:
+    """KISS-Matcher; it believes its answer if it says `valid`."""
+
+    def run(pair: GridPair) -> Answer:
+        import kiss_matcher
+
+        config = kiss_matcher.KISSMatcherConfig(voxel)
+        matcher = kiss_matcher.KISSMatcher(config)
+        found = matcher.estimate(cell_middles(pair.b), cell_middles(pair.a))
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = np.array(found.rotation), np.array(found.translation).ravel()
+        return upright(matrix, pair), bool(found.valid), float(found.valid)
+
+    return run
+
+
+def open3d_features(pair: GridPair, voxel: float) -> tuple[Any, Any, Any, Any]:
+    """Downsampled clouds of b and a, and their FPFH features, as Open3D's tutorial makes them."""
+    import open3d as o3d
+
+    out = []
+    for grid in (pair.b, pair.a):
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cell_middles(grid))).voxel_down_sample(voxel)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=2 * voxel, max_nn=30))
+        search = o3d.geometry.KDTreeSearchParamHybrid(radius=5 * voxel, max_nn=100)
+        out.append((cloud, o3d.pipelines.registration.compute_fpfh_feature(cloud, search)))
+    return out[0][0], out[1][0], out[0][1], out[1][1]
+
+
+def fpfh(pair: GridPair, voxel: float = 0.3) -> Answer:
+    """Open3D: FPFH and RANSAC. It has no verdict: an answer counts as believed."""
+    import open3d as o3d
+
+    reg = o3d.pipelines.registration
+    b, a, fb, fa = open3d_features(pair, voxel)
+    checks = [reg.CorrespondenceCheckerBasedOnEdgeLength(0.9), reg.CorrespondenceCheckerBasedOnDistance(1.5 * voxel)]
+    estimate = reg.TransformationEstimationPointToPoint(False)
+    criteria = reg.RANSACConvergenceCriteria(100_000, 0.999)
+    found = reg.registration_ransac_based_on_feature_matching(b, a, fb, fa, True, 1.5 * voxel, estimate, 3, checks, criteria)
+    return upright(found.transformation, pair), True, float(found.fitness)
+
+
+def fgr(pair: GridPair, voxel: float = 0.3) -> Answer:
+    """Open3D: fast global registration."""
+    import open3d as o3d
+
+    reg = o3d.pipelines.registration
+    b, a, fb, fa = open3d_features(pair, voxel)
+    option = reg.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * voxel)
+    found = reg.registration_fgr_based_on_feature_matching(b, a, fb, fa, option)
+    return upright(found.transformation, pair), True, float(found.fitness)
+
+
+METHODS: dict[str, Callable[[GridPair], Answer]] = {
+    "ours": ours, "kiss02": kiss(0.2), "kiss03": kiss(0.3), "fpfh": fpfh, "fgr": fgr,
+}  # fmt: skip
+
+
+def upright(matrix: Array, pair: GridPair) -> Sim3 | None:
+    """The pose as one under gravity that keeps the place where errors are measured; None where the map was turned over."""
+    if not np.isfinite(matrix).all() or matrix[2, 2] < 0.9:
+        return None
+    yaw = float(np.arctan2(matrix[1, 0], matrix[0, 0]))
+    placed = matrix[:3, :3] @ pair.anchor + matrix[:3, 3] - Sim3(yaw).apply(pair.anchor[None])[0]
+    x, y, z = placed.tolist()
+    return Sim3(yaw, (x, y, z))
+
+
+def real_pairs() -> Iterator[GridPair]:
+    """The real pairs, at 0.1 m."""
+    for name, pair in iter_real_pairs(os.environ["TOPOMERGE_DATA"]):
+        if isinstance(pair, Pair):
+            a, b = grid_of(pair.a), grid_of(pair.b)
+            free = tuple(free_of(c, g) if c.poses is not None else c.free for c, g in ((pair.a, a), (pair.b, b)))
+            about = {"sensors": list(pair.sensors), "kind": pair.kind, "building": pair.building, "source": pair.source}
+            about["overlap"] = pair.overlap
+            common = common_area(pair, a, b, (free[0], free[1]))
+            yield GridPair(name, a, b, (free[0], free[1]), pair.truth, common, about)
+
+
+def simulated_pairs(split: str, limit: int, skip: set[str]) -> Iterator[GridPair]:
+    """The first cached pairs of a split, but for those named."""
+    for path in sorted((Path("cache/merge") / split).glob("*_overlap.npz" if split.endswith("_drawings") else "*.npz"))[:limit]:
+        if path.stem not in skip:
+            yield load(path, mean=True)
+
+
+def run(split: str, limit: int, methods: list[str], target: Path) -> None:
+    """Run what is missing."""
+    done = {(r["name"], r["method"]) for r in map(json.loads, target.read_text().splitlines())} if target.exists() else set()
+    whole = {name for name, _ in done if all((name, m) in done for m in methods)}
+    for pair in real_pairs() if split == "real" else simulated_pairs(split, limit, whole):
+        for method in methods:
+            if (pair.name, method) in done:
+                continue
+            began = time.process_time()
+            try:
+                pose, believed, how = METHODS[method](pair)
+            except Exception as failure:  # a peer that fails has not merged
+                print(f"{pair.name} {method}: {failure}", flush=True)
+                pose, believed, how = None, False, 0.0
+            about = {k: pair.about.get(k) for k in ("sensors", "kind", "building", "source", "overlap", "differs", "scaled")}
+            row = {"name": pair.name, "method": method, "common": pair.common, **about, "seconds": time.process_time() - began}
+            row |= {"believed": believed, "probability": how, "err": None if pose is None else error(pose, pair)}
+            row["scale"] = None if pose is None or pair.truth is None else pose.scale / pair.truth.scale
+            row["answered"] = pose is not None
+            with target.open("a") as out:
+                out.write(json.dumps(row) + "\n")
+
+
+def table(rows: list[dict[str, Any]], key: Callable[[dict[str, Any]], str]) -> None:
+    """One line a method and group: pairs, right and fine among all, believed and right, believed and wrong, median seconds."""
+    for group in sorted({key(r) for r in rows}):
+        for method in METHODS:
+            mine = [r for r in rows if key(r) == group and r["method"] == method]
+            if mine:
+                good = np.array([right(r["err"], r["sensors"]) for r in mine])
+                fine = np.array([right(r["err"], r["sensors"], (0.1, 1.0)) for r in mine])
+                believed = np.array([r["believed"] and r["answered"] for r in mine])
+                seconds = np.median([r["seconds"] for r in mine])
+                print(
+                    f"{group:24s} {method:10s} pairs {len(mine):3d}  right {good.sum():3d}  fine {fine.sum():3d}  believed right "
+                    f"{(good & believed).sum():3d}  believed wrong {(believed & ~good).sum():3d}  cpu s {seconds:.2f}"
+                )
+
+
+def main(split: str = "train", limit: str = "40", methods: str = ",".join(METHODS)) -> None:
+    """Run and print."""
+    target = Path("cache/merge") / f"results_{split}.jsonl"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    run(split, int(limit), methods.split(","), target)
+    rows = [json.loads(line) for line in target.read_text().splitlines()]
+    table(rows, lambda r: f"{r['source']}" if split == "real" else kind_of(r))
+    table([r for r in rows if r["common"] >= 40], lambda r: "-".join(sorted(r["sensors"])))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

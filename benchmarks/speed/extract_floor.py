@@ -1,0 +1,74 @@
+"""The whole of `extract`, default preset: seconds a step on a floor of 1,500 m2 and 6 M points, memory, and growth with floors.
+
+The peer of `extract_floor` is the thesis preset on the same points. `beside_n` compares n floors beside each other with n times
+the seconds of one, `above_n` the same one above the other: a ratio of 1 is linear growth, above 1 is better. Run from the root:
+``python -m benchmarks.speed.extract_floor [most floors]``. Each measurement is a process of its own, after one that compiles.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+from time import perf_counter
+
+import numpy as np
+
+from benchmarks.speed.bench import line
+from benchmarks.speed.floors import HEIGHT, WIDTH, storey
+
+SLAB = 0.4  # m
+
+
+def measure(floors: int, preset: str, points: int, place: str) -> dict[str, object]:
+    """Extract `floors` storeys in this process: seconds in all and a step, peak memory (MB), rooms, storeys."""
+    from topomerge.extraction.extract import extract
+    from topomerge.types import PointCloud
+
+    extract(storey(60_000), preset=preset)  # loads what was compiled
+    cloud = storey(points)
+    step = np.array([0, 0, HEIGHT + SLAB] if place == "above" else [WIDTH + 1, 0, 0], np.float32)
+    chunks = (PointCloud(cloud + i * step) for i in range(floors))
+    began = perf_counter()
+    result = extract(chunks, preset=preset)
+    seconds = perf_counter() - began
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {
+        "seconds": seconds,
+        "steps": dict(result.seconds),
+        "peak_mb": peak,
+        "rooms": len(result.rooms),
+        "storeys": len(result.storeys),
+        "cells": len(result.grid),
+    }
+
+
+def in_a_process(floors: int, preset: str = "default", points: int = 6_000_000, place: str = "beside") -> dict[str, object]:
+    command = [sys.executable, "-m", "benchmarks.speed.extract_floor", "--measure", str(floors), preset, str(points), place]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
+
+
+def main(most: int = 16) -> None:
+    in_a_process(1, points=100_000)
+    one = min((in_a_process(1) for _ in range(3)), key=lambda m: m["seconds"])
+    thesis = in_a_process(1, "thesis")
+    line("extract_floor", one["seconds"], thesis["seconds"])
+    for step, seconds in one["steps"].items():
+        print(f"#   {step}: {seconds:.2f} s")
+    print(f"# {one['cells']} cells, {one['rooms']} rooms, peak {one['peak_mb']:.0f} MB; thesis: {thesis['rooms']} rooms")
+    small = min((in_a_process(1, points=2_000_000) for _ in range(3)), key=lambda m: m["seconds"])
+    for place in ("beside", "above"):
+        floors = 2
+        while floors <= most:
+            many = in_a_process(floors, points=2_000_000, place=place)
+            line(f"{place}_{floors}", many["seconds"], floors * small["seconds"])
+            print(f"# {many['cells']} cells, {many['rooms']} rooms, {many['storeys']} storeys, peak {many['peak_mb']:.0f} MB")
+            floors *= 2
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--measure"]:
+        print(json.dumps(measure(int(sys.argv[2]), sys.argv[3], int(sys.argv[4]), sys.argv[5])))
+    else:
+        main(*(int(a) for a in sys.argv[1:2]))

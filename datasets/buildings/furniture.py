@@ -1,0 +1,264 @@
+"""Furniture: what it is made of, and which rooms hold what."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from topomerge.datasets.core.solids import rotation
+
+from topomerge.types import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Item:
+    """A thing at its place: boxes (n, 6) about `at` on the floor, turned by `yaw`; `size` of the box around them."""
+
+    kind: str
+    parts: Array
+    at: Array  # (2,) middle of its footprint
+    yaw: float
+    size: tuple[float, float, float]
+    movable: bool = True
+    label: str = "furniture"
+
+    @property
+    def outline(self) -> shapely.Polygon:
+        """Its footprint."""
+        return shapely.Polygon(footprints(self.at[None], np.array([self.yaw]), self.size)[0])
+
+
+def _table(w: float, d: float, h: float = 0.74) -> list[list[float]]:
+    legs = [[x * (w / 2 - 0.05), y * (d / 2 - 0.05), h / 2, 0.05, 0.05, h] for x in (-1, 1) for y in (-1, 1)]
+    return [[0, 0, h - 0.015, w, d, 0.03], *legs]
+
+
+def _pile(w: float, d: float, h: float, g: np.random.Generator, most: int = 4) -> list[list[float]]:
+    """What lies about on a top: papers, boxes, bags."""
+    number = int(g.integers(most + 1))
+    sizes = g.uniform([0.1, 0.1, 0.03], [0.35, 0.3, 0.35], (number, 3))
+    sizes[:, 2] *= g.uniform(0.2, 1.0, number)
+    at = g.uniform(-0.5, 0.5, (number, 2)) * np.maximum([w - 0.35, d - 0.3], 0.0)
+    return [[x, y, h + s[2] / 2, *s] for (x, y), s in zip(at.tolist(), sizes.tolist(), strict=True)]
+
+
+def _chair(x: float = 0.0, y: float = 0.0, back: float = -1.0) -> list[list[float]]:
+    return [
+        [x, y, 0.44, 0.45, 0.45, 0.06],
+        [x, y + back * 0.21, 0.7, 0.42, 0.04, 0.45],
+        *_around(x, y, 0.18, 0.18, 0.21, 0.04, 0.42),
+    ]
+
+
+def _around(x: float, y: float, dx: float, dy: float, z: float, side: float, h: float) -> list[list[float]]:
+    return [[x + i * dx, y + j * dy, z, side, side, h] for i in (-1, 1) for j in (-1, 1)]
+
+
+def _shelf(w: float, d: float, h: float, g: np.random.Generator) -> list[list[float]]:
+    boards = [[0, 0, z, w, d, 0.03] for z in np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))]
+    levels = np.linspace(0.05, h - 0.02, max(2, round(h / 0.4)))[:-1]
+    full = g.uniform(0, 0.95, len(levels)) * w  # rows of books begin at the left
+    books = [[f / 2 - w / 2, 0.03, z + 0.14, f, d * 0.6, 0.25] for z, f in zip(levels, full, strict=True) if f > 0.1]
+    return [
+        [0, d / 2 - 0.01, h / 2, w, 0.02, h],
+        [-w / 2, 0, h / 2, 0.03, d, h],
+        [w / 2, 0, h / 2, 0.03, d, h],
+        *boards,
+        *books,
+    ]
+
+
+def _bed(w: float, d: float = 2.05) -> list[list[float]]:
+    return [[0, 0, 0.3, w, d, 0.3], [0, d / 2 - 0.03, 0.5, w, 0.06, 1.0], [0, d / 2 - 0.35, 0.5, w * 0.8, 0.4, 0.12]]
+
+
+def _sofa(w: float, d: float = 0.9) -> list[list[float]]:
+    arms = [[s * (w / 2 - 0.09), 0, 0.3, 0.18, d, 0.6] for s in (-1, 1)]
+    return [[0, 0, 0.21, w, d, 0.42], [0, d / 2 - 0.1, 0.55, w, 0.2, 0.6], *arms]
+
+
+def _desk(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
+    """Desk with screen, chair and what lies on it; the chair's side is y < 0, anywhere between pushed in and pulled out."""
+    y = 0.35
+    shift = [[b[0], b[1] + y, *b[2:]] for b in [*_table(w, d), *_pile(w, d, 0.74, g)]]
+    x, out = float(g.normal(0, 0.12)), float(g.uniform(-0.1, 0.35))
+    return [
+        *shift,
+        [0, y + 0.2, 1.0, 0.55, 0.04, 0.33],
+        [0, y + 0.2, 0.8, 0.2, 0.15, 0.12],
+        *_chair(x, y - d / 2 - out),
+    ]
+
+
+def _dining(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
+    """Table with chairs on both sides; one in eight is missing."""
+    xs = np.arange(int(w / 0.65)) * 0.65
+    xs = xs - xs.mean()
+    seats = [(float(x + g.normal(0, 0.05)), s, float(g.uniform(0.0, 0.3))) for x in xs for s in (-1.0, 1.0) if g.random() < 0.88]
+    return [*_table(w, d), *_pile(w, d, 0.74, g), *(b for x, s, out in seats for b in _chair(x, s * (d / 2 + out), s))]
+
+
+def _counter(w: float, g: np.random.Generator, d: float = 0.6) -> list[list[float]]:
+    """Kitchen run with cupboards above and a tall fridge."""
+    cupboard = [w * 0.1, d / 2 - 0.17, 1.75, w * 0.75, 0.34, 0.65]
+    return [[0, 0, 0.45, w, d, 0.9], *_pile(w, d, 0.9, g), cupboard, [-w / 2 + 0.3, 0, 0.95, 0.6, d, 1.9]]
+
+
+def _toilet() -> list[list[float]]:
+    return [[0, -0.05, 0.2, 0.37, 0.5, 0.4], [0, 0.22, 0.6, 0.4, 0.18, 0.4]]
+
+
+def _bench(w: float, d: float, g: np.random.Generator) -> list[list[float]]:
+    """Laboratory island: drawers, a worktop and a rack of shelves along its middle."""
+    return [
+        [0, 0, 0.42, w * 0.95, d * 0.8, 0.84],
+        [0, 0, 0.89, w, d, 0.06],
+        [0, 0, 1.35, w * 0.9, 0.3, 0.03],
+        [0, 0, 1.2, 0.05, 0.3, 0.6],
+        *_pile(w, d, 0.92, g, 8),
+    ]
+
+
+def _seat(w: float, g: np.random.Generator) -> list[list[float]]:
+    """School desk for two with two chairs."""
+    back = [b for x in (-w / 4, w / 4) for b in _chair(x, -float(g.uniform(0.3, 0.6)))]
+    return [*_table(w, 0.5, 0.72), *back]
+
+
+Make = Callable[[np.random.Generator], list[list[float]]]
+ITEMS: dict[str, Make] = {
+    "desk": lambda g: _desk(g.choice([1.2, 1.4, 1.6]), 0.8, g),
+    "shelf": lambda g: _shelf(g.choice([0.8, 1.0, 1.6]), 0.35, g.choice([1.2, 1.9, 2.1]), g),
+    "cabinet": lambda g: [[0, 0, (h := g.uniform(0.8, 1.5)) / 2, g.choice([0.8, 1.2]), 0.45, h]],
+    "wardrobe": lambda g: [[0, 0, 1.05, g.choice([1.0, 1.5, 2.0]), 0.6, 2.1]],
+    "bed": lambda g: _bed(g.choice([0.9, 1.4, 1.6])),
+    "hospitalbed": lambda g: _bed(0.95, 2.15),
+    "nightstand": lambda g: [[0, 0, 0.27, 0.45, 0.4, 0.54]],
+    "sofa": lambda g: _sofa(g.choice([1.5, 1.9, 2.3])),
+    "lowtable": lambda g: _table(1.0, 0.6, 0.4),
+    "armchair": lambda g: _sofa(0.9, 0.85),
+    "dining": lambda g: _dining(g.choice([1.4, 1.8]), 0.85, g),
+    "meeting": lambda g: _dining(g.choice([2.4, 3.2]), 1.1, g),
+    "kitchen": lambda g: _counter(g.choice([1.8, 2.4, 3.0]), g),
+    "tv": lambda g: [[0, 0, 0.25, 1.5, 0.4, 0.5], [0, 0.05, 0.85, 1.1, 0.06, 0.65]],
+    "toilet": lambda g: _toilet(),
+    "sink": lambda g: [[0, 0, 0.8, 0.55, 0.45, 0.16], [0, 0.1, 0.36, 0.18, 0.2, 0.72], [0, 0.21, 1.5, 0.5, 0.03, 0.7]],
+    "shower": lambda g: [[0, 0, 0.04, 0.9, 0.9, 0.08], [0, 0.42, 1.1, 0.05, 0.05, 2.0]],
+    "bath": lambda g: [[0, 0, 0.28, 1.7, 0.75, 0.56]],
+    "bench": lambda g: _bench(g.choice([1.8, 2.4, 3.0]), g.choice([0.8, 1.4]), g),
+    "hood": lambda g: [[0, 0, 0.45, 1.5, 0.8, 0.9], [0, 0.3, 1.6, 1.5, 0.2, 1.4], [0, 0, 2.25, 1.5, 0.8, 0.3]],
+    "seat": lambda g: _seat(1.3, g),
+    "board": lambda g: [[0, 0, 1.5, g.choice([1.8, 2.4, 3.6]), 0.05, 1.2]],
+    "locker": lambda g: [[0, 0, 0.9, g.choice([0.9, 1.8, 2.7]), 0.4, 1.8]],
+    "printer": lambda g: [[0, 0, 0.55, 0.65, 0.6, 1.1]],
+    "sidebench": lambda g: [
+        [0, 0, 0.43, 1.5, 0.4, 0.05],
+        [-0.6, 0, 0.2, 0.05, 0.35, 0.4],
+        [0.6, 0, 0.2, 0.05, 0.35, 0.4],
+    ],
+    "plant": lambda g: [
+        [0, 0, 0.2, 0.35, 0.35, 0.4],
+        [0, 0, 0.9, 0.5, 0.5, (h := g.uniform(0.6, 1.2))],
+        [0, 0, 0.7, 0.06, 0.06, h],
+    ],
+    "rack": lambda g: _shelf(1.2, 0.6, 2.1, g),
+    "trolley": lambda g: [[0, 0, 0.5, 0.8, 0.5, 0.9]],
+    "radiator": lambda g: [[0, 0, 0.45, g.choice([0.8, 1.2]), 0.1, 0.6]],
+    "partition": lambda g: [[0, 0, 0.75, 1.6, 0.05, 1.5]],
+    "counterdesk": lambda g: [[0, 0, 0.55, 2.2, 0.7, 1.1], [0, 0.6, 0.72, 2.0, 0.5, 0.04]],
+    "clutter": lambda g: [[0, 0, (h := g.uniform(0.12, 0.6)) / 2, g.uniform(0.15, 0.5), g.uniform(0.15, 0.5), h]],
+    "person": lambda g: [[0, 0, 0.42, 0.32, 0.24, 0.84], [0, 0, 1.15, 0.44, 0.26, 0.66], [0, 0, 1.6, 0.2, 0.22, 0.26]],
+}
+FIXED = {"kitchen", "toilet", "sink", "shower", "bath", "bench", "hood", "board", "radiator", "counterdesk"}
+# kind of room -> (item, where, number, m2 for each further one: 0 none). "rows" fill the room's middle.
+WALL, MIDDLE, ROWS = "wall", "middle", "rows"
+ROOMS: dict[str, list[tuple[str, str, int, float]]] = {
+    "office": [
+        ("desk", WALL, 1, 9),
+        ("shelf", WALL, 1, 14),
+        ("cabinet", WALL, 1, 16),
+        ("radiator", WALL, 1, 0),
+        ("plant", WALL, 0, 25),
+    ],
+    "openplan": [("desk", ROWS, 4, 7), ("cabinet", WALL, 2, 25), ("partition", MIDDLE, 1, 40), ("plant", WALL, 1, 40)],
+    "meeting": [("meeting", MIDDLE, 1, 60), ("board", WALL, 1, 0), ("cabinet", WALL, 0, 30)],
+    "corridor": [
+        ("cabinet", WALL, 0, 40),
+        ("plant", WALL, 0, 60),
+        ("sidebench", WALL, 0, 60),
+        ("printer", WALL, 0, 70),
+    ],
+    "lobby": [
+        ("counterdesk", MIDDLE, 1, 0),
+        ("sofa", WALL, 1, 40),
+        ("lowtable", MIDDLE, 1, 60),
+        ("plant", WALL, 1, 30),
+    ],
+    "atrium": [("sofa", MIDDLE, 1, 60), ("lowtable", MIDDLE, 1, 60), ("plant", WALL, 2, 40), ("dining", MIDDLE, 0, 60)],
+    "lounge": [("sofa", MIDDLE, 1, 30), ("lowtable", MIDDLE, 1, 40), ("plant", WALL, 1, 30), ("shelf", WALL, 0, 30)],
+    "kitchen": [("kitchen", WALL, 1, 0), ("dining", MIDDLE, 1, 0), ("cabinet", WALL, 0, 15)],
+    "living": [
+        ("sofa", WALL, 1, 25),
+        ("lowtable", MIDDLE, 1, 0),
+        ("tv", WALL, 1, 0),
+        ("shelf", WALL, 1, 12),
+        ("dining", MIDDLE, 0, 22),
+        ("armchair", MIDDLE, 0, 15),
+        ("plant", WALL, 1, 0),
+    ],
+    "bedroom": [("bed", WALL, 1, 0), ("wardrobe", WALL, 1, 18), ("nightstand", WALL, 1, 0), ("desk", WALL, 0, 14)],
+    "hotel": [
+        ("bed", WALL, 1, 0),
+        ("wardrobe", WALL, 1, 0),
+        ("nightstand", WALL, 1, 0),
+        ("tv", WALL, 1, 0),
+        ("armchair", WALL, 0, 20),
+    ],
+    "ward": [
+        ("hospitalbed", WALL, 1, 11),
+        ("nightstand", WALL, 1, 11),
+        ("wardrobe", WALL, 1, 30),
+        ("trolley", WALL, 0, 20),
+    ],
+    "bath": [("toilet", WALL, 1, 0), ("sink", WALL, 1, 0), ("shower", WALL, 1, 0), ("bath", WALL, 0, 6)],
+    "toilets": [("toilet", WALL, 1, 5), ("sink", WALL, 1, 7)],
+    "classroom": [
+        ("board", WALL, 1, 0),
+        ("seat", ROWS, 6, 4.5),
+        ("desk", MIDDLE, 1, 0),
+        ("shelf", WALL, 1, 40),
+        ("cabinet", WALL, 1, 40),
+    ],
+    "hall": [("sidebench", WALL, 2, 50), ("seat", ROWS, 0, 60), ("cabinet", WALL, 1, 80)],
+    "canteen": [("dining", ROWS, 3, 12), ("counterdesk", WALL, 1, 0)],
+    "lab": [
+        ("bench", ROWS, 1, 16),
+        ("hood", WALL, 1, 30),
+        ("shelf", WALL, 1, 20),
+        ("desk", WALL, 0, 25),
+        ("cabinet", WALL, 1, 25),
+    ],
+    "storage": [("rack", WALL, 2, 5), ("clutter", MIDDLE, 1, 5)],
+    "nurses": [("counterdesk", MIDDLE, 1, 0), ("desk", WALL, 1, 12), ("shelf", WALL, 1, 10), ("trolley", WALL, 1, 12)],
+    "library": [("shelf", ROWS, 4, 6), ("desk", WALL, 1, 25), ("dining", MIDDLE, 0, 40)],
+    "cloakroom": [("locker", WALL, 2, 6), ("sidebench", MIDDLE, 1, 12)],
+}
+
+
+def footprints(at: Array, yaw: Array, size: Sequence[float]) -> Array:
+    """(n, 4, 2) corners of rectangles of one size at (n, 2) places, turned by (n,) radians."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size[:2]) / 2
+    turn = np.moveaxis(rotation(np.asarray(yaw)), 2, 0)
+    return corners @ turn + np.asarray(at)[:, None]
+
+
+def make_item(kind: str, rng: np.random.Generator) -> Item:
+    """An item at the origin, its back towards +y, centred on its footprint."""
+    parts = np.array(ITEMS[kind](rng), float)
+    low, high = (parts[:, :3] - parts[:, 3:] / 2).min(axis=0), (parts[:, :3] + parts[:, 3:] / 2).max(axis=0)
+    parts[:, :2] -= (low + high)[:2] / 2
+    size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
+    label = kind if kind in ("clutter", "person") else "furniture"
+    return Item(kind, parts, np.zeros(2), 0.0, size, kind not in FIXED, label)

@@ -1,0 +1,275 @@
+"""Sibling storeys of real plans made into one building: registered over each other, with stairs where both have a stairwell.
+
+Plans of one survey share a frame (RMF levels, malls); those of the campus plans were each drawn in a frame and scale of their
+own. These are registered: hypotheses from stairwells, lifts and outer walls are compared by how well the walls of the two storeys
+lie over each other, and refined by iterated nearest points (Besl and McKay 1992) over scale and shift. Siblings are drawn the
+same way up: plans are not turned. The scale of the plan whose stairwells are nearer to a usual size holds for both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+from pathlib import Path
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+from topomerge.datasets.buildings.stairwell import add_stairs
+from topomerge.datasets.core.plan import Opening, Plan, Wall
+from topomerge.datasets.plans.floorplans import Refusal, frame_of, iter_plans, landed, siblings
+
+from topomerge.errors import InputError
+from topomerge.types import Array
+
+SAMPLE = 0.25  # m between points along walls
+NEAR = 0.5  # m; walls that lie over each other
+WALLS = 0.55  # least share of the walls, where the storeys overlap, that do
+COMMON = 0.4  # least share of walls where the frame is known to be the same
+COVER = 0.75  # least share of the smaller storey that lies over the larger one
+SCALES = (0.35, 2.9)  # of one plan by the other
+SHAFTS = 7  # largest stairwells and lifts that hypotheses are made of
+STAIRWELL = 18.0  # m2, usual
+ALIKE = 0.8  # IoU of two rooms, above each other, of the same plan
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a storey lies over the one beneath: `scale` and `shift` take its own frame there.
+
+    Args:
+        walls: share of the walls within `NEAR` of a wall of the other storey, where the two overlap.
+        cover: share of the smaller storey's area that lies over the larger one.
+        common: the two plans had the same frame.
+    """
+
+    scale: float
+    shift: tuple[float, float]
+    walls: float
+    cover: float
+    common: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Plans of one building, lowest storey first, in one frame, ready for `erect`.
+
+    Args:
+        fits: of each storey but the lowest one.
+        stairs: number of flights between each two storeys; 0: nothing joins them on foot.
+    """
+
+    names: tuple[str, ...]
+    plans: tuple[Plan, ...]
+    fits: tuple[Fit, ...]
+    stairs: tuple[int, ...]
+
+
+def iter_stacks(folder: str | Path, plans: dict[str, Plan | Refusal] | None = None) -> Iterator[tuple[str, Stack | Refusal]]:
+    """Every two neighbouring sibling storeys of a folder as a stack, or why they are none; names are joined by " + ".
+
+    Args:
+        plans: of `iter_plans`, where they are known already.
+
+    Raises:
+        InputError: no such folder.
+    """
+    known = dict(iter_plans(folder)) if plans is None else plans
+    frames = frame_of(folder)
+    for group in siblings(folder):
+        for names in pairwise(group):
+            found = [known.get(name) for name in names]
+            refused = [n for n, p in zip(names, found, strict=True) if not isinstance(p, Plan)]
+            name = " + ".join(names)
+            try:
+                if refused:
+                    raise InputError(f"a storey is missing or was refused: {', '.join(refused)}")
+                common = frames[names[0]] == frames[names[1]]
+                yield name, stack([p for p in found if isinstance(p, Plan)], names, common)
+            except InputError as error:
+                yield name, Refusal(name, str(error))
+
+
+def stack(plans: Sequence[Plan], names: Sequence[str] = (), common: bool = False) -> Stack:
+    """Put plans over each other, lowest first.
+
+    Args:
+        common: they are in one frame already, which is checked; otherwise they are registered.
+
+    Raises:
+        InputError: fewer than two plans, or two that do not lie over each other.
+    """
+    if len(plans) < 2:
+        raise InputError("a stack needs two storeys or more")
+    names = tuple(names) or tuple(f"storey {k}" for k in range(len(plans)))
+    fits = [register(low, high, common) for low, high in pairwise(plans)]
+    least = COMMON if common else WALLS
+    for fit, name in zip(fits, names[1:], strict=True):
+        if fit.walls < least or fit.cover < COVER:
+            raise InputError(
+                f"storeys do not fit: {fit.walls:.0%} of the walls of {name} lie over walls ({least:.0%} are wanted), "
+                f"{fit.cover:.0%} of its floor over floor ({COVER:.0%})"
+            )
+    placed, scale, shift = [plans[0]], 1.0, np.zeros(2)
+    for plan, fit in zip(plans[1:], fits, strict=True):
+        shift, scale = scale * np.array(fit.shift) + shift, scale * fit.scale
+        placed.append(moved(plan, scale, shift))
+    if not common:
+        unit = _unit(plans, placed)
+        placed = [moved(plan, unit, np.zeros(2)) for plan in placed]
+    built, stairs = add_stairs(landed(placed))
+    return Stack(names, tuple(built), tuple(fits), stairs)
+
+
+def _unit(plans: Sequence[Plan], placed: Sequence[Plan]) -> float:
+    """Factor for all: the scale of the plan whose stairwells (whose storey, if there are none) are nearest to a usual size."""
+    best, factor = np.inf, 1.0
+    for plan, now in zip(plans, placed, strict=True):
+        wells = [_shape(r).area for r in plan.rooms if r.kind == "stairs"]
+        if wells and abs(np.log(np.median(wells) / STAIRWELL)) < best:
+            best = abs(float(np.log(np.median(wells) / STAIRWELL)))
+            factor = float(np.sqrt(_shape(plan.rooms[0]).area / _shape(now.rooms[0]).area))
+    return round(factor, 4)
+
+
+def moved(plan: Plan, scale: float, shift: Array) -> Plan:
+    """A plan scaled, then shifted. Doors keep their width (in a shrinking plan they shrink to 0.7 m), walls their thickness."""
+
+    def place(points: Array) -> Array:
+        return np.round(np.asarray(points, float) * scale + shift, 4)
+
+    def wall(w: Wall) -> Wall:
+        start, end = place(np.array([w.start, w.end])).tolist()
+        return replace(w, start=tuple(start), end=tuple(end))
+
+    def opening(o: Opening) -> Opening:
+        ends = np.array([o.start, o.end], float)
+        width = float(np.hypot(*(ends[1] - ends[0])))
+        wanted = width if o.kind == "window" and scale > 1 else min(width, max(width * scale, 0.7))
+        middle = ends.mean(axis=0) * scale + shift
+        a, b = np.round(middle + (ends - ends.mean(axis=0)) * wanted / width, 4).tolist()
+        return replace(o, start=tuple(a), end=tuple(b), thickness=round(o.thickness * max(scale, 1.0), 3))
+
+    if scale == 1 and not np.any(shift):
+        return plan
+    return replace(
+        plan,
+        rooms=tuple(replace(room, polygon=place(room.polygon)) for room in plan.rooms),
+        walls=tuple(wall(w) for w in plan.walls),
+        openings=tuple(opening(o) for o in plan.openings if o.start != o.end),
+        flights=tuple(replace(f, corner=tuple(place(np.array(f.corner)).tolist())) for f in plan.flights if scale == 1),
+    )
+
+
+def register(low: Plan, high: Plan, common: bool = False) -> Fit:
+    """How the plan `high` lies over the plan `low`: the best of all hypotheses; with a common frame only that one."""
+    target, source = _Storey.of(low), _Storey.of(high)
+    if common:
+        return _fit(target, source, 1.0, np.zeros(2), True)
+    guesses = np.array(list(_hypotheses(target, source)))
+    rough = [_score(target, source, g[0], g[1:], 8) for g in guesses]
+    best = sorted(np.argsort(rough)[::-1][:12].tolist())
+    refined = [_refine(target, source, *guesses[i]) for i in best]
+    scale, x, y = max(refined, key=lambda g: _score(target, source, g[0], np.array(g[1:]), 2))
+    return _fit(target, source, round(scale, 4), np.round([x, y], 3), False)
+
+
+@dataclass(frozen=True, eq=False)
+class _Storey:
+    points: Array  # (n, 2) along the walls
+    tree: cKDTree
+    floor: shapely.Geometry
+    shafts: list[tuple[str, float, Array]]  # kind, area, middle; largest first
+
+    @classmethod
+    def of(cls, plan: Plan) -> _Storey:
+        shapes = [_shape(room) for room in plan.rooms]
+        rings = [s.exterior for s in shapes]
+        points = np.concatenate([shapely.get_coordinates(shapely.segmentize(ring, SAMPLE)) for ring in rings])
+        floor = shapely.union_all([s.buffer(0.4, join_style="mitre") for s in shapes]).simplify(0.2)
+        found = [
+            (r.kind, s.area, shapely.get_coordinates(s.centroid)[0])
+            for r, s in zip(plan.rooms, shapes, strict=True)
+            if r.kind in ("stairs", "lift")
+        ]
+        return cls(points, cKDTree(points), floor, sorted(found, key=lambda shaft: -shaft[1])[:SHAFTS])
+
+
+def _shape(room: object) -> shapely.Polygon:
+    return shapely.Polygon(room.polygon)  # type: ignore[attr-defined]
+
+
+def _hypotheses(target: _Storey, source: _Storey) -> Iterator[tuple[float, float, float]]:
+    """Scale and shift from: nothing, two shafts of each, one shaft and its size, the corners of the boxes around."""
+    yield 1.0, 0.0, 0.0
+    shafts = [(a, b) for a, b in product(target.shafts, source.shafts) if a[0] == b[0]]
+    low, high = (np.array(s.floor.bounds).reshape(2, 2) for s in (target, source))
+    sizes = (low[1] - low[0]) / (high[1] - high[0])
+    for (_, area, at), (_, other, there) in shafts:
+        for scale in (1.0, float(np.sqrt(area / other)), *sizes.tolist()):
+            if SCALES[0] <= scale <= SCALES[1]:
+                yield scale, *(at - scale * there).tolist()
+    for (a, b), (c, d) in product(shafts, shafts):
+        v, w = c[2] - a[2], d[2] - b[2]
+        if a is c or b is d or min(np.hypot(*v), np.hypot(*w)) < 3:
+            continue
+        scale = float(np.hypot(*v) / np.hypot(*w))
+        if SCALES[0] <= scale <= SCALES[1] and v @ w > 0.985 * np.hypot(*v) * np.hypot(*w):
+            yield scale, *((a[2] + c[2]) / 2 - scale * (b[2] + d[2]) / 2).tolist()
+    for scale in (1.0, float(sizes[0]), float(sizes[1]), float(np.sqrt(sizes.prod()))):
+        for i, j in product((0, 1), repeat=2):
+            corner = np.array([low[i, 0], low[j, 1]]) - scale * np.array([high[i, 0], high[j, 1]])
+            yield scale, *corner.tolist()
+
+
+def _refine(target: _Storey, source: _Storey, scale: float, x: float, y: float) -> tuple[float, float, float]:
+    points, shift = source.points[::2], np.array([x, y])
+    for reach in np.geomspace(1.5, NEAR, 12):
+        apart, nearest = target.tree.query(scale * points + shift)
+        p, q = points[apart < reach], target.points[nearest[apart < reach]]
+        if len(p) < 20:
+            break
+        a, b = p - p.mean(axis=0), q - q.mean(axis=0)
+        scale = float(np.clip((a * b).sum() / (a * a).sum(), *SCALES))
+        shift = q.mean(axis=0) - scale * p.mean(axis=0)
+    return scale, float(shift[0]), float(shift[1])
+
+
+def _score(target: _Storey, source: _Storey, scale: float, shift: Array, step: int = 1) -> float:
+    walls, cover = _overlay(target, source, scale, shift, step)
+    return walls * min(cover / COVER, 1.0)
+
+
+def _overlay(target: _Storey, source: _Storey, scale: float, shift: Array, step: int = 1) -> tuple[float, float]:
+    """Shares of walls over walls, and of floor over floor."""
+    near = NEAR * min(scale, 1.0)  # a plan that shrinks has more walls a metre, so that more of them lie near others by chance
+    floor = shapely.transform(source.floor, lambda p: p * scale + shift)
+    common = floor.intersection(target.floor)
+    cover = common.area / min(floor.area, target.floor.area)
+    if cover < 0.3:
+        return 0.0, float(cover)
+    shapely.prepare(common)
+    points = source.points[::step] * scale + shift
+    points = points[shapely.contains_xy(common, points)]
+    others = target.points[::step]
+    others = others[shapely.contains_xy(common, others)]
+    if min(len(points), len(others)) < 10:
+        return 0.0, float(cover)
+    over = target.tree.query(points, distance_upper_bound=near)[0] < near
+    under = source.tree.query((others - shift) / scale, distance_upper_bound=near / scale)[0] < near / scale
+    return float(over.mean() + under.mean()) / 2, float(cover)
+
+
+def _fit(target: _Storey, source: _Storey, scale: float, shift: Array, common: bool) -> Fit:
+    walls, cover = _overlay(target, source, scale, np.asarray(shift))
+    return Fit(float(scale), (float(shift[0]), float(shift[1])), round(walls, 3), round(cover, 3), common)
+
+
+def alike(low: Plan, high: Plan) -> int:
+    """Number of rooms of one storey that lie over a room of the same outline (IoU above `ALIKE`)."""
+    a, b = ([_shape(r) for r in plan.rooms if r.kind != "lift"] for plan in (low, high))
+    i, j = shapely.STRtree(b).query(a, predicate="intersects")
+    one, other = np.array(a)[i], np.array(b)[j]
+    both = shapely.area(shapely.intersection(one, other))
+    return len(np.unique(i[both > ALIKE * (shapely.area(one) + shapely.area(other) - both)]))

@@ -1,0 +1,218 @@
+"""Pairs of extracted maps that are kept for evaluation: two `.tmap` beside the pair's file, and what judges them.
+
+Beside what `example.pair_arrays` gives, the file holds for each room whether another room of the other map looks the same
+(`a.twin`, `b.twin`), a point of b at which errors of a pose are measured (`anchor`) and, for real pairs whose rooms nobody
+labelled, the rooms that lie over each other under the true transform (`laid`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from topomerge.datasets.pairs.pairs import Pair
+
+from topomerge.embedding.graph import ROOM_FEATURES
+from topomerge.errors import InputError
+from topomerge.io import archive
+from topomerge.io.maps import load_map, save_map
+from topomerge.matching.consistency import matches_under, storey_map
+from topomerge.matching.door_poses import Poses
+from topomerge.matching.topdown import top_down
+from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
+
+TWIN_AREA, TWIN_SIDE = 0.05, 0.25  # share, m: rooms that differ by less are near-identical
+GLIMPSED = ROOM_FEATURES.index("glimpsed")
+COLUMN = 0.2  # m, columns by which the area in common is measured
+BELOW = 0.15  # m: what is that far below a floor is the ceiling of the storey below
+STOREY = 1.0  # m between two storeys, at least
+FEW = 50  # columns: maps that share fewer have no middle of what both saw
+LAID = 0.4  # IoU from which rooms that lie over each other are one
+
+
+@dataclass(frozen=True, eq=False)
+class KeptPair:
+    """What is true of a kept pair; `maps` reads the maps.
+
+    Args:
+        name: of the files.
+        matches: (M, 2) extracted rooms of a and of b that are one true room.
+        true: of each map, (R,) true room of each extracted one, -1 none.
+        one: of each map, (R,) is it the one that is assigned to the true room?
+        twin: of each map, (R,) does the other map hold a near-identical room, another than its true partner?
+        glimpsed: of each map, (R,) was it looked into only?
+        transform: T_ab; None where there is none.
+        anchor: (3,) a point of b in the middle of what both maps saw: drift bends maps, and no pose is right everywhere.
+        about: sensors, source, building, overlap, kind, common (m2 that both saw), rooms ("labelled" or "laid"), ...
+    """
+
+    name: str
+    folder: Path
+    matches: Array
+    true: tuple[Array, Array]
+    one: tuple[Array, Array]
+    twin: tuple[Array, Array]
+    glimpsed: tuple[Array, Array]
+    transform: Sim3 | None
+    anchor: Array
+    about: dict[str, Any]
+
+    def maps(self) -> tuple[TopometricMap, TopometricMap]:
+        """The two extracted maps."""
+        a, b = (load_map(self.folder / f"{self.name}{side}.tmap") for side in "ab")
+        return a, b
+
+
+def save_maps(maps: Sequence[TopometricMap], folder: Path, name: str) -> None:
+    """Write both maps under the name of their pair."""
+    for side, found in zip("ab", maps, strict=True):
+        save_map(found, folder / f"{name}{side}.tmap")
+
+
+def load_kept(path: Path) -> KeptPair:
+    """What is true of a kept pair, from its file.
+
+    Raises:
+        InputError: no such file, damaged, or its maps were not kept.
+    """
+    data = archive.read(path, "kept pair")
+    if "anchor" not in data:
+        raise InputError(f"{path}: its maps were not kept; build it with data.maps=true")
+    about = json.loads(data["about"].tobytes())
+    true, one, twin = ((data[f"a.{name}"], data[f"b.{name}"]) for name in ("true_room", "true_one", "twin"))
+    glimpsed = (data["a.x"][:, GLIMPSED] > 0.5, data["b.x"][:, GLIMPSED] > 0.5)
+    laid = about["rooms"] == "laid"
+    matches = data["laid" if laid else "matches"]
+    if laid:  # no labels: the rooms that lie over each other stand for true ones
+        true = _rooms_of_matches(matches, tuple(len(t) for t in true))
+        one = (true[0] >= 0, true[1] >= 0)
+    pose = sim3_of(data["transform"])
+    return KeptPair(path.stem, path.parent, matches, true, one, twin, glimpsed, pose, data["anchor"], about)
+
+
+def load_set(manifest: Path) -> list[KeptPair]:
+    """All pairs of a manifest that `build` wrote.
+
+    Raises:
+        InputError: no such manifest, or a pair's maps were not kept.
+    """
+    if not manifest.is_file():
+        raise InputError(f"{manifest}: no such manifest; make it with python -m topomerge.datasets.pairs.build")
+    rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
+    return [load_kept(manifest.parent / "pairs" / row["file"]) for row in rows]
+
+
+def _rooms_of_matches(matches: Array, sizes: Sequence[int]) -> tuple[Array, Array]:
+    """A number of its own for each match; rooms without one have -1."""
+    out = [np.full(n, -1) for n in sizes]
+    for k, (i, j) in enumerate(matches.tolist()):
+        out[0][i] = out[1][j] = k
+    return out[0], out[1]
+
+
+def sim3_of(matrix: Array) -> Sim3 | None:
+    """The similarity of a (4, 4) matrix; None of nan."""
+    if np.isnan(matrix).any():
+        return None
+    x, y, z = matrix[:3, 3].tolist()
+    return Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), (x, y, z), float(matrix[2, 2]))
+
+
+def told_of_maps(pair: Pair, maps: Sequence[TopometricMap]) -> dict[str, Any]:
+    """What the file of a kept pair tells beside the usual."""
+    return {
+        "source": pair.source,
+        "kind": pair.kind,
+        "sensors": pair.sensors,
+        "common": round(common_area(maps, pair.truth if pair.kind == "overlap" else None), 2),
+        "rooms": "labelled" if pair.a.rooms else "laid",
+        "scale_free": pair.truth is not None and abs(pair.truth.scale - 1) > 0.03,
+    }
+
+
+def kept_arrays(pair: Pair, maps: Sequence[TopometricMap], true: tuple[Array, Array]) -> dict[str, Array]:
+    """The arrays that the file of a kept pair has beside the usual."""
+    arrays = {"anchor": anchor(pair, maps)}
+    rooms = (pair.a.rooms, pair.b.rooms)
+    same = pair.kind == "overlap"
+    for k, side in enumerate("ab"):
+        arrays[f"{side}.twin"] = twins(true[k], true[1 - k], rooms[k], rooms[1 - k], same)
+    arrays["laid"] = laid(pair, maps) if not pair.a.rooms else np.zeros((0, 2), np.int64)
+    return arrays
+
+
+def twins(true: Array, other: Array, rooms: Sequence[TrueRoom], others: Sequence[TrueRoom], same: bool = True) -> Array:
+    """(R,) bool: does the other map hold a room, another than the true partner, whose plan has the same area and sides?
+
+    Args:
+        true, other: true room of each extracted room of this map and of the other one, -1 none.
+        rooms, others: their true rooms, in frames that may be turned but not scaled.
+        same: are the true rooms numbered alike?
+    """
+    out = np.zeros(len(true), bool)
+    if not rooms or not others:
+        return out
+    here, there = np.array([_plan(r) for r in rooms]), np.array([_plan(r) for r in others])
+    held = np.unique(other[other >= 0])
+    for i in np.flatnonzero(true >= 0):
+        mine, these = here[true[i]], there[held[held != true[i]] if same else held]
+        alike = (abs(these[:, 0] / mine[0] - 1) < TWIN_AREA) & (abs(these[:, 1:] - mine[1:]) < TWIN_SIDE).all(axis=1)
+        out[i] = alike.any()
+    return out
+
+
+def _plan(room: TrueRoom) -> tuple[float, float, float]:
+    """Area, m2, and sides of the smallest rectangle about it, m."""
+    shape = shapely.Polygon(room.polygon)
+    corners = np.array(shapely.minimum_rotated_rectangle(shape).exterior.coords)
+    sides = np.linalg.norm(np.diff(corners[:3], axis=0), axis=1)
+    return float(shape.area), float(sides.min()), float(sides.max())
+
+
+def common_area(maps: Sequence[TopometricMap], truth: Sim3 | None) -> float:
+    """Area, m2, of which both maps saw something, on the same storey; 0 where they are of two places."""
+    if truth is None:
+        return 0.0
+    floors = np.sort([*maps[0].storeys["floor"], *(truth.scale * maps[1].storeys["floor"] + truth.translation[2])])
+    floors = floors[np.diff(floors, prepend=-np.inf) > STOREY] - BELOW
+    both = np.intersect1d(_columns(maps[0], Sim3(), floors), _columns(maps[1], truth, floors))
+    return float(len(both) * COLUMN**2)
+
+
+def _columns(map: TopometricMap, into: Sim3, floors: Array) -> Array:
+    """Sorted keys of the (storey, x, y) columns of which a map knows anything, in another frame."""
+    at = into.apply(np.concatenate([map.grid.centroids(), map.navigable.centroids()]))
+    rows = np.column_stack([np.searchsorted(floors, at[:, 2]) - 1, np.floor(at[:, :2] / COLUMN)]).astype(np.int64)
+    return np.unique(rows[:, 0] * 2**40 + (rows[:, 1] + 2**18) * 2**20 + rows[:, 2] + 2**18)
+
+
+def anchor(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
+    """(3,) middle of the cells of b that a has seen, too; of all where these are hardly any."""
+    cells = maps[1].grid.centroids()
+    if pair.truth is not None:
+        seen = [np.floor(c / 0.5).astype(np.int64) for c in (maps[0].grid.centroids(), pair.truth.apply(cells))]
+        keys = [k[:, 0] * 2**42 + k[:, 1] * 2**21 + k[:, 2] for k in seen]
+        both = np.isin(keys[1], keys[0])
+        cells = cells[both] if both.sum() > FEW else cells
+    middle: Array = cells.mean(axis=0)
+    return middle
+
+
+def laid(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
+    """(M, 2) rooms of which most of both lies over each other under the true transform, one to one."""
+    t = pair.truth
+    if t is None or pair.kind != "overlap":
+        return np.zeros((0, 2), np.int64)
+    plans = (top_down(maps[0]), top_down(maps[1]))
+    pose = Poses(np.array([t.yaw]), np.array([t.translation]), np.array([t.scale]), np.ones(1))
+    rooms, fit = matches_under(t, plans, storey_map(pose, plans[0].floors, plans[1].floors)[0])
+    kept: list[tuple[int, int]] = []
+    for i, j in rooms[np.argsort(-fit, kind="stable")][: int((fit >= LAID).sum())].tolist():
+        if i not in {k[0] for k in kept} and j not in {k[1] for k in kept}:
+            kept.append((i, j))
+    return np.array(sorted(kept), np.int64).reshape(-1, 2)

@@ -1,0 +1,212 @@
+"""Pairs of partial maps of a building, by two sensors on two days, in two frames, with everything known that relates them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from topomerge.datasets.buildings.procedural import make_building
+from topomerge.datasets.core.building import Building
+from topomerge.datasets.core.difficulty import Difficulty
+from topomerge.datasets.pairs.parts import share, twin_rooms, two_parts
+from topomerge.datasets.simulation.scanner import scan
+from topomerge.datasets.simulation.session import session
+from topomerge.datasets.simulation.twin_wing import twin_wing
+
+from topomerge.errors import InputError
+from topomerge.types import Array, PointCloud, Sim3
+
+HARD = ("other-building", "other-storey", "twin-wing")
+KINDS = ("overlap", *HARD)
+ROOMS = 15  # a map
+SCALES = (0.5, 2.0)  # a map of unknown scale is larger or smaller by so much
+AWAY = 20.0  # m, frames lie that far apart along x and y
+TURN = np.radians(3)  # frames are turned against each other by more than this
+SEEN = 50  # points of a room, from which on a map has seen it
+ELSEWHERE = Difficulty(moved=0.5, gone=0.3, doors_moved=1.0)  # furniture of a twin wing
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two partial maps, and what is true about them.
+
+    Args:
+        name: unique within its source.
+        a, b: clouds with `labels` (index into their `rooms`) where the truth knows them, each in a frame of its own.
+        truth: T_ab, maps b into a; None where there is none, as the maps are of different buildings.
+        shared: (i, j): room i of `a.rooms` is room j of `b.rooms`, and both maps saw it. A match of two extracted rooms is right
+            if their true rooms are one of these.
+        overlap: share of visited rooms that both visited (Dice), or as good as is known; 0 for hard negatives.
+        sensors: of a and of b.
+        source: procedural, r2v, utexas, ...: splits are by source and building.
+        building: its name within the source.
+        kind: one of `KINDS`; all but "overlap" are maps of two places.
+        visited: rooms of `a.rooms` and of `b.rooms` that the surveyors went into; the others were seen through doors at most.
+        frames: building -> cloud, of a and of b, where both come from a building that is known.
+    """
+
+    name: str
+    a: PointCloud
+    b: PointCloud
+    truth: Sim3 | None
+    shared: tuple[tuple[int, int], ...]
+    overlap: float
+    sensors: tuple[str, str]
+    source: str
+    building: str
+    kind: str = "overlap"
+    visited: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
+    frames: tuple[Sim3, Sim3] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(f"{self.name}: kind of pair {self.kind!r}: {', '.join(KINDS)} are possible")
+        if not 0 <= self.overlap <= 1:
+            raise InputError(f"{self.name}: overlap must be 0 to 1, not {self.overlap}")
+        if self.kind != "overlap" and self.shared:
+            raise InputError(f"{self.name}: maps of two places share no room")
+        if self.truth is not None and is_identity(self.truth):
+            raise InputError(f"{self.name}: the true transform is the identity: such a pair tests nothing")
+        for i, j in self.shared:
+            if not (0 <= i < len(self.a.rooms) and 0 <= j < len(self.b.rooms)):
+                raise InputError(f"{self.name}: shared rooms {i}, {j} do not exist")
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """Three or more partial maps of one building.
+
+    Args:
+        maps: n clouds.
+        truth: n transforms T_0k; the first is the identity.
+        shared: rooms (i of `maps[k].rooms`, j of `maps[l].rooms`) for each (k, l) with k < l.
+    """
+
+    name: str
+    maps: tuple[PointCloud, ...]
+    truth: tuple[Sim3, ...]
+    shared: dict[tuple[int, int], tuple[tuple[int, int], ...]]
+    sensors: tuple[str, ...]
+    source: str
+    building: str
+
+    def __post_init__(self) -> None:
+        if not len(self.maps) == len(self.truth) == len(self.sensors) or len(self.maps) < 2:
+            raise InputError(f"{self.name}: two or more maps, with a transform and a sensor each")
+
+
+def is_identity(transform: Sim3) -> bool:
+    """Does a transform move nothing?"""
+    shift = max(map(abs, transform.translation))
+    return abs(transform.yaw) < 1e-3 and shift < 0.01 and abs(transform.scale - 1) < 1e-3
+
+
+def make_pair(
+    building: Building,
+    overlap: float = 0.5,
+    sensors: Sequence[str] = ("tls", "depth"),
+    rng: np.random.Generator | int = 0,
+    scale: bool = False,
+    hard: str | None = None,
+    rooms: int = ROOMS,
+    other: Building | None = None,
+    difficulty: Difficulty | None = None,
+    source: str = "procedural",
+    over_stairs: bool = False,
+) -> Pair:
+    """Two sessions in a building, each scanned along a walk through a connected part of it.
+
+    Args:
+        overlap: share of the rooms that both visit (of hard negatives: rooms with the same plan).
+        sensors: names, of a and of b.
+        rng: generator or seed; the same seed gives the same points.
+        scale: b's scale is unknown.
+        hard: None, or one of `HARD`: b is another building, another storey with the same plan, or another wing with nearly the
+            same plan (other ends and other furniture, perhaps mirrored: `twin_wing`).
+        rooms: of each map, at most.
+        other: the building of "other-building"; None: one of the same kind with another seed.
+        difficulty: of both sessions.
+        over_stairs: walks lead over stairs, where the building has any (`two_parts`).
+
+    Raises:
+        InputError: the building has no such parts, or a room can't be reached.
+    """
+    rng, difficulty = np.random.default_rng(rng), difficulty or Difficulty()
+    if hard is not None and hard not in HARD:
+        raise InputError(f"hard negative {hard!r}: {', '.join(HARD)} are possible")
+    if len(sensors) != 2:
+        raise InputError(f"a pair needs two sensors, not {len(sensors)}")
+    places, visited = _places(building, overlap, rooms, hard, other, over_stairs, rng)
+    frames = draw_frames(2, scale, rng)
+    days = (difficulty, ELSEWHERE if hard == "twin-wing" else difficulty)
+    a, b = (
+        scan(session(place, day, rng), sensor, part, rng, frame=frame)
+        for place, part, sensor, frame, day in zip(places, visited, sensors, frames, days, strict=True)
+    )
+    share_of = 0.0 if hard else share(visited[0].tolist(), visited[1].tolist())
+    truth = None if hard in ("other-building", "twin-wing") else frames[0] @ frames[1].inverse()
+    parts = (tuple(visited[0].tolist()), tuple(visited[1].tolist()))
+    return Pair(
+        name=f"{building.name}:{sensors[0]}-{sensors[1]}:{round(100 * overlap)}" + (f":{hard}" if hard else ""),
+        a=a,
+        b=b,
+        truth=truth,
+        shared=() if hard else seen_by_both(a, b),
+        overlap=share_of,
+        sensors=(sensors[0], sensors[1]),
+        source=source,
+        building=building.name,
+        kind=hard or "overlap",
+        visited=parts,
+        frames=(frames[0], frames[1]),
+    )
+
+
+def seen_by_both(a: PointCloud, b: PointCloud) -> tuple[tuple[int, int], ...]:
+    """(i, i) of the rooms, numbered alike in both maps, of which both have `SEEN` points."""
+    seen = [np.bincount(c.labels[c.labels >= 0], minlength=len(c.rooms)) >= SEEN for c in (a, b) if c.labels is not None]
+    return tuple((int(i), int(i)) for i in np.flatnonzero(np.logical_and.reduce(seen)))
+
+
+def _places(
+    building: Building,
+    overlap: float,
+    rooms: int,
+    hard: str | None,
+    other: Building | None,
+    over_stairs: bool,
+    rng: np.random.Generator,
+) -> tuple[tuple[Building, Building], tuple[Array, Array]]:
+    """The two buildings, and the rooms that are visited in each."""
+    if hard == "other-building":
+        other = other or _another(building)
+        a, b = (two_parts(x, rooms, 1.0, rng)[0] for x in (building, other))
+        return (building, other), (a, b)
+    if hard == "other-storey":
+        twins = twin_rooms(building)
+        a, b = two_parts(building, rooms, overlap, rng, twins)
+        return (building, building), (a, np.array(sorted(twins[i] for i in b.tolist())))
+    parts = two_parts(building, rooms, overlap, rng, over_stairs=over_stairs)
+    return (building, twin_wing(building, rng) if hard == "twin-wing" else building), parts
+
+
+def _another(building: Building) -> Building:
+    """A building of the same kind from another seed, of the same split: seeds come in pairs there."""
+    if building.seed < 0 or not building.kind:
+        raise InputError(f"{building.name}: name the other building of the hard negative")
+    known = building.parameters
+    return make_building(building.kind, building.seed ^ 1, len(building.storeys), Difficulty(**known["difficulty"]))
+
+
+def draw_frames(count: int, scale: bool, rng: np.random.Generator) -> list[Sim3]:
+    """Random frames, building -> cloud; no two are turned alike. With `scale` all but the first have a scale of their own."""
+    frames: list[Sim3] = []
+    while len(frames) < count:
+        low, high = np.log(SCALES)
+        size = float(np.exp(rng.uniform(low, high))) if scale and frames else 1.0
+        x, y, z = (rng.uniform(-1, 1, 3) * (AWAY, AWAY, 2.0)).round(3).tolist()
+        frame = Sim3(float(rng.uniform(-np.pi, np.pi)), (x, y, z), size)
+        if all(abs((f.inverse() @ frame).yaw) > TURN for f in frames):
+            frames.append(frame)
+    return frames

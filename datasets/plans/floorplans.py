@@ -1,0 +1,236 @@
+"""Plans of real buildings, read from the formats that their owners publish, one `Plan` a storey for `erect`.
+
+| file | format | reader |
+|---|---|---|
+| `*.tar.xz`, `*.txt` | apartments of Raster-to-Vector | `plans.r2v` |
+| `*.xml` | schools and offices of Luperto et al. | `plans.campus` |
+| `*.building.yaml` | Open-RMF traffic editor | `plans.rmf` |
+| `geojson_map.json` | malls of the indoor location competition 2.0 | `plans.mall` |
+| `*.vectormap.json` | line maps of UT-AMRL | `plans.amrl` |
+| `locations.yaml`, `*_gt_segmentation.png` | robot grids with true rooms: UTexas BWI, IPA | `plans.grid` |
+| `*.ifc` | building models with spaces | `plans.ifc` |
+
+Reasons of refusals start with: not closed, crosses itself, overlapping rooms, zero-width doors, no doors, no walls, absurd
+scale, no scale, too few rooms, disconnected, missing file, wrong version, bad line, damaged ..., absurd size, not read, not a
+... plan.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import shapely
+from topomerge.datasets.core.plan import Flight, Plan, PlanRoom
+from topomerge.datasets.plans.sketch import Sketch, finish
+
+from topomerge.errors import InputError
+
+log = logging.getLogger(__name__)
+
+READERS = (  # what a file's name matches, and the module that reads it
+    (r"\.(tar(\.(xz|gz|bz2))?|tgz|txz|txt)$", "r2v"),
+    (r"\.xml$", "campus"),
+    (r"\.building\.yaml$", "rmf"),
+    (r"(^|/)geojson_map\.json$", "mall"),
+    (r"\.vectormap\.json$", "amrl"),
+    (r"(^|/)locations\.yaml$|_gt_segmentation\.png$", "grid"),
+    (r"\.ifc$", "ifc"),
+)
+NOT_PLANS = re.compile(r"(^|/)(NOTE|README|LICENSE[^/]*)\.txt$|\.vectormap\.txt$|\.navigation\.txt$|(^|/)package\.xml$")
+
+LEVELS = ("rmf", "ifc")  # formats with several storeys a file
+SURVEYED = ("mall",)  # formats whose storeys, one a folder, are in one frame
+WORDS = {"basement": -1.0, "lower": 0.0, "ground": 0.0, "main": 1.0, "first": 1.0, "upper": 2.0, "second": 2.0, "third": 3.0}
+ALIASES = {"romainrolland": "romainroland"}  # misspelt by the owner
+STRANGERS = ("scuolasconosciuta",)  # "unknown school": the three are different ones
+
+Maker = Callable[[], Sketch]
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A plan that was not taken, and why; the reason's words before the colon are for counting."""
+
+    name: str
+    reason: str
+
+
+def read_plans(path: str | Path) -> list[Plan]:
+    """The plans of one file, lowest storey first.
+
+    Args:
+        path: a file; for one plan of an archive, ``archive.tar.xz::name``.
+
+    Raises:
+        InputError: the file is missing or of no known format, or one of its plans is refused.
+    """
+    file, _, member = str(path).partition("::")
+    plans = []
+    for name, result in _read(Path(file), lambda name: not member or member == name):
+        if isinstance(result, Refusal):
+            raise InputError(f"{file}: {name}: {result.reason}")
+        plans.append(result)
+    if not plans:
+        raise InputError(f"{path}: no plan in it")
+    return landed(plans)
+
+
+def landed(plans: list[Plan]) -> list[Plan]:
+    """Storeys, lowest first, without the lifts and stairs that end in no room: rooms that no door reaches are left out."""
+    out = []
+    for k, plan in enumerate(plans):
+        above = plans[k + 1].rooms if k + 1 < len(plans) else ()
+        kept = [f for f in plan.flights if all(_in_room(f, rooms) for rooms in (plan.rooms, above))]
+        out.append(replace(plan, flights=tuple(kept)))
+    return out
+
+
+def _in_room(flight: Flight, rooms: tuple[PlanRoom, ...]) -> bool:
+    ahead = np.array([np.cos(flight.heading), np.sin(flight.heading)])
+    middle = np.asarray(flight.corner) + ahead * flight.length / 2 + np.array([ahead[1], -ahead[0]]) * flight.width / 2
+    return any(shapely.Polygon(room.polygon).contains(shapely.Point(middle)) for room in rooms)
+
+
+def iter_plans(folder: str | Path, among: Collection[str] | None = None) -> Iterator[tuple[str, Plan | Refusal]]:
+    """Every plan of a folder, or of one file, in the order of their names; a bad one is a `Refusal` and the rest goes on.
+
+    Names are paths below the folder, without suffix, with the storey or the archive's member behind them: unique, and the same
+    on every machine. What was changed or left out of a plan is logged at level INFO.
+
+    Args:
+        among: only plans of these names.
+
+    Raises:
+        InputError: no such folder.
+    """
+    for file, root in _files(Path(folder)):
+        above = partial(_full, file, root)
+        for name, result in _read(file, lambda name, above=above: among is None or above(name) in among):  # type: ignore[misc]
+            name = above(name)
+            yield name, Refusal(name, result.reason) if isinstance(result, Refusal) else result
+
+
+def _files(folder: Path) -> list[tuple[Path, Path]]:
+    """Files with plans, and the folder that their names count from."""
+    if not folder.exists():
+        raise InputError(f"{folder}: no such file or folder")
+    if folder.is_file():
+        return [(folder, folder.parent)]
+    return [(p, folder) for p in sorted(folder.rglob("*")) if p.is_file() and _reader(p)]
+
+
+def _full(file: Path, root: Path, name: str) -> str:
+    """Path of the folder and name of the plan, without repeating the folder's own name."""
+    above = file.parent.relative_to(root)
+    if above.name and above.name == name.split("/")[0]:
+        above = above.parent
+    return (above / name).as_posix()
+
+
+def siblings(folder: str | Path) -> list[list[str]]:
+    """Names (as of `iter_plans`) of the plans that are storeys of one building, lowest first; single ones are left out.
+
+    Storeys of one file belong together; so do files whose names differ in a storey only: Sabadell1 and Sabadell2, P0 and P1,
+    groundfloor and secondfloor, LOWER and MAIN, the folders B1, F1 and F2. Whether their frames and scales agree is up to the
+    owner of the plans: those of the campus plans do not.
+    """
+    groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
+    for file, root in _files(Path(folder)):
+        names = [_full(file, root, name) for name in _names(file)]
+        if len(names) > 1 and _reader(file) in LEVELS:
+            groups[("", names[0])] = [(k, name) for k, name in enumerate(names)]
+        elif len(names) == 1:
+            above, _, last = names[0].rpartition("/")
+            base, level = _storey(last)
+            if base not in STRANGERS:
+                groups.setdefault((above if base or level else names[0], base), []).append((level, names[0]))
+    return sorted([name for _, name in sorted(group)] for group in groups.values() if len(group) > 1)
+
+
+def frame_of(folder: str | Path) -> dict[str, str]:
+    """Plan (named as of `iter_plans`) -> the frame it is in: that of its file or survey, otherwise one of its own."""
+    out = {}
+    for file, root in _files(Path(folder)):
+        for name in (_full(file, root, name) for name in _names(file)):
+            reader = _reader(file)
+            out[name] = file.as_posix() if reader in LEVELS else file.parent.parent.as_posix() if reader in SURVEYED else name
+    return out
+
+
+def _names(file: Path) -> list[str]:
+    try:
+        return [name for name, _ in import_module(f"topomerge.datasets.plans.{_reader(file)}").sketches(file)]
+    except Exception:  # refused by `iter_plans`, with the reason
+        return []
+
+
+def _storey(name: str) -> tuple[str, float]:
+    """What a plan's name says of its building and of its storey: ("Sabadell", 2) of Sabadell2."""
+    word = re.fullmatch(rf"(.*?)[ _-]*({'|'.join(WORDS)})(?:[ _-]*floor)?", name, re.IGNORECASE)
+    if word:
+        return word[1].lower(), WORDS[word[2].lower()]
+    number = re.fullmatch(r"(.*?)[ _-]*([PFBL]?)(\d)(v\d|[ns]?e?)", name)
+    if not number:
+        return name, 0.0
+    base, level = number[1].lower(), float(number[3])
+    return ALIASES.get(base, base), (-level if number[2] == "B" else level) + (0.5 if number[4] else 0.0)
+
+
+def summarise(results: Iterable[tuple[str, Plan | Refusal] | Refusal]) -> dict[str, int]:
+    """How many plans were refused for which reason, the commonest first; plans among the results count as "taken"."""
+    items = [item[1] if isinstance(item, tuple) else item for item in results]
+    words = [item.reason.partition(":")[0] if isinstance(item, Refusal) else "taken" for item in items]
+    return dict(Counter(words).most_common())
+
+
+def _reader(path: Path) -> str:
+    """Name of the module that reads a file, or nothing."""
+    name = path.as_posix()
+    if NOT_PLANS.search(name):
+        return ""
+    return next((module for pattern, module in READERS if re.search(pattern, name)), "")
+
+
+def _read(path: Path, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[tuple[str, Plan | Refusal]]:
+    """Name and plan or refusal of each storey of a file."""
+    module = _reader(path)
+    if not module:
+        yield path.stem, Refusal(path.stem, f"not a known format: {path.name}")
+        return
+    items: Iterator[tuple[str, Maker]] = import_module(f"topomerge.datasets.plans.{module}").sketches(path)
+    while True:
+        try:
+            name, make = next(items)
+        except StopIteration:
+            return
+        except Exception as error:
+            yield path.stem, Refusal(path.stem, _reason(error))
+            return
+        if wanted(name):
+            yield name, _made(name, make)
+
+
+def _made(name: str, make: Maker) -> Plan | Refusal:
+    try:
+        plan, notes = finish(make())
+    except Exception as error:
+        return Refusal(name, _reason(error))
+    if notes:
+        log.info("%s: %s", name, "; ".join(f"{note} ({n} times)" if n > 1 else note for note, n in Counter(notes).items()))
+    return plan
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, InputError):
+        return " ".join(str(error).split())
+    if isinstance(error, FileNotFoundError):
+        return f"missing file: {Path(error.filename or '').name}"
+    return f"not read: {type(error).__name__}: {' '.join(str(error).split())[:200]}"

@@ -1,0 +1,185 @@
+"""Robot grids with true rooms: UTexas BWI (``locations.yaml``) and IPA room segmentation (``*_gt_segmentation.png``).
+
+Grids without room truth have no plan. UTexas: `locations.yaml` names the rooms and holds their polygons, in pixels from the top,
+`doors.yaml` the two corners of each door, and the map itself tells where rooms are open to each other. IPA: rooms are white
+regions between lines; where a line runs over free space of the scan, there is a doorway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from PIL import Image, ImageDraw
+from scipy import ndimage
+from topomerge.datasets.plans.doors import doorway, place_door
+from topomerge.datasets.plans.raster import SPARE, add_contacts, add_rooms, contacts, flood, guess_kinds
+from topomerge.datasets.plans.sketch import Sketch
+
+from topomerge.errors import InputError
+from topomerge.types import Array
+
+IPA_CELL = 0.05  # m, nominal
+FREE, WHITE = 250, 250  # grey levels of free space, of the inside of a true room
+SMALLEST = 1.0  # m2 of a room
+CAVITY = 0.3  # m; narrower strips of a room are left out
+BRIDGE = 6  # cells between two rooms that an opening may cross
+BODY = 0.3  # m that a way from room to room keeps from what is not free: speckled walls have holes
+PASSAGE = 1.5  # m, of openings whose place is not known
+APART = 1.0  # m between an opening of the map and a door of the list
+MAX_PIXELS = 100_000_000
+
+
+def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+    """Name and maker of the one storey."""
+    if path.suffix == ".yaml":
+        yield path.parent.name, partial(bwi, path)
+    else:
+        yield path.stem.removesuffix("_gt_segmentation"), partial(ipa, path)
+
+
+def ipa(path: Path) -> Sketch:
+    """Rooms of a segmentation image and doorways where its lines cross free space of the scan beside it.
+
+    Raises:
+        InputError: no scan of the same name and size, or no rooms.
+    """
+    truth = _image(path)
+    stem = path.stem.removesuffix("_gt_segmentation")
+    scans = [path.with_name(f"{stem}{end}.png") for end in ("", "_scan")]
+    scan = next((s for s in scans if s.is_file()), None)
+    if scan is None:
+        raise InputError(f"missing file: {stem}.png")
+    free = _image(scan) >= FREE
+    if free.shape != truth.shape:
+        raise InputError(f"wrong version: {scan.name} is {free.shape[::-1]} pixels, its rooms are {truth.shape[::-1]}")
+    labels = ndimage.label(truth >= WHITE)[0].astype(np.int32)
+    sizes = np.bincount(labels.ravel())
+    labels[np.isin(labels, np.flatnonzero(sizes < SMALLEST / IPA_CELL**2))] = 0
+    labels = _without_outside(labels, free)
+    labels = flood(labels, free | (labels > 0))
+    result = Sketch(height=3.2, ceiling=2.7, inset=0.02)
+    origin = np.zeros(2)
+    index = add_rooms(result, labels, {}, IPA_CELL, origin, SMALLEST, CAVITY / 2)
+    add_contacts(result, contacts(labels, IPA_CELL, origin), index, "door")
+    guess_kinds(result, "office")
+    return result
+
+
+def bwi(path: Path) -> Sketch:
+    """Rooms of `locations.yaml`, doors of `doors.yaml`, and openings where the map is free between two rooms.
+
+    The image `locations.png` is not read: on floor 3 its numbers are not those of the list.
+
+    Raises:
+        InputError: a polygon for each room, `doors.yaml` or the map with its resolution is missing.
+    """
+    about = _yaml(path)
+    names, polygons = (about.get(key) if isinstance(about, dict) else None for key in ("locations", "polygons"))
+    if not isinstance(names, list) or not isinstance(polygons, list) or not names or len(names) != len(polygons):
+        raise InputError("not a grid plan: expected as many 'polygons' as 'locations'")
+    if not path.with_name("doors.yaml").is_file():
+        raise InputError("missing file: doors.yaml")
+    grid, resolution, origin = _map(path.parent)
+    labels = _painted(polygons, grid.shape)
+    result = Sketch(height=3.6, ceiling=2.8, inset=0.05)
+    index = add_rooms(result, labels, dict(enumerate(map(str, names), 1)), resolution, origin, SMALLEST, CAVITY / 2)
+    known = {str(name): index.get(k, -1) for k, name in enumerate(names, 1)}
+    _listed_doors(result, _yaml(path.with_name("doors.yaml")), known)
+    doors = [np.add(o.start, o.end) / 2 for o in result.openings]
+    body = ndimage.distance_transform_edt(grid >= FREE) * resolution > BODY
+    near = ndimage.distance_transform_edt(labels == 0) <= BRIDGE / 2
+    for a, b, ends in contacts(flood(np.where(body, labels, 0), body & near), resolution, origin):
+        along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+        if all(np.hypot(*(ends.mean(axis=0) - door)) > APART for door in doors):
+            add_contacts(result, [(a, b, ends + np.stack([-along, along]) * BODY)], index, "opening")
+    if (path.with_name("connectivity.yaml")).is_file():
+        _connected(result, _yaml(path.with_name("connectivity.yaml")), known)
+    guess_kinds(result, "office")
+    return result
+
+
+def _painted(polygons: list[list[float]], shape: tuple[int, ...]) -> Array:
+    """(h, w) int32: number of the polygon in each cell, from 1, lowest row first."""
+    image = Image.new("I", (shape[1], shape[0]), 0)
+    for k, polygon in enumerate(polygons, 1):
+        corners = np.array(polygon, float).reshape(-1, 2)
+        if len(np.unique(corners, axis=0)) < 3:
+            raise InputError(f"not closed: polygon {k} has no area")
+        ImageDraw.Draw(image).polygon([(float(x), float(y)) for x, y in corners], fill=k)
+    return np.flipud(np.asarray(image, np.int32)).copy()
+
+
+def _listed_doors(result: Sketch, doors: Any, known: dict[str, int]) -> None:
+    if not isinstance(doors, list):
+        raise InputError("not a grid plan: doors.yaml holds no list")
+    for door in doors:
+        ends = sorted({known.get(str(a.get("from")), -1) for a in door.get("approach", [])})
+        start, end = (np.array(door[f"door_corner_pt_{k}"], float) for k in (1, 2))
+        if len(ends) != 2 or ends[0] < 0:
+            continue
+        width = float(np.hypot(*(end - start)))
+        shapes = [result.shapes[i] for i in ends]
+        placed = place_door(shapes[0], shapes[1], width, 1.0, (start + end) / 2) if width else None
+        placed = placed or doorway("door", start, end, SPARE)
+        result.add_opening(replace(placed, kind="door"), (ends[0], ends[1]))  # also double ones have leaves here
+
+
+def _connected(result: Sketch, neighbours: Any, known: dict[str, int]) -> None:
+    """Openings for rooms that `connectivity.yaml` calls neighbours and that have none yet."""
+    done = {frozenset(ends) for ends in result.ends}
+    for name, others in sorted(neighbours.items()) if isinstance(neighbours, dict) else []:
+        for other in others:
+            a, b = known.get(str(name), -1), known.get(str(other), -1)
+            if min(a, b) < 0 or frozenset((a, b)) in done:
+                continue
+            opening = place_door(result.shapes[a], result.shapes[b], PASSAGE, 0.5, None, "opening")
+            if opening is not None:
+                result.add_opening(opening, (a, b))
+                done.add(frozenset((a, b)))
+
+
+def _without_outside(labels: Array, free: Array) -> Array:
+    """White regions that are not free in the scan, or touch the rim of the image, are no rooms."""
+    counts = np.bincount(labels.ravel())
+    share = np.bincount(labels.ravel(), free.ravel()) / np.maximum(counts, 1)
+    rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    out = np.union1d(np.flatnonzero(share < 0.2), rim)
+    return np.where(np.isin(labels, out), 0, labels)
+
+
+def _map(folder: Path) -> tuple[Array, float, Array]:
+    """The map of a folder: grey levels, m per cell, and origin, m."""
+    found = sorted(p for p in folder.glob("*.yaml") if p.stem not in ("locations", "doors", "objects", "connectivity"))
+    for path in sorted(found, key=lambda p: p.stem != folder.name):
+        about = _yaml(path)
+        image = path.with_name(f"{Path(str(about.get('image', ''))).stem}.png")
+        if "resolution" in about and image.is_file():
+            cell = float(about["resolution"])
+            if not 0.005 <= cell <= 1.0:
+                raise InputError(f"absurd scale: {cell} m per cell")
+            return _image(image), cell, np.array(about["origin"][:2], float)
+    raise InputError("missing file: a map with 'resolution', 'origin' and its image as PNG")
+
+
+def _yaml(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_bytes()) or {}
+    except yaml.YAMLError as error:
+        raise InputError(f"damaged YAML: {path.name}: {' '.join(str(error).split())[:100]}") from error
+
+
+def _image(path: Path) -> Array:
+    """(h, w) uint8 grey levels, lowest row first; transparent is as dark as it is painted."""
+    try:
+        with Image.open(path) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise InputError(f"absurd size: {path.name} has {image.width} by {image.height} pixels")
+            return np.flipud(np.asarray(image.convert("L"))).copy()
+    except (OSError, Image.DecompressionBombError) as error:
+        raise InputError(f"damaged image: {path.name}") from error

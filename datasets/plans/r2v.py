@@ -1,0 +1,208 @@
+"""Apartments of Raster-to-Vector (Liu et al., ICCV 2017): one text file a plan, many in a tar archive.
+
+A line is ``x1 y1 x2 y2 category a b``, tab-separated, pixels, y down. Walls and doors are segments, rooms are small
+rectangles that lie inside the room, the rest are fixtures. "door" is any opening. There is no scale: it follows from narrow
+doors, bathtubs and toilets, which hardly differ in size between apartments. Rooms are the faces of the wall arrangement.
+"""
+
+from __future__ import annotations
+
+import lzma
+import tarfile
+import zlib
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import shapely
+from topomerge.datasets.core.plan import Wall
+from topomerge.datasets.plans.doors import doorway, sides, window
+from topomerge.datasets.plans.sketch import Sketch
+
+from topomerge.errors import InputError
+from topomerge.types import Array
+
+KINDS = {  # in order of precedence where a face has several labels; our word for each
+    "living_room": "living",
+    "bedroom": "bedroom",
+    "kitchen": "kitchen",
+    "stairs": "stairs",
+    "bathroom": "bath",
+    "washing_room": "bath",
+    "restroom": "toilets",
+    "entrance": "entrance",
+    "corridor": "corridor",
+    "closet": "storage",
+    "balcony": "balcony",
+    "PS": "shaft",
+}
+OUTSIDE = ("balcony", "shaft")  # open air and pipe spaces are no rooms
+LIVED_IN = ("bedroom", "living_room", "kitchen")
+HINGED = ("1", "2", "4", "5", "7", "9")  # kinds of opening with an ordinary leaf
+DOOR, BATHTUB, TOILET = 0.75, 1.2, 0.74  # m, usual lengths
+DOOR_RANGE = (0.7, 0.9)  # m, of the median narrow door
+SNAP = 6.0  # px; walls whose ends miss each other by less are joined
+THICKNESS = 0.12  # m
+MAX_MEMBERS, MAX_TOTAL, MAX_BYTES = 100_000, 1 << 30, 1 << 20  # of an archive, and of one plan
+
+Rows = list[tuple[Array, str, str]]  # (2, 2) px, category, type
+
+
+def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
+    """Name and maker of every plan of a text file or a tar archive, whose members are read in memory only.
+
+    Raises:
+        InputError: truncated or absurdly large archive.
+    """
+    if path.suffix == ".txt":
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"absurd size: {path.stat().st_size} bytes for one plan")
+        yield path.stem, partial(sketch, path.read_bytes())
+        return
+    total = 0
+    try:
+        with tarfile.open(path, "r:*") as archive:
+            for count, member in enumerate(archive):
+                total += member.size
+                if count >= MAX_MEMBERS or total > MAX_TOTAL:
+                    raise InputError(f"absurd size: more than {MAX_MEMBERS} members or {MAX_TOTAL >> 20} MiB")
+                if not member.isfile() or not member.name.endswith(".txt"):
+                    continue
+                name = member.name.removeprefix("./").removesuffix(".txt")
+                if member.size > MAX_BYTES:
+                    yield name, partial(_refuse, f"absurd size: {member.size} bytes for one plan")
+                    continue
+                stream = archive.extractfile(member)
+                yield name, partial(sketch, stream.read() if stream else b"")
+    except (tarfile.TarError, EOFError, lzma.LZMAError, zlib.error) as error:
+        raise InputError(f"damaged archive: {error}") from error
+
+
+def _refuse(reason: str) -> Sketch:
+    raise InputError(reason)
+
+
+def sketch(text: bytes) -> Sketch:
+    """One apartment.
+
+    Raises:
+        InputError: a line that can't be read; no walls; walls that enclose nothing; no scale.
+    """
+    rows = _rows(text)
+    walls = np.array([ends for ends, category, _ in rows if category == "wall" and np.ptp(ends, axis=0).max() > 0])
+    if not len(walls):
+        raise InputError("no walls: not a Raster-to-Vector plan")
+    scale = _scale(rows)
+    walls = walls * scale
+    faces = _faces(walls, SNAP * scale)
+    kinds = _kinds(faces, rows, scale)
+    _check_seeds(faces, rows, scale)
+    result = Sketch(height=2.9, ceiling=2.4)
+    rooms = np.full(len(faces) + 1, -1)  # the last one is the answer to index -1: outside
+    for i, (face, kind) in enumerate(zip(faces, kinds, strict=True)):
+        if kind not in OUTSIDE:
+            rooms[i] = result.add_room(f"{kind or 'room'} {len(result.shapes)}", kind, face)
+    result.walls = [Wall((w[0][0], w[0][1]), (w[1][0], w[1][1]), THICKNESS) for w in walls.tolist()]
+    _openings(result, rows, scale, faces, rooms, walls)
+    return result
+
+
+def _rows(text: bytes) -> Rows:
+    rows: Rows = []
+    for number, line in enumerate(text.decode("utf-8", "replace").splitlines(), 1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            ends = np.array(words[:4], np.float64).reshape(2, 2) * (1, -1)  # y up
+        except ValueError:
+            ends = np.full((2, 2), np.nan)
+        if len(words) < 5 or not np.isfinite(ends).all():
+            raise InputError(f"bad line: {number} is not 'x1 y1 x2 y2 category'")
+        rows.append((ends, words[4], words[5] if len(words) > 5 else ""))
+    return rows
+
+
+def _scale(rows: Rows) -> float:
+    """m per pixel: the middle one of what doors, bathtubs and toilets say, kept where narrow doors are 0.7 to 0.9 m."""
+
+    def lengths(category: str, types: tuple[str, ...] = ()) -> Array:
+        chosen = [np.ptp(ends, axis=0).max() for ends, c, t in rows if c == category and (not types or t in types)]
+        return np.array([length for length in chosen if length > 5])
+
+    doors = lengths("door", HINGED)
+    doors = doors if len(doors) else lengths("door")
+    if not len(doors):
+        raise InputError("zero-width doors: none is longer than 5 px" if any(r[1] == "door" for r in rows) else "no doors")
+    narrow = float(np.median(doors))
+    guesses = [DOOR / narrow]
+    for category, length in (("bathtub", BATHTUB), ("toilet", TOILET)):
+        found = lengths(category)
+        guesses += [length / float(np.median(found))] if len(found) else []
+    low, high = np.array(DOOR_RANGE) / narrow
+    return float(np.clip(np.median(guesses), low, high))
+
+
+def _faces(walls: Array, snap: float) -> list[shapely.Polygon]:
+    """Faces of the walls after making them longer by `snap` at both ends; slivers between double lines are left out."""
+    along = walls[:, 1] - walls[:, 0]
+    along = along / np.linalg.norm(along, axis=1, keepdims=True) * snap
+    lines = np.stack([walls[:, 0] - along, walls[:, 1] + along], axis=1)
+    noded = shapely.node(shapely.multilinestrings(shapely.linestrings(lines)))
+    faces = shapely.get_parts(shapely.polygonize([noded]))
+    faces = [face for face in faces if not face.buffer(-snap).is_empty]
+    if not faces:
+        raise InputError("not closed: the walls enclose no room")
+    return faces
+
+
+def _kinds(faces: list[shapely.Polygon], rows: Rows, scale: float) -> list[str]:
+    """Kind of each face: that of the seed in it, the most telling one where there are several."""
+    tree, order = shapely.STRtree(faces), list(KINDS)
+    best = np.full(len(faces), len(order))
+    for ends, category, _ in rows:
+        if category in KINDS:
+            for i in tree.query(shapely.Point(ends.mean(axis=0) * scale), predicate="within"):
+                best[i] = min(best[i], order.index(category))
+    return [KINDS[order[k]] if k < len(order) else "" for k in best]
+
+
+def _check_seeds(faces: list[shapely.Polygon], rows: Rows, scale: float) -> None:
+    """Refuse a plan where half of the rooms that people live in stand open: what is left of it is no apartment."""
+    seeds = [shapely.Point(ends.mean(axis=0) * scale) for ends, category, _ in rows if category in LIVED_IN]
+    open_ = sum(1 for seed in seeds if not len(shapely.STRtree(faces).query(seed, predicate="within")))
+    if open_ and 2 * open_ >= len(seeds):
+        raise InputError(f"not closed: no walls around {open_} of {len(seeds)} bedrooms, living rooms and kitchens")
+
+
+def _openings(result: Sketch, rows: Rows, scale: float, faces: list[shapely.Polygon], rooms: Array, walls: Array) -> None:
+    """Doors between rooms and at the entrance; other openings to outside are windows, wide ones down to the floor."""
+    ends = np.array([ends * scale for ends, category, _ in rows if category == "door" and np.ptp(ends, axis=0).max() > 0])
+    if not len(ends):
+        return
+    lines = shapely.linestrings(walls)
+    ends = np.array([_on_wall(pair, walls, lines) for pair in ends])
+    faced = sides(ends[:, 0], ends[:, 1], faces, THICKNESS / 2 + 0.3)
+    for (start, end), (left, right) in zip(ends, rooms[faced].tolist(), strict=True):
+        opening = doorway("door", start, end, THICKNESS + 0.1)
+        inner = max(left, right)
+        if min(left, right) < 0 <= inner and result.kinds[inner] != "entrance":
+            wide = np.hypot(*(end - start)) > 1.5
+            opening = window(opening, 0.0 if wide else 0.9, 2.0)
+        result.add_opening(opening, (left, right))
+
+
+def _on_wall(ends: Array, walls: Array, lines: Array) -> Array:
+    """(2, 2) the opening moved onto the nearest wall that runs its way, if there is one within 0.2 m."""
+    along = ends[1] - ends[0]
+    if abs(along[0]) > 1e-9 and abs(along[1]) > 1e-9:  # a slanted opening stays where it is
+        return ends
+    axis = int(abs(along[0]) > abs(along[1]))  # the coordinate that does not change
+    parallel = np.ptp(walls[:, :, axis], axis=1) < 0.1 * np.ptp(walls[:, :, 1 - axis], axis=1)
+    distance = np.where(parallel, shapely.distance(lines, shapely.Point(ends.mean(axis=0))), np.inf)
+    best = int(np.argmin(distance))
+    moved = ends.copy()
+    if distance[best] < 0.2:
+        moved[:, axis] = walls[best][:, axis].mean()
+    return moved

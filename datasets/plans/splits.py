@@ -1,0 +1,145 @@
+"""Which building is for training, which for validation, which for the test: text lists in `datasets/plans/splits/`.
+
+A line names a building as `source/name` (name as of `floorplans.iter_plans`), all of a source as `source/*`, or seeds of
+procedural buildings as `procedural/first..last`. Sources that evaluation stands on are in the test as a whole. Storeys of one
+building, and plans of one property, are never apart. The lists were written by ``python -m topomerge.datasets.plans.splits
+FOLDER``,
+FOLDER being that of the real data; what came into the world since then is in no split until they are written again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import shapely
+from topomerge.datasets.core.plan import Plan
+
+from topomerge.errors import InputError
+
+SPLITS = ("train", "validation", "test")
+FOLDERS = {  # source -> folder of the real data
+    "r2v": "plans_r2v_apartments",
+    "campus": "plans_schools_offices",
+    "mall": "plans_malls",
+    "rmf": "sim_rmf_buildings",
+}
+TEST_ONLY = {
+    "utexas": ("utexas_gdc_floors", "utexas_amrl_vectormaps"),  # one building by two surveys
+    "ipa": ("grids_ipa_room_segmentation",),
+    "halmstad": ("halmstad_robot_maps",),
+    "carmen": ("carmen_logs",),
+    "ifc": ("ifc_buildings",),
+    "octomap": ("octomap_freiburg078",),
+    "strands": ("grids_rose2_homes_strands",),
+    "ipad": ("ipad_lidar_rooms",),
+    "libpointmatcher": ("pair_libpointmatcher_apartment",),
+}
+SEEDS = {"train": (0, 799_999), "validation": (800_000, 899_999), "test": (900_000, 999_999)}
+SHARES = {"validation": 0.1, "test": 0.1}  # of the plans of a source; the rest is for training
+
+
+def split_of(source: str, name: str) -> str | None:
+    """The split of a building, or None where no list names it. `name` is the seed of a procedural building."""
+    for split in SPLITS:
+        names, whole, seeds = _read(split)
+        if source in whole or f"{source}/{name}" in names:
+            return split
+        if source == "procedural" and name.isdecimal() and seeds[0] <= int(name) <= seeds[1]:
+            return split
+    return None
+
+
+def members(split: str, source: str) -> list[str]:
+    """Names of the buildings of a source in a split, ascending.
+
+    Raises:
+        InputError: unknown split.
+    """
+    names, _, _ = _read(split)
+    return sorted(n.removeprefix(f"{source}/") for n in names if n.startswith(f"{source}/"))
+
+
+def seeds(split: str) -> tuple[int, int]:
+    """First and last seed of the procedural buildings of a split.
+
+    Raises:
+        InputError: unknown split.
+    """
+    return _read(split)[2]
+
+
+@cache
+def _read(split: str) -> tuple[frozenset[str], frozenset[str], tuple[int, int]]:
+    """Buildings, whole sources and seeds of a split."""
+    if split not in SPLITS:
+        raise InputError(f"split {split!r}: {', '.join(SPLITS)} are possible")
+    text = resources.files("topomerge.datasets.plans").joinpath("splits", f"{split}.txt").read_text(encoding="utf-8")
+    lines = {line.strip() for line in text.splitlines()} - {""}
+    lines = {line for line in lines if not line.startswith("#")}
+    whole = {line.removesuffix("/*") for line in lines if line.endswith("/*")}
+    ranges = [m for line in lines if (m := re.fullmatch(r"procedural/(\d+)\.\.(\d+)", line))]
+    first, last = (int(ranges[0][1]), int(ranges[0][2])) if ranges else (0, -1)
+    names = lines - {f"{w}/*" for w in whole} - {m[0] for m in ranges}
+    return frozenset(names), frozenset(whole), (first, last)
+
+
+def groups(names: Iterable[str], together: Iterable[Iterable[str]]) -> list[list[str]]:
+    """Groups of names that must not be parted, as `together` says; each ascending, and the groups, too."""
+    of = {name: {name} for name in names}
+    for some in together:
+        joined: set[str] = set().union(*(of.get(name, {name}) for name in some))
+        for name in joined:
+            of[name] = joined
+    return sorted({id(group): sorted(group) for group in of.values()}.values())
+
+
+def relatives(source: str, plans: Mapping[str, Plan]) -> Iterator[list[str]]:
+    """Plans of one property, and plans whose rooms have the same sizes: the same apartment is on offer more than once."""
+    by: dict[object, list[str]] = {}
+    for name, plan in plans.items():
+        areas = np.sort([shapely.Polygon(room.polygon).area for room in plan.rooms])
+        by.setdefault((len(areas), *np.round(areas / areas.sum(), 2).tolist()), []).append(name)
+        if source == "r2v":
+            by.setdefault(name.rpartition("/")[0], []).append(name)
+    yield from by.values()
+
+
+def deal(source: str, drawn: list[list[str]]) -> dict[str, list[str]]:
+    """Groups dealt to the splits in the order of a hash of their names: the test takes its share first, one group at least."""
+    order = sorted(drawn, key=lambda group: hashlib.sha256(f"{source}/{group[0]}".encode()).digest())
+    total, out = sum(map(len, drawn)), {split: list[str]() for split in SPLITS}
+    for k, group in enumerate(order):
+        left = len(order) - k
+        hungry = [s for s in ("test", "validation") if len(out[s]) < SHARES[s] * total and (left > 1 or out["train"])]
+        out[hungry[0] if hungry else "train"] += group
+    return out
+
+
+def write_lists(data: Path, folder: Path) -> None:
+    """Write the lists from the real data that is in `data`."""
+    from topomerge.datasets.plans.floorplans import Refusal, iter_plans, siblings
+
+    from topomerge.io.atomic import replacing
+
+    lines: dict[str, list[str]] = {split: [f"procedural/{a}..{b}"] for split, (a, b) in SEEDS.items()}
+    lines["test"] += [f"{source}/*" for source in TEST_ONLY]
+    for source, name in FOLDERS.items():
+        taken = {n: plan for n, plan in iter_plans(data / name) if not isinstance(plan, Refusal)}
+        dealt = deal(source, groups(taken, [*siblings(data / name), *relatives(source, taken)]))
+        for split in SPLITS:
+            lines[split] += sorted(f"{source}/{n}" for n in dealt[split] if n in taken)
+    for split in SPLITS:
+        head = f"# Buildings for {split}: written by python -m topomerge.datasets.plans.splits; see datasets/plans/splits.py\n"
+        with replacing(folder / f"{split}.txt") as beside:
+            beside.write_text(head + "\n".join(lines[split]) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write_lists(Path(sys.argv[1]), Path(__file__).parent / "splits")

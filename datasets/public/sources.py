@@ -1,0 +1,169 @@
+"""Public 3D sets whose terms forbid passing them on, read as their owners publish them.
+
+| source | folder | pairs |
+|---|---|---|
+| `s3dis` | `Area_1` ... with a folder a room | two connected parts of an area |
+| `matterport` | a folder a house | two connected parts of a house |
+| `rscan` | `3RScan.json` and a folder a scan | a scan of a room and one of a later day |
+| `cslamd` | `Flat`, `House`, `Lab`, `Priory` | two sequences of a building |
+| `scannet` | a folder a scan | none: no truth is published; `scannet.places` groups the scans of a place |
+
+`cslamd` maps an assumption or two; see there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+from topomerge.datasets.pairs.flat import floor_overlap, thin
+from topomerge.datasets.pairs.pairs import Pair, draw_frames, seen_by_both
+from topomerge.datasets.pairs.parts import share
+from topomerge.datasets.plans.floorplans import Refusal
+from topomerge.datasets.real.sources import collect
+from topomerge.datasets.simulation.scanner import moved
+
+from topomerge.errors import InputError
+from topomerge.types import Array, PointCloud, Sim3, TrueRoom
+
+SOURCES = ("s3dis", "matterport", "rscan", "cslamd")
+SPACING = 0.05  # m between the points that are kept
+LARGEST_JSON = 500 << 20  # bytes
+BESIDE = 0.35  # m; rooms with points that near each other are neighbours
+TOUCH = 5  # points that must be that near
+PART = 0.6  # share of the rooms that each of two parts has at most
+LEAST = 4  # rooms that can be cut into two parts
+
+
+def iter_public_pairs(folder: str | Path, source: str) -> Iterator[tuple[str, Pair | Refusal]]:
+    """Every pair of a set; what is missing or damaged is a `Refusal`, and the rest goes on.
+
+    Raises:
+        InputError: no such folder or source.
+    """
+    if source not in SOURCES:
+        raise InputError(f"source {source!r}: {', '.join(SOURCES)} are possible")
+    if not Path(folder).is_dir():
+        raise InputError(f"{folder}: no such folder; give the one that holds the data set")
+    return collect(source, import_module(f"topomerge.datasets.public.{source}").pairs(Path(folder)))
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        InputError: missing, far too large, or damaged.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; copy the data set again")
+    if path.stat().st_size > LARGEST_JSON:
+        raise InputError(f"{path}: has {path.stat().st_size >> 20} MB and the limit is {LARGEST_JSON >> 20} MB")
+    try:
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON, or cut short ({str(error)[:80]}); copy it again") from error
+
+
+def join_rooms(parts: Sequence[tuple[TrueRoom, Array]], source: str) -> PointCloud:
+    """One cloud of rooms and their points (n, 3), thinned to `SPACING`."""
+    kept = [thin(points, SPACING) for _, points in parts]
+    points = np.concatenate(kept)
+    shift = np.round(points.mean(axis=0), 0) if np.abs(points).max() > 1000 else np.zeros(3)
+    labels = np.repeat(np.arange(len(parts)), [len(p) for p in kept]).astype(np.int32)
+    rooms = tuple(room for room, _ in parts)
+    return PointCloud((points - shift).astype(np.float32), shift, labels=labels, rooms=rooms, source=source)
+
+
+def hull(points: Array) -> Array:
+    """(k, 2) convex outline of points, counter-clockwise: where no outline is published."""
+    shape = shapely.convex_hull(shapely.multipoints(points[:, :2]))
+    if shape.geom_type != "Polygon":
+        raise InputError("its points lie on one line; no room has this shape")
+    return np.asarray(shapely.normalize(shape).exterior.coords)[-2::-1].copy()
+
+
+def cut_pair(cloud: PointCloud, name: str, source: str, sensor: str, seed: int) -> Pair:
+    """Two connected parts of a labelled cloud in random frames, a third to a half of their rooms in common, as in the thesis.
+
+    Raises:
+        InputError: too few rooms that hang together.
+    """
+    rng = np.random.default_rng(seed)
+    a, b = two_parts(room_neighbours(cloud), rng)
+    frames = draw_frames(2, False, rng)
+    maps = [moved(_only(cloud, part), frame) for part, frame in zip((a, b), frames, strict=True)]
+    truth = frames[0] @ frames[1].inverse()
+    one, other = maps
+    shared, visited, both = seen_by_both(one, other), (tuple(a), tuple(b)), (frames[0], frames[1])
+    return Pair(name, one, other, truth, shared, share(a, b), (sensor, sensor), source, name, visited=visited, frames=both)
+
+
+def _only(cloud: PointCloud, rooms: Sequence[int]) -> PointCloud:
+    assert cloud.labels is not None
+    kept = np.isin(cloud.labels, rooms)
+    return replace(cloud, points=cloud.points[kept], labels=cloud.labels[kept])
+
+
+def room_neighbours(cloud: PointCloud) -> dict[int, set[int]]:
+    """Room -> rooms that lie side by side with it, through a thin wall or a door; rooms without points are left out."""
+    assert cloud.labels is not None
+    trees = {int(i): cKDTree(thin(cloud.points[cloud.labels == i], 0.1)) for i in np.unique(cloud.labels[cloud.labels >= 0])}
+    out: dict[int, set[int]] = {i: set() for i in trees}
+    for i, tree in trees.items():
+        for j, other in trees.items():
+            if i < j and (tree.maxes + BESIDE >= other.mins).all() and (other.maxes + BESIDE >= tree.mins).all():
+                near = np.isfinite(other.query(tree.data, distance_upper_bound=BESIDE)[0])
+                if near.sum() >= TOUCH:
+                    out[i].add(j)
+                    out[j].add(i)
+    return out
+
+
+def two_parts(neighbours: dict[int, set[int]], rng: np.random.Generator) -> tuple[list[int], list[int]]:
+    """Two connected sets of rooms that share a connected core.
+
+    Raises:
+        InputError: fewer than `LEAST` rooms hang together.
+    """
+    whole = max((grow(neighbours, [i], len(neighbours), rng) for i in sorted(neighbours)), key=len, default=[])
+    if len(whole) < LEAST:
+        raise InputError(f"only {len(whole)} rooms hang together; {LEAST} are needed to cut two parts")
+    count = max(int(PART * len(whole)), 2)
+    for _ in range(50):
+        a = grow(neighbours, [int(rng.choice(whole))], count, rng)
+        edge = [i for i in a if neighbours[i] - set(a)]
+        inside = {i: neighbours[i] & set(a) for i in a}
+        core = grow(inside, [int(rng.choice(edge))], max(count // 2, 1), rng)
+        open_rooms = {i: neighbours[i] - (set(a) - set(core)) for i in neighbours if i not in set(a) - set(core)}
+        b = grow(open_rooms, core, count, rng)
+        if len(b) > len(core):
+            return sorted(a), sorted(b)
+    raise InputError("its rooms can't be cut into two parts that overlap")
+
+
+def grow(neighbours: dict[int, set[int]], start: list[int], count: int, rng: np.random.Generator) -> list[int]:
+    """Up to `count` rooms that hang together, with those to start from."""
+    out = list(start)
+    while len(out) < count:
+        edge = sorted(set().union(*(neighbours[i] for i in out)) - set(out))
+        if not edge:
+            break
+        out.append(edge[int(rng.integers(len(edge)))])
+    return out
+
+
+def framed_pair(a: PointCloud, b: PointCloud, known: Sim3, name: str, source: str, building: str, sensor: str, seed: int) -> Pair:
+    """Two clouds whose relation `known` (b into a) is published, moved into random frames."""
+    frames = draw_frames(2, False, np.random.default_rng(seed))
+    truth = frames[0] @ known @ frames[1].inverse()
+    flat = [c.points[:, :2].astype(np.float64) + c.shift[:2] for c in (a, b)]
+    there = known.apply(np.column_stack([flat[1], np.zeros(len(flat[1]))]))[:, :2]
+    clouds = moved(a, frames[0]), moved(b, frames[1])
+    return Pair(name, *clouds, truth, (), floor_overlap(flat[0], there), (sensor, sensor), source, building)

@@ -1,0 +1,138 @@
+"""Gates Dell Complex, UT Austin: robot grids of floors 1-4 (UTexas BWI) and line maps of the same floors (UT-AMRL), and three
+partial grids.
+
+The line maps' relation to the grids is not published. It was measured: first turned and moved by hand, then refined by
+`wall_fit.fit_walls` (all changes were below 0.3° and 0.1 m) and looked at as overlay. Walls agree to a decimetre or two; the grid
+of floor 4 is bent and misses them by up to 2 m in its north-east, floor 1's was put together from two maps.
+Floors 1 and 3 contain the partial grids pixel by pixel, moved by whole pixels: 1n and 1s are its two wings, 3ne the north of 3.
+Rooms are those of BWI, also for the line maps, which have none.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy import ndimage
+from topomerge.datasets.pairs.flat import HEIGHT, Flat, flat_pair, from_masks, moved_room, read_flat
+from topomerge.datasets.pairs.pairs import Pair
+
+from topomerge.errors import InputError
+from topomerge.io import grid
+from topomerge.types import Array, Sim3, TrueRoom
+
+FOLDER, LINES = "utexas_gdc_floors", "utexas_amrl_vectormaps"
+INTO_LINES = {  # BWI grid -> AMRL line map
+    "1": Sim3(np.radians(179.818), (-14.694, 3.939, 0.0)),
+    "2": Sim3(np.radians(-179.909), (-14.118, 2.608, 0.0)),
+    "3": Sim3(np.radians(-179.434), (-14.026, 9.348, 0.0)),
+    "4": Sim3(np.radians(179.677), (-13.801, 9.239, 0.0)),
+}
+INTO_WHOLE = {  # partial grid -> grid of the floor
+    "1n": ("1", Sim3(0.0, (0.1, 0.1, 0.0))),
+    "1s": ("1", Sim3(0.0, (-10.25, 62.25, 0.0))),
+    "3ne": ("3", Sim3(0.0, (0.1, 0.1, 0.0))),
+}
+CELL = 0.05  # m, of the raster that line maps are drawn into
+GAP = 5.0  # m; narrower gaps in the outer walls don't lead outside (glass is not in the line maps)
+MARGIN = 2 * GAP  # m around a line map
+CAVITY = 0.2  # m; what is narrower lies within a wall
+LARGEST, CELLS = 50 << 20, 50_000_000
+
+
+def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+    """Name and maker of four pairs of a grid and a line map, and three of a grid and a part of it."""
+    read = cache(partial(_grid, folder))
+    for seed, floor in enumerate(INTO_LINES):
+        yield f"gdc{floor}-lines", partial(_with_lines, read, folder.parent / LINES, floor, seed)
+    for seed, part in enumerate(INTO_WHOLE, len(INTO_LINES)):
+        yield f"gdc{INTO_WHOLE[part][0]}-{part}", partial(_with_part, read, part, seed)
+
+
+def _with_lines(read: Callable[[str], Flat], lines: Path, floor: str, seed: int) -> Pair:
+    b = read_lines(lines / f"GDC{floor}" / f"GDC{floor}.vectormap.json")
+    return _pair(f"gdc{floor}-lines", read(floor), b, INTO_LINES[floor].inverse(), "drawing", seed)
+
+
+def _with_part(read: Callable[[str], Flat], part: str, seed: int) -> Pair:
+    floor, truth = INTO_WHOLE[part]
+    return _pair(f"gdc{floor}-{part}", read(floor), read(part), truth, "laser2d", seed)
+
+
+def _pair(name: str, a: Flat, b: Flat, truth: Sim3, sensor: str, seed: int) -> Pair:
+    """A pair whose second map has the rooms of the first."""
+    b = replace(b, rooms=tuple(moved_room(room, truth.inverse()) for room in a.rooms))
+    return flat_pair(name, a, b, truth, ("laser2d", sensor), "utexas", "gdc", seed)
+
+
+def _grid(folder: Path, name: str) -> Flat:
+    """The grid of a floor, with the rooms of BWI where it has them."""
+    path = folder / "maps" / "real" / name
+    flat = read_flat(path / f"{name}.yaml")
+    return replace(flat, rooms=_rooms(path / "locations.yaml", path / f"{name}.yaml")) if name in INTO_LINES else flat
+
+
+def _rooms(path: Path, plan: Path) -> tuple[TrueRoom, ...]:
+    """Rooms of a floor: their outlines are given in pixels from the map's upper left corner.
+
+    Raises:
+        InputError: missing or damaged file.
+    """
+    about = grid.read_yaml(plan)
+    height = len(grid.read_image(about.image)[0])
+    try:
+        listed = yaml.safe_load(path.read_bytes())
+        outlines = [np.array(p, float).reshape(-1, 2) for p in listed["polygons"]]
+        named = list(zip(listed["locations"], outlines, strict=True))
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: has no list of locations with their polygons ({error}); copy it again") from error
+    corner = np.array(about.origin[:2])
+    metres = [(n, np.column_stack([p[:, 0], height - p[:, 1]]) * about.resolution + corner) for n, p in named if len(p) > 2]
+    return tuple(TrueRoom(str(name), polygon[::-1], 0.0, HEIGHT) for name, polygon in metres)
+
+
+def read_lines(path: Path) -> Flat:
+    """A line map of UT-AMRL: walls as drawn, and the floor that they enclose.
+
+    Raises:
+        InputError: missing, damaged, or of an absurd size.
+    """
+    if not path.is_file() or path.stat().st_size > LARGEST:
+        raise InputError(f"{path}: no such file, or far too large; check the folder")
+    try:
+        listed = json.loads(path.read_bytes())
+        lines = np.array([[[s[p]["x"], s[p]["y"]] for p in ("p0", "p1")] for s in listed], float).reshape(-1, 2, 2)
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{path}: is not a line map, a list of {{p0: {{x, y}}, p1: {{x, y}}}} ({error})") from error
+    low, high = lines.min(axis=(0, 1), initial=np.inf) - MARGIN, lines.max(axis=(0, 1), initial=-np.inf) + MARGIN
+    if not len(lines) or not np.prod((high - low) / CELL) < CELLS:
+        raise InputError(f"{path}: has no lines, or spans more than a building; copy it again")
+    walls = _drawn(lines, low, high)
+    return from_masks(walls[::-1], _floor(walls)[::-1], CELL, (*low.tolist(), 0.0), rays=False, source=path.name)
+
+
+def _drawn(lines: Array, low: Array, high: Array) -> Array:
+    """(h, w) bool, lowest row first: cells on a line."""
+    columns, rows = np.ceil((high - low) / CELL).astype(int) + 1
+    count = (np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) / CELL * 2).astype(int) + 2
+    t = np.concatenate([np.linspace(0, 1, n) for n in count])[:, None]
+    points = np.repeat(lines[:, 0], count, axis=0) * (1 - t) + np.repeat(lines[:, 1], count, axis=0) * t
+    cells = np.floor((points - low) / CELL).astype(int)
+    walls = np.zeros((int(rows), int(columns)), bool)
+    walls[cells[:, 1], cells[:, 0]] = True
+    return walls
+
+
+def _floor(walls: Array) -> Array:
+    """(h, w) bool: what lies between walls, without the cavities in them."""
+    far = ndimage.distance_transform_edt(~walls) * CELL
+    closed = ndimage.binary_fill_holes(far <= GAP / 2)
+    inside = ndimage.distance_transform_edt(closed) * CELL > GAP / 2
+    wide = ndimage.distance_transform_edt(far <= CAVITY) * CELL <= CAVITY  # an opening: narrow gaps vanish, corners stay
+    floor: Array = inside & ~walls & wide & ndimage.binary_propagation(inside & (far > CAVITY), mask=~walls)
+    return floor

@@ -1,0 +1,130 @@
+"""`topomerge atlas` and `topomerge merge` of more than two: files, exit statuses, one line for whatever is wrong."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import topomerge
+from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
+from topomerge.cli.main import main as cli
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps of an office's west and east and of another building, and an atlas of them."""
+    place = tmp_path_factory.mktemp("atlas")
+    for k in (0, 2):
+        topomerge.save_map(office_map(k), place / f"{NAMES[k]}.tmap")
+    topomerge.save_map(stranger(), place / "stranger.tmap")
+    words = [str(place / f"{name}.tmap") for name in ("west", "east", "stranger")]
+    assert cli(["atlas", "add", str(place / "house"), *words, "-q"]) == 0
+    return place
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    monkeypatch.chdir(folder)
+
+    def call(*words: str) -> tuple[int, str, str]:
+        status = cli(list(words))
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return call
+
+
+def test_listing(run: Run) -> None:
+    status, out, err = run("atlas", "list", "house")
+    assert status == 0 and err == ""
+    lines = out.splitlines()
+    assert "2 maps belong together (west, east)" in lines[0] and "stranger stands apart" in lines[0]
+    assert [line.split()[:1] for line in lines[1:]] == [["map"], ["west"], ["east"], ["stranger"]]
+    assert "map_0.tmap" in lines[2] and "apart" in lines[4]
+    status, out, _ = run("atlas", "list", "house", "--json")
+    assert status == 0 and json.loads(out)["components"][0]["names"] == ["west", "east"]
+
+
+STRANGE = [
+    {"maps": None}, {"maps": [{}]}, {"components": 3}, {"components": [{"maps": [[], []]}]}, {"reason": None}, {"format": [1]},
+    {"settings": 1e999}, {"maps": [{"name": [], "key": "", "source": {}, "rooms": 1e999, "storeys": -1}]},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("change", STRANGE)
+def test_a_strangers_listing(run: Run, folder: Path, change: dict[str, object]) -> None:
+    told = json.loads((folder / "house" / "atlas.json").read_text())
+    (folder / "strange").mkdir(exist_ok=True)
+    for changed in (told | change, {k: v for k, v in told.items() if k not in change}):
+        (folder / "strange" / "atlas.json").write_text(json.dumps(changed))
+        status, out, err = run("atlas", "list", "strange")
+        assert status == 0 or (status == 1 and err.count("\n") == 1 and out == ""), err
+        assert status == 0 or "damaged" in err or "of format" in err, err
+
+
+@pytest.mark.parametrize("found", [[], {"features": []}, {"yaw": 10**400}, {"translation": 3}, {"scale": 0}, {"probability": 7}])
+def test_strange_registrations_are_made_anew(run: Run, folder: Path, found: object) -> None:
+    from topomerge.fusion.atlas.store import _pairs, read_atlas
+
+    path = folder / "house" / "pairs.json"
+    before = path.read_text()
+    told = json.loads(before)
+    assert len(_pairs(read_atlas(folder / "house"))) == len(told["pairs"]) > 0
+    try:
+        good = next(p["hypotheses"][0] for p in told["pairs"] if p["hypotheses"])
+        told["pairs"][0]["hypotheses"] = [good | found if isinstance(found, dict) else found]
+        path.write_text(json.dumps(told))
+        assert _pairs(read_atlas(folder / "house")) == {}
+    finally:
+        path.write_text(before)
+
+
+def test_nothing_connected_is_status_two(run: Run, folder: Path) -> None:
+    status, out, err = run("atlas", "add", "two", "west.tmap", "stranger.tmap")
+    assert status == 2 and "nothing could be connected: all 2 maps stand apart" in out and err == ""
+    status, out, err = run("atlas", "remove", "two", "stranger", "--quiet")
+    assert status == 0 and out == "" and err == ""
+    assert not list((folder / "two").glob("map_*")) and [p.name for p in (folder / "two" / "maps").iterdir()] == ["west.tmap"]
+
+
+def test_three_maps_are_merged(run: Run, folder: Path) -> None:
+    status, out, err = run("merge", "west.tmap", "east.tmap", "stranger.tmap", "-o", "merged")
+    assert status == 0 and "west.tmap, east.tmap" in out and "stranger.tmap stands apart" in out and err == ""
+    told = json.loads((folder / "merged" / "merge.json").read_text())
+    assert told["status"] == "merged" and list(told["transforms"]) == ["1"] and len(told["maps"]) == 3
+    assert np.bitwise_or.reduce(topomerge.load_map(folder / "merged" / "map.tmap").provenance) == 0b11
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("add", "house"), "house: name the maps"),
+        (("add", "new", "missing.ply"), "missing.ply: no such file"),
+        (("add", "new", "west.tmap", "./west.tmap"), "west.tmap: is given twice"),
+        (("add", "house", "west.tmap"), "west.tmap: is in the atlas already, as west"),
+        (("add", "west.tmap", "east.tmap"), "west.tmap: is a file"),
+        (("add", "other", "east.tmap"), "other: is no atlas"),
+        (("add", "new", "broken.tmap"), "topomerge: broken.tmap: "),
+        (("add", "new", "west.tmap", "--threshold", "2"), "from 0 to 1"),
+        (("remove", "house", "attic"), "attic: is no map of house; it holds west, east, stranger"),
+        (("remove", "house"), "name the maps to take out; it holds west, east, stranger"),
+        (("remove", "nowhere", "west"), "nowhere: no such folder"),
+        (("list", "other"), "other: is no atlas"),
+        (("list", "house", "west"), "list takes the folder only"),
+        (("show", "house"), "invalid choice"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(run: Run, folder: Path, words: tuple[str, ...], told: str) -> None:
+    (folder / "broken.tmap").write_bytes((folder / "west.tmap").read_bytes()[:-2000])
+    (folder / "other").mkdir(exist_ok=True)
+    (folder / "other" / "notes.txt").write_text("mine")
+    before = (folder / "house" / "atlas.json").read_bytes()
+    status, out, err = run("atlas", *words)
+    assert status == 1 and out == "" and told in err and len(err.splitlines()) == 1
+    assert not (folder / "new").exists() and (folder / "house" / "atlas.json").read_bytes() == before

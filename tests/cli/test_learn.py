@@ -1,0 +1,37 @@
+"""`topomerge export-embedder`: what training made comes out as it is, or one line says why not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes_map import building
+from topomerge.cli.main import main as cli
+from topomerge.embedding import pretrained
+from topomerge.embedding.learned import load_embedder
+
+SHIPPED = str(Path(pretrained.__path__[0]))
+
+
+def test_an_embedder_comes_out_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("torch")
+    assert cli(["export-embedder", SHIPPED, "-o", str(tmp_path / "a" / "b")]) == 0
+    assert "numbers a room" in capsys.readouterr().out
+    assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == ["embedder.json", "embedder.safetensors"]
+    map = building(2, 2)
+    assert np.allclose(load_embedder(tmp_path / "a" / "b")(map), load_embedder(SHIPPED)(map), atol=1e-6)
+
+
+@pytest.mark.parametrize(("run", "place"), [("nowhere", "a/b"), ("", "a"), (SHIPPED, "file"), (SHIPPED, "file/x"), (SHIPPED, "")])
+def test_bad_input_is_one_line_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], run: str, place: str
+) -> None:
+    pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    assert cli(["export-embedder", run, "-o", place]) == 1
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and "; give " in err
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]

@@ -1,0 +1,355 @@
+"""The command line: statuses, one-line errors, whole files or none, and nothing heavy before it is needed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import topomerge
+from tests.scenes_map import building, same
+from topomerge.cli import console
+from topomerge.cli.commands import COMMANDS
+from topomerge.cli.main import main as cli
+from topomerge.errors import InputError
+from topomerge.io.maps import load_map, save_map
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Call `main` in an empty folder; gives status, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("TOPOMERGE_DEBUG", raising=False)
+
+    def call(*words: str) -> tuple[int, str, str]:
+        status = cli(words)
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return call
+
+
+@pytest.fixture
+def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Reading and extracting replaced: what they were given is recorded, and a `result` (map or error) comes out."""
+    import topomerge.extraction.extract as extraction
+    import topomerge.io.points as points
+
+    seen: dict[str, Any] = {"result": building(2, 2)}
+
+    def read_chunks(path: str, **options: Any) -> str:
+        seen["read"] = {"path": path, **options}
+        return "chunks"
+
+    def extract(chunks: str, **options: Any) -> Any:
+        seen["extract"] = {"chunks": chunks, **options}
+        if isinstance(seen["result"], BaseException):
+            raise seen["result"]
+        return seen["result"]
+
+    monkeypatch.setattr(points, "read_chunks", read_chunks)
+    monkeypatch.setattr(extraction, "extract", extract)
+    return seen
+
+
+def process(*words: str, code: str | None = None, **settings: Any) -> subprocess.CompletedProcess[str]:
+    start = [sys.executable, "-c", code] if code else [sys.executable, "-m", "topomerge"]
+    return subprocess.run([*start, *words], capture_output=True, text=True, timeout=60, check=False, **settings)
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = """
+import sys
+from topomerge.cli.main import main
+for words in (["--help"], ["--version"], ["extract", "--help"], ["info", "--help"], ["extract"]):
+    main(words)
+heavy = {"numpy", "numba", "scipy", "matplotlib", "rich", "open3d", "torch", "plyfile"} & set(sys.modules)
+sys.exit(f"imported {heavy}" if heavy else 0)
+"""
+    done = process(code=code)
+    assert done.returncode == 0, done.stderr
+
+
+def test_package_is_lazy_and_whole() -> None:
+    code = """
+import sys, topomerge as tm
+assert "numpy" not in sys.modules
+assert set(tm.__all__) <= set(dir(tm))
+assert tm.InputError.__name__ == "InputError" and "numpy" not in sys.modules
+assert callable(tm.load_map) and tm.load_map is sys.modules["topomerge.io.maps"].load_map
+"""
+    assert process(code=code).stderr == ""
+    assert all(getattr(topomerge, name) is not None for name in topomerge.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        topomerge.nothing  # noqa: B018
+
+
+def test_module_and_version() -> None:
+    assert process("--version").stdout == f"topomerge {topomerge.__version__}\n"
+    helped = process("--help").stdout
+    assert all(command.name in helped for command in COMMANDS) and "exit status" in helped
+
+
+@pytest.mark.parametrize("command", [command.name for command in COMMANDS])
+def test_help_has_an_example(run: Run, command: str) -> None:
+    status, out, _ = run(command, "--help")
+    assert status == 0 and f"example:\n  topomerge {command} " in out and "exit status" in out
+
+
+def test_presets_are_those_of_extract() -> None:
+    from topomerge.extraction.extract import PRESETS
+
+    (preset,) = (s for c in COMMANDS if c.name == "extract" for f, s in c.arguments if "--preset" in f)
+    assert set(preset["choices"]) == set(PRESETS)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["extract"],
+        ["extract", "a.ply"],
+        ["extract", "a.ply", "-o", "a.tmap", "--voxel-size", "0"],
+        ["extract", "a.ply", "-o", "a.tmap", "--voxel-size", "nan"],
+        ["extract", "a.ply", "-o", "a.tmap", "--voxel-size", "ten"],
+        ["extract", "a.ply", "-o", "a.tmap", "--unit", "miles"],
+        ["extract", "a.ply", "-o", "a.tmap", "--prese", "thesis"],
+        ["fly"],
+    ],
+)
+def test_wrong_words(run: Run, words: list[str]) -> None:
+    status, out, err = run(*words)
+    assert status == 1 and out == ""
+    assert err.startswith("topomerge") and err.count("\n") == 1 and "--help" in err
+
+
+@pytest.mark.parametrize("words", [["", "-o", "a.tmap"], ["scan.ply", "-o", ""], ["scan.ply", "-o", "a.tmap", "--json", ""]])
+def test_empty_names_are_no_files(run: Run, stages: dict[str, Any], tmp_path: Path, words: list[str]) -> None:
+    status, out, err = run("extract", *words)
+    assert status == 1 and out == "" and "is empty; give the name of a file" in err and err.count("\n") == 1
+    assert not stages.keys() & {"read"} and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", [["--up", "-y"], ["--up=-y"]])
+def test_values_may_start_with_a_dash(run: Run, stages: dict[str, Any], words: list[str]) -> None:
+    assert run("extract", "scan.ply", "-o", "a.tmap", *words)[0] == 0
+    assert stages["read"]["up"] == "-y"
+
+
+def test_no_words(run: Run) -> None:
+    status, _, err = run()
+    assert status == 1 and "extract" in err
+
+
+def test_extract_writes_all_and_prints_the_table(run: Run, stages: dict[str, Any], tmp_path: Path) -> None:
+    words = ["--json", "a.json", "--ply", "a_rooms.ply", "--figure", "a.png"]
+    status, out, err = run("extract", "scan.ply", "-o", "a.tmap", *words)
+    assert status == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "a.png", "a.tmap", "a_rooms.ply"]
+    assert same(load_map(tmp_path / "a.tmap"), stages["result"])
+    assert json.loads((tmp_path / "a.json").read_text())["format"] == 1
+    assert err == "topomerge: warning: only a test\n"
+    assert "10 rooms, 2 storeys, 6 doors, 2 openings, 1 stairs" in out
+    assert "4       0     14.6      2.90   1498      5  0, 1, 2, 3, 9 (stairs)" in out
+    assert "0.25  read and voxelise" in out
+
+
+def test_defaults_have_one_home(run: Run, stages: dict[str, Any]) -> None:
+    assert run("extract", "scan.ply", "-o", "a.tmap", "--quiet")[:2] == (0, "")
+    assert stages["read"] == {"path": "scan.ply", "progress": None}
+    assert stages["extract"] == {"chunks": "chunks", "name": "scan.ply", "progress": None}
+
+
+def test_options_reach_their_functions(run: Run, stages: dict[str, Any]) -> None:
+    words = "--voxel-size 0.05 --preset thesis --up y --unit mm --scale 2 --resolution 0.03 --extrude 3 --ceiling"
+    assert run("extract", "scan.ply", "-o", "a.tmap", *words.split())[0] == 0
+    read = {"up": "y", "unit": "mm", "scale": 2.0, "resolution": 0.03, "extrude": 3.0, "ceiling": True}
+    assert read.items() <= stages["read"].items()
+    assert {"voxel_size": 0.05, "preset": "thesis"}.items() <= stages["extract"].items()
+
+
+def from_a_signal(signal: BaseException) -> InputError:
+    """As it comes out of a reader that was running compiled code."""
+    try:
+        try:
+            raise SystemError("returned a result with an exception set") from signal
+        except SystemError as error:
+            raise InputError("scan.ply: damaged") from error
+    except InputError as error:
+        return error
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (InputError("scan.ply: no floor;\n crop it"), 1, "topomerge: scan.ply: no floor; crop it\n"),
+        (ValueError("edge must be above 0"), 1, "topomerge: scan.ply: edge must be above 0\n"),
+        (MemoryError(), 1, "topomerge: scan.ply: not enough memory; take larger voxels or a part of the input\n"),
+        (PermissionError(13, "Permission denied", "scan.ply"), 1, "topomerge: scan.ply: Permission denied\n"),
+        (KeyboardInterrupt(), 130, "topomerge: interrupted\n"),
+        (SystemExit(143), 143, ""),
+        (from_a_signal(SystemExit(143)), 143, ""),
+        (from_a_signal(KeyboardInterrupt()), 130, "topomerge: interrupted\n"),
+    ],
+)
+def test_failures(run: Run, stages: dict[str, Any], tmp_path: Path, error: Any, status: int, said: str) -> None:
+    stages["result"] = error
+    assert run("extract", "scan.ply", "-o", "a.tmap", "--json", "a.json") == (status, "", said)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_fault_of_ours_asks_for_a_report(run: Run, stages: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    stages["result"] = KeyError("x")
+    status, _, err = run("extract", "scan.ply", "-o", "a.tmap")
+    assert status == 1 and err.count("\n") == 1 and "scan.ply: unexpected KeyError" in err
+    status, _, err = run("extract", "scan.ply", "-o", "a.tmap", "-vv")
+    assert status == 1 and "Traceback" in err
+    monkeypatch.setenv("TOPOMERGE_DEBUG", "1")
+    assert "Traceback" in run("extract", "scan.ply", "-o", "a.tmap")[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["-o", "absent/a.tmap"], "absent/a.tmap: can't be written"),
+        (["-o", "."], "is a folder"),
+        (["-o", "a.tmap", "--json", "a.tmap"], "two outputs"),
+        (["-o", "scan.ply"], "is the input"),
+        (["-o", "a.tmap", "--figure", "a.docx"], "unknown kind of figure"),
+        (["-o", "a.tmap", "--ply", "absent/a.ply"], "absent/a.ply: can't be written"),
+    ],
+)
+def test_unwritable_outputs_are_found_first(
+    run: Run, stages: dict[str, Any], tmp_path: Path, words: list[str], reason: str
+) -> None:
+    (tmp_path / "scan.ply").write_text("ply")
+    status, _, err = run("extract", "scan.ply", *words)
+    assert status == 1 and reason in err and err.count("\n") == 1
+    assert "read" not in stages
+    assert [p.name for p in tmp_path.iterdir()] == ["scan.ply"]
+
+
+def test_all_outputs_or_none(run: Run, stages: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(map: Any, path: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(topomerge, "save_figure", full)
+    (tmp_path / "a.tmap").write_text("an older one")
+    status, _, err = run("extract", "scan.ply", "-o", "a.tmap", "--figure", "a.png")
+    assert (status, err) == (1, "topomerge: a.png: can't be written (No space left on device); give another place\n")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.tmap"]
+    assert (tmp_path / "a.tmap").read_text() == "an older one"
+
+
+def test_info(run: Run, tmp_path: Path) -> None:
+    save_map(building(1, 1), tmp_path / "a.tmap")
+    status, out, _ = run("info", "a.tmap")
+    assert status == 0 and out.startswith("building.ply: 3 rooms, 1 storey, 2 doors")
+    status, out, err = run("info", "a.tmap", "--json")
+    assert status == 0 and len(json.loads(out)["rooms"]) == 3
+    (tmp_path / "bad.tmap").write_bytes((tmp_path / "a.tmap").read_bytes()[:-50])
+    status, out, err = run("info", "bad.tmap")
+    assert (status, out) == (1, "") and err.startswith("topomerge: bad.tmap: damaged") and err.count("\n") == 1
+
+
+def test_a_strangers_map_does_not_steer_the_terminal(run: Run, tmp_path: Path) -> None:
+    text = "\x1b[31mred\x07\x9b\u202e\x00\ud800.ply"
+    save_map(replace(building(1, 1), source=text, warnings=(text,)), tmp_path / "a.tmap")
+    status, out, err = run("info", "a.tmap")
+    assert status == 0 and "red" in out and "red" in err
+    assert all(c.isprintable() or c == "\n" for c in out + err)
+    status, out, err = run("info", "\x1b[31mno.tmap")
+    assert status == 1 and "\x1b" not in err
+
+
+def test_info_into_a_pipe_that_closed(tmp_path: Path) -> None:
+    save_map(replace(building(1, 1), warnings=()), tmp_path / "a.tmap")
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "topomerge", "info", str(tmp_path / "a.tmap")]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_terminal_without_umlauts(tmp_path: Path) -> None:
+    save_map(building(1, 1), tmp_path / "a.tmap")
+    done = process("info", str(tmp_path / "a.tmap"), env={**os.environ, "PYTHONIOENCODING": "ascii"})
+    assert done.returncode == 0 and "area m?" in done.stdout
+
+
+def test_a_real_failure_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "bad.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n")
+    done = process("extract", "bad.ply", "-o", "a.tmap", "--json", "a.json", cwd=tmp_path)
+    assert done.returncode == 1 and done.stdout == ""
+    assert done.stderr.startswith("topomerge: bad.ply: ") and done.stderr.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.ply"]
+
+
+def test_sigterm_leaves_nothing(tmp_path: Path) -> None:
+    code = """
+import sys, time
+import topomerge, topomerge.cli.console as console
+from topomerge.cli import commands
+from topomerge.cli.main import main as cli
+def slow(args):
+    console.write_all([("a.tmap", lambda path: (print("here", flush=True), time.sleep(30)))])
+commands.COMMANDS[0].__dict__["run"] = slow
+sys.argv[1:] = ["extract", "x", "-o", "a.tmap"]
+sys.exit(cli())
+"""
+    started = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    assert started.stdout is not None and started.stdout.readline() == "here\n"
+    started.send_signal(signal.SIGTERM)
+    assert started.wait(20) == 143
+    started.stdout.close()
+    assert not list(tmp_path.iterdir())
+
+
+class Terminal:
+    """Stands for a stderr that is a terminal."""
+
+    def __init__(self) -> None:
+        self.text = ""
+
+    def isatty(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        self.text += text
+        return len(text)
+
+    def flush(self) -> None:
+        pass
+
+
+def test_bars_only_when_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with console.Bars() as bars:
+        report = bars.task("read")
+        assert report is not None
+        report(0.5, "scan.ply")
+    assert sys.stderr.text == ""  # type: ignore[attr-defined]
+    with console.Bars(delay=0.0) as bars:
+        report = bars.task("read")
+        assert report is not None
+        report(0.2, "[odd] name")
+        bars._timer.join()
+        report(2.0, "[odd] name")
+    report(1.0)  # a late word after the end does no harm
+    assert "[odd] name" in sys.stderr.text  # type: ignore[attr-defined]
+    assert console.Bars(enabled=False).task("read") is None
+
+
+def test_no_bars_without_a_terminal() -> None:
+    with console.Bars(delay=0.0) as bars:
+        assert bars.task("read") is None

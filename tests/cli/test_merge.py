@@ -1,0 +1,151 @@
+"""`topomerge merge`: files, exit statuses, and one line for whatever is wrong with the input."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import topomerge
+from tests.fusion.plans_of import MOVE, office, part
+from tests.scenes import Scene
+from topomerge.cli.main import main as cli
+
+Run = Callable[..., tuple[int, str, str]]
+WHOLE = ["map.tmap", "merge.json", "merged.ply", "report.html"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cloud of the west of an office, maps of its east and of another building, and a merge of the first two."""
+    place = tmp_path_factory.mktemp("merge")
+    points = office().points()
+    np.save(place / "a.npy", part(points, high=(16, 99)))
+    other = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,)).points()
+    for name, cloud in (("b", part(points, low=(5, -99))), ("c", other)):
+        moved = MOVE.apply(cloud).astype(np.float32)
+        topomerge.save_map(topomerge.extract(moved, name=f"{name}.ply"), place / f"{name}.tmap")
+    assert cli(["merge", str(place / "a.npy"), str(place / "b.tmap"), "-o", str(place / "merged"), "-q"]) == 0
+    return place
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    monkeypatch.chdir(folder)
+
+    def call(*words: str) -> tuple[int, str, str]:
+        status = cli(["merge", *words])
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return call
+
+
+def listing(folder: Path) -> Any:
+    return json.loads((folder / "merge.json").read_text())
+
+
+def test_a_cloud_and_a_map_are_merged(folder: Path) -> None:
+    merged = folder / "merged"
+    assert sorted(p.name for p in merged.iterdir()) == WHOLE
+    found = listing(merged)
+    assert found["status"] == "merged" and found["probability"] >= 0.9
+    assert [Path(m["source"]).name for m in found["maps"]] == ["a.npy", "b.tmap"]
+    matrix = np.array(found["transforms"]["1"]["matrix"])
+    middle = np.append(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0], 1.0)
+    assert np.allclose((matrix @ middle)[:3], [10.0, 7.0, 1.0], atol=0.08)
+    assert found["seconds"]["read"] > 0 and found["seconds"]["extract"] > 0 and found["seconds"]["fuse"] > 0
+    assert (merged / "merged.ply").read_bytes()[:40].startswith(b"ply\nformat binary")
+    assert topomerge.load_map(merged / "map.tmap").provenance is not None
+
+
+def test_a_refusal_has_status_two(run: Run, folder: Path) -> None:
+    status, out, err = run("b.tmap", "c.tmap", "-o", "no")
+    assert status == 2 and "not merged: probability" in out and err == ""
+    assert sorted(p.name for p in (folder / "no").iterdir()) == ["merge.json", "report.html"]
+    found = listing(folder / "no")
+    assert found["status"] == "abstained" and found["transforms"] == {} and found["matches"] == []
+    assert found["reason"] in out
+    status, out, err = run("b.tmap", "c.tmap", "-o", "no", "--quiet")
+    assert status == 2 and out == "" and "not merged" in err and len(err.splitlines()) == 1
+
+
+def test_force_writes_all_and_keeps_the_status(run: Run, folder: Path) -> None:
+    status, out, _ = run("b.tmap", "c.tmap", "-o", "forced", "--force")
+    assert status == 2 and "force" in out
+    assert sorted(p.name for p in (folder / "forced").iterdir()) == WHOLE
+    found = listing(folder / "forced")
+    assert found["status"] == "abstained" and list(found["transforms"]) == ["1"]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("b.tmap", "b.tmap"), "b.tmap: is given twice"),
+        (("b.tmap", "./merged/../b.tmap"), "is given twice"),
+        (("b.tmap", "copy.tmap"), "copy.tmap: is the same map as b.tmap"),
+        (("b.tmap",), "merge takes two maps or more, 1 given"),
+        (("a.npy", "b.tmap", "a.npy"), "a.npy: is given twice"),
+        (("b.tmap", "missing.ply"), "missing.ply: no such file"),
+        (("b.tmap", "broken.tmap"), "topomerge: broken.tmap: "),
+        (("b.tmap", "text.ply"), "topomerge: text.ply: "),
+        (("b.tmap", "mm.npy"), "topomerge: mm.npy: "),
+        (("b.tmap", "c.tmap", "--threshold", "2"), "from 0 to 1"),
+        (("b.tmap", "c.tmap", "--scale", "2"), "invalid choice"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(run: Run, folder: Path, words: tuple[str, ...], told: str) -> None:
+    (folder / "copy.tmap").write_bytes((folder / "b.tmap").read_bytes())
+    (folder / "broken.tmap").write_bytes((folder / "b.tmap").read_bytes()[:-2000])
+    (folder / "text.ply").write_text("no points\n")
+    np.save(folder / "mm.npy", np.load(folder / "a.npy") * 1000)
+    status, out, err = run(*words, "-o", "new")
+    assert status == 1 and out == ""
+    assert told in err and len(err.splitlines()) == 1
+    assert not (folder / "new").exists()
+
+
+def test_bad_folders(run: Run, folder: Path) -> None:
+    (folder / "file").write_text("")
+    for place, told in (("file", "is a file"), ("file/merged", "can't be made"), ("merged", "is the input")):
+        first = "merged/map.tmap" if place == "merged" else "b.tmap"
+        status, _, err = run(first, "c.tmap", "-o", place)
+        assert status == 1 and told in err and len(err.splitlines()) == 1
+    assert sorted(p.name for p in (folder / "merged").iterdir()) == WHOLE
+
+
+def test_the_report_in_a_browser(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The slider fades one map, rooms that are one light up together, and nothing is said on the console."""
+    from tests.viz import test_report as report
+
+    probe = """
+addEventListener("load", () => setTimeout(() => {
+  const seen = {}, slider = document.querySelector("[data-blend]");
+  const of = (name) => document.querySelector(".of-" + name).style.opacity;
+  seen.both = [of("a"), of("b")];
+  slider.value = 1;
+  slider.dispatchEvent(new Event("input"));
+  seen.b = [of("a"), of("b")];
+  const mates = JSON.parse(document.getElementById("mates").textContent);
+  const room = Object.keys(mates).find((one) => one[0] === "a");
+  document.querySelector(`path[data-room="${room}"]`).dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
+  const lit = (one) => document.querySelector(`path[data-room="${one}"]`).classList.contains("mate");
+  seen.mates = mates[room].every(lit);
+  document.title = JSON.stringify(seen);
+}, 500));
+"""
+    text = (folder / "merged" / "report.html").read_text(encoding="utf-8")
+    page = tmp_path / "report.html"
+    monkeypatch.setattr(report, "PROBE", probe)
+    page.write_text(report.with_probe(text), encoding="utf-8")
+    shown, console = report.browse(page, "--dump-dom", "--disable-3d-apis")
+    assert console == []
+    title = re.search("<title>(.*?)</title>", shown)
+    assert title
+    seen = json.loads(title[1].replace("&quot;", '"'))
+    assert seen == {"both": ["1", "1"], "b": ["0", "1"], "mates": True}

@@ -1,0 +1,41 @@
+"""True rooms of maps whose cells are not where the points are: a slice that was made into walls and a floor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from topomerge.datasets.pairs.truth import cell_labels, room_truth
+
+from topomerge.extraction.extract import extract
+from topomerge.types import PointCloud, TrueRoom
+
+
+def slice_of_two_rooms() -> PointCloud:
+    """Two rooms of 4 by 4 m with a door of 1 m between them, cut at 0.3 m, in a frame whose heights begin at 0.3 m."""
+    along = np.arange(0, 4, 0.04) + 0.02
+    side = [np.stack([along, np.full_like(along, y)], axis=1) for y in (0.0, 4.0)]
+    end = np.stack([np.zeros_like(along), along], axis=1)
+    between = end[(along < 1.5) | (along > 2.5)] + [4.0, 0]
+    left = np.concatenate([*side, end, between - [0.02, 0]])
+    right = np.concatenate([*(s + [4.0, 0] for s in side), end + [8.0, 0], between + [0.02, 0]])
+    points = np.concatenate([left, right])
+    points = np.column_stack([points, np.full(len(points), 0.05)]).astype(np.float32)
+    labels = np.repeat(np.array([0, 1], np.int32), [len(left), len(right)])
+    square = np.array([[0, 0], [4, 0], [4, 4], [0, 4.0]])
+    rooms = (TrueRoom("left", square, -0.3, 2.5), TrueRoom("right", square + [4, 0], -0.3, 2.5))
+    return PointCloud(points, labels=labels, rooms=rooms)
+
+
+@pytest.mark.parametrize("uneven", [0.0, 0.12])  # m: with it some points lie in the walls and some below them
+def test_a_slice_labels_the_walls_that_were_made_of_it(uneven: float) -> None:
+    cloud = slice_of_two_rooms()
+    cloud.points[:, 2] += uneven * (np.arange(len(cloud)) % 2)
+    map = extract(cloud, voxel_size=0.1, carve=False)
+    assert "slice" in " ".join(map.warnings)
+    labels = cell_labels(map, cloud)
+    assert (labels >= 0).mean() > 0.95
+    places = map.grid.centroids()
+    clear = np.abs(places[:, 0] - 4) > 0.2
+    assert (labels[clear & (labels >= 0)] == (places[clear & (labels >= 0), 0] > 4)).all()
+    truth = room_truth(map, cloud)
+    assert sorted(truth["room"][truth["one"]].tolist()) == [0, 1] and truth["iou"][truth["one"]].min() > 0.6

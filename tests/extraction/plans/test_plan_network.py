@@ -1,0 +1,122 @@
+"""The network of the plans: NumPy against torch, what it says of a drawn plan, and files that are none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from topomerge.errors import InputError
+from topomerge.extraction.plans.plan import BELOW, Plan
+from topomerge.extraction.plans.plan_network import (
+    CHANNELS,
+    CLASSES,
+    Told,
+    evidence,
+    forward,
+    read_weights,
+    segment,
+    through_wall,
+    weights,
+    without_furniture,
+)
+from topomerge.types import Array
+
+WALL, FLOOR = ((1 << 24) - 1) << BELOW, 1 << BELOW
+
+
+def drawn(wall: Array) -> Plan:
+    """The plan of a raised grid map: walls of 2.4 m, a floor everywhere else but outside."""
+    profile = np.where(wall, WALL, FLOOR).astype(np.uint64)
+    none = np.full(wall.shape, np.nan)
+    nothing = np.zeros(wall.shape, np.int64)
+    inside = ~wall
+    inside[[0, -1]] = inside[:, [0, -1]] = False
+    return Plan(0.1, np.zeros(2, np.int64), nothing, nothing + 30, profile, wall, inside, none, none)
+
+
+@pytest.fixture(scope="module")
+def two_rooms() -> Plan:
+    """5 m by 4 m each, with a door of 0.9 m and four legs of a table."""
+    wall = np.zeros((106, 46), bool)
+    wall[1:3], wall[-3:-1], wall[:, 1:3], wall[:, -3:-1], wall[52:54] = True, True, True, True, True
+    wall[52:54, 18:27] = False
+    for i, j in ((70, 15), (70, 21), (82, 15), (82, 21)):
+        wall[i, j] = True
+    return drawn(wall)
+
+
+def test_numpy_as_torch() -> None:
+    torch = pytest.importorskip("torch")
+    from benchmarks.training.train_plan_network import exported, network
+
+    torch.manual_seed(0)
+    net = network()
+    net.train()
+    net(torch.rand(4, CHANNELS, 64, 64))  # gives the normalisation something to know
+    net.eval()
+    x = np.random.default_rng(0).random((80, 144, CHANNELS)).astype(np.float32)
+    with torch.no_grad():
+        wanted = net(torch.from_numpy(x.transpose(2, 0, 1)[None].copy()))[0].numpy().transpose(1, 2, 0)
+    assert np.abs(forward(x, exported(net)) - wanted).max() < 1e-4
+
+
+def test_what_it_sees(two_rooms: Plan) -> None:
+    chance = segment(two_rooms)
+    assert chance.shape == (106, 46, len(CLASSES)) and np.allclose(chance.sum(axis=-1), 1, atol=1e-5)
+    answer = chance.argmax(axis=-1)
+    assert (answer[5:50, 5:41] == CLASSES.index("inside")).mean() > 0.95
+    boundary = chance[..., 1:4].sum(axis=-1)  # a wall, or a door that is shut
+    assert boundary[52:54, 5:15].max(axis=0).min() > 0.4 > boundary[20:40, 10:35].max()
+    assert chance[52:54, 20:25, CLASSES.index("doorway")].mean() > 0.5
+
+
+def test_furniture_is_no_wall(two_rooms: Plan) -> None:
+    plan = without_furniture(two_rooms, segment(two_rooms))
+    assert not plan.wall[65:90, 10:30].any() and plan.inside[65:90, 10:30].all()
+    assert plan.wall[52:54, 5:15].any(axis=0).all() and not (plan.wall & plan.inside).any()
+
+
+def test_through_a_wall(two_rooms: Plan) -> None:
+    told = [Told(segment(two_rooms), np.zeros(2), 0.1, 0.0), Told(np.zeros((106, 46, 5)), np.zeros(2), 0.1, 3.0)]
+    assert not through_wall(told, np.array([5.3, 2.25, 0.1])) and not through_wall(told, np.array([2.5, 2.0, 0.0]))
+    assert through_wall(told, np.array([5.3, 0.8, 0.1])) and not through_wall(told, np.array([5.3, 0.8, 2.9]))
+    assert not through_wall(told, np.array([50.0, -20.0, 0.0])) and not through_wall([], np.zeros(3))
+
+
+@pytest.mark.parametrize("turn", [1, 2, 3])
+def test_turned_and_shifted(two_rooms: Plan, turn: int) -> None:
+    """A plan that is turned, mirrored and shifted by a few columns is told alike."""
+    wall = np.pad(two_rooms.wall, ((turn, 7), (3, turn)))
+    there = segment(drawn(np.rot90(wall, turn)[::-1])).argmax(axis=-1)[::-1]
+    back = np.rot90(there, -turn)[turn : turn + 106, 3 : 3 + 46]
+    same = back == segment(two_rooms).argmax(axis=-1)
+    assert same[4:-4, 4:-4].mean() > 0.97
+
+
+def test_evidence(two_rooms: Plan) -> None:
+    x = evidence(two_rooms)
+    assert x.shape == (106, 46, CHANNELS) and x.dtype == np.float32 and np.isfinite(x).all()
+    assert x[52, 5].tolist() == pytest.approx([0, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0.5])
+    assert x[20, 20].tolist() == pytest.approx([1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0.5])
+
+
+def test_damaged_weights(tmp_path: Path) -> None:
+    known = dict(weights())
+    for change in ({"a1.w": known["a1.w"][:-9]}, {"h1.b": known["h1.b"][:-1]}, {"out.b": known["out.b"] * np.nan}):
+        path = tmp_path / "other.npz"
+        np.savez(path, **{**known, **change})
+        with pytest.raises(InputError, match=r"other\.npz"):
+            read_weights(path)
+    np.savez(path, **{k: v for k, v in known.items() if k != "e1.w"})
+    with pytest.raises(InputError, match="e1"):
+        read_weights(path)
+    whole = path.read_bytes()
+    for broken in (b"", b"hello", whole[: len(whole) // 2]):
+        path.write_bytes(broken)
+        with pytest.raises(InputError):
+            read_weights(path)
+    np.savez(path, **{**known, "a1.w": np.array([{"no": 1}], object)})
+    with pytest.raises(InputError):
+        read_weights(path)

@@ -1,0 +1,212 @@
+"""Rooms from the plans of the storeys: what sensors and buildings do to them must not change them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests import scenes
+from topomerge.extraction.assumed import has_floor, is_slice
+from topomerge.extraction.extract import PRESETS, extract, navigable_volume
+from topomerge.extraction.plans.door_classifier import door_probability
+from topomerge.extraction.plans.partition import merge_regions
+from topomerge.extraction.plans.passages import FEATURES, clearance_of, features, find_passages, regions_of
+from topomerge.extraction.plans.plan import storey_plan
+from topomerge.extraction.plans.plan_network import segment
+from topomerge.extraction.plans.plan_rooms import _floor, _upper_side
+from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
+from topomerge.extraction.voxels import voxelise
+from topomerge.types import STOREY_DTYPE, Array, PointCloud, TopometricMap, VoxelGrid
+
+CORRIDOR_ROOMS = [(x, y) for x in (2, 6, 10, 14) for y in (2, 8)]
+
+
+def room_at(result: TopometricMap, x: float, y: float, z: float = 0.0) -> int:
+    distance = np.linalg.norm(result.navigable.centroids() - (x, y, z), axis=1)
+    return int(result.navigable_room[distance.argmin()])
+
+
+def is_the_corridor(result: TopometricMap, z: float = 0.0) -> None:
+    """Nine rooms: the corridor whole, and eight beside it."""
+    hall = {room_at(result, x, 5, z) for x in np.arange(0.5, 16, 0.5)}
+    beside = {room_at(result, x, y, z) for x, y in CORRIDOR_ROOMS}
+    assert len(hall) == 1 and len(beside) == 8 and not hall & beside and len(result.rooms) == 9
+
+
+def turned(points: Array, degrees: float) -> Array:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return (points @ np.array([(c, s, 0), (-s, c, 0), (0, 0, 1.0)])).astype(np.float32)
+
+
+def agreement(a: TopometricMap, b: TopometricMap, back: float = 0.0) -> float:
+    """Mean IoU of the rooms of a with their best in b, on a's floor; b is turned by `back` degrees against a."""
+    places = turned(a.navigable.centroids(), back)
+    row = b.navigable.rows(b.navigable.locate(places))
+    row = np.where(row >= 0, row, b.navigable.rows(b.navigable.locate(places) + (0, 0, 1)))
+    label = np.where(row >= 0, b.navigable_room[np.maximum(row, 0)], -1)
+    best = []
+    for r in range(len(a.rooms)):
+        mine = a.navigable_room == r
+        others = (label == k for k in np.unique(label[mine]) if k >= 0)
+        best.append(max(((mine & other).sum() / (mine | other).sum() for other in others), default=0))
+    return float(np.mean(best))
+
+
+@pytest.fixture(scope="module")
+def corridor() -> Array:
+    return scenes.corridor().points(0.01)
+
+
+def test_without_lintels(corridor: Array) -> None:
+    scene = scenes.Scene().shell(0, 0, 16, 10)
+    for y in (4, 6):
+        scene.wall((0, y), (16, y), doors=(2.0, 6.0, 10.0, 14.0), lintel=False)
+    for x in (4, 8, 12):
+        scene.wall((x, 0), (x, 4)).wall((x, 6), (x, 10))
+    is_the_corridor(extract(scene.points(0.01)))
+
+
+def test_nothing_above_two_metres(corridor: Array) -> None:
+    is_the_corridor(extract(corridor[corridor[:, 2] < 2.0]))
+
+
+def test_furniture_hides_the_floor_and_stays_in_the_room() -> None:
+    scene = scenes.two_rooms()
+    scene.box(0.0, 3.5, 0.0, 3.9, 5.0, 0.75)  # a counter through the room
+    scene.box(1.0, 0.0, 0.0, 2.0, 0.6, 1.95)  # a cupboard
+    points = scene.points(0.005)
+    under = (points[:, 0] < 3.85) & (points[:, 1] > 3.55) & (points[:, 2] < 0.7) & (points[:, 1] < 4.9)
+    result = extract(points[~under])
+    assert len(result.rooms) == 2
+    assert result.rooms["area"][room_at(result, 2, 2)] == pytest.approx(20, rel=0.08)
+    standing = result.navigable.properties["standing"]
+    on_counter = (np.abs(result.navigable.centroids()[:, :2] - (2, 4.2)) < 0.4).all(axis=1)
+    assert on_counter.any() and not standing[on_counter].any() and standing.mean() > 0.6
+
+
+def test_sparse_points_get_larger_cells(corridor: Array) -> None:
+    few = corridor[np.random.default_rng(0).random(len(corridor)) < 0.05]
+    result = extract(few)
+    assert result.grid.edge == pytest.approx(0.2) and any("sparse" in w for w in result.warnings)
+    is_the_corridor(result)
+    assert extract(corridor).grid.edge == 0.1
+
+
+@pytest.mark.parametrize("poses", [True, False])
+def test_a_slice_gets_walls_and_a_floor(corridor: Array, poses: bool) -> None:
+    points = corridor[np.abs(corridor[:, 2] - 0.3) < 0.04]
+    assert is_slice(voxelise(points, 0.1, []))
+    cloud = PointCloud(points)
+    if poses:  # a laser in the middle of every room, and along the corridor
+        places = np.array([(x, y) for x, y in CORRIDOR_ROOMS] + [(x, 5.0) for x in range(1, 16)])
+        seen_by = np.linalg.norm(points[:, None, :2] - places, axis=2).argmin(axis=1)
+        stand = np.tile(np.eye(4), (len(places), 1, 1))
+        stand[:, :2, 3], stand[:, 2, 3] = places, 0.3
+        cloud = PointCloud(points, poses=stand, pose_of=seen_by.astype(np.int32))
+    result = extract(cloud)
+    assert any("slice" in w for w in result.warnings)
+    is_the_corridor(result, 0.2)
+
+
+def test_the_upper_half_gets_a_floor(corridor: Array) -> None:
+    upper = corridor[corridor[:, 2] > 1.0]
+    grid = voxelise(upper, 0.1, [])
+    assert not has_floor(grid, navigable_volume(grid, PRESETS["default"]), 1.75)
+    result = extract(upper)
+    assert any("no floor was seen" in w for w in result.warnings)
+    is_the_corridor(result, float(result.storeys["floor"][0]))
+    whole = voxelise(corridor, 0.1, [])
+    assert has_floor(whole, navigable_volume(whole, PRESETS["default"]), 1.75)
+
+
+def test_turning_shuffling_and_other_cells_change_little(corridor: Array) -> None:
+    result = extract(corridor)
+    shuffled = extract(corridor[np.random.default_rng(0).permutation(len(corridor))], carve=False)
+    assert (shuffled.room == result.room).all() and (shuffled.rooms == result.rooms).all()
+    assert agreement(result, extract(turned(corridor, 27.0)), 27.0) > 0.9
+    for edge in (0.05, 0.15):
+        assert len(extract(corridor, voxel_size=edge).rooms) == 9
+
+
+def test_a_wide_opening_keeps_both_readings() -> None:
+    scene = scenes.Scene().shell(0, 0, 10, 5).wall((5, 0), (5, 1.2)).wall((5, 3.8), (5, 5))  # 2.6 m open, no lintel
+    result = extract(scene.points(0.005))
+    assert len(result.areas) == 2
+    assert len(result.rooms) == 2 or (len(result.narrows) == 1 and result.narrows["width"][0] == pytest.approx(2.6, abs=0.4))
+    whole = extract(scenes.table().points(0.005))
+    assert len(whole.rooms) == len(whole.areas) == 1 and not len(whole.narrows)
+
+
+def test_free_space_is_what_rays_crossed() -> None:
+    points = scenes.two_rooms().points()
+    right = points[:, 0] > 4.3
+    stand = np.eye(4)
+    stand[:3, 3] = (2.0, 2.5, 1.5)
+    cloud = PointCloud(points[~right], poses=stand[None], pose_of=np.zeros((~right).sum(), np.int32))
+    free = extract(cloud).free
+    assert free is not None and free.edge == pytest.approx(0.2)
+    places = free.centroids()
+    assert places[:, 0].max() < 4.4 and (places[:, 2] > -0.1).all() and (places[:, 2] < 2.8).all()
+    assert len(free) * free.edge**3 == pytest.approx(4 * 5 * 2.7, rel=0.25)
+    swept = extract(points).free  # the sensor's place unknown: swept from views
+    assert swept is not None and swept.contains(swept.locate(np.array([(5.5, 2.5, 1.2)])))[0]
+    assert not swept.contains(swept.locate(np.array([(4.0, 4.0, 1.2)])))[0]
+    assert extract(points, carve=False).free is None
+
+
+def test_the_upper_side_of_a_ceiling_is_no_storey() -> None:
+    """Walls that rise above a thin ceiling, as in building models, make no attic."""
+    scene = scenes.Scene().floor(0, 0, 8, 5).floor(0, 0, 8, 5, 2.6)
+    for a, b in (((0, 0), (8, 0)), ((0, 5), (8, 5)), ((0, 0), (0, 5)), ((8, 0), (8, 5))):
+        scene.wall(a, b, 0.0, 3.6)
+    result = extract(scene.points(0.005))
+    assert len(result.storeys) == 1 and len(result.rooms) == 1
+
+
+def test_passages_measure_the_door() -> None:
+    grid = voxelise(scenes.two_rooms().points(0.005), 0.1, [])
+    navigable = navigable_volume(grid, PRESETS["default"])
+    _, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, 1.75))
+    plan = storey_plan(grid, navigable, storey, 0)
+    clearance = clearance_of(plan)
+    chance = segment(plan)
+    region = regions_of(plan, chance)
+    found = find_passages(plan, clearance, region, chance)
+    x = grid.origin[0] + (plan.low[0] + 0.5) * grid.edge
+    at_the_door = [p for p in found.values() if abs(x + p.place[0] * grid.edge - 4.0) < 0.3]
+    assert len(at_the_door) == 1
+    values = dict(zip(FEATURES, features(at_the_door[0], (2.0, 1.5), (20.0, 15.0)), strict=True))
+    assert values["width"] == pytest.approx(scenes.DOOR[0], abs=0.25)
+    assert values["lintel"] == pytest.approx(scenes.HEIGHT - scenes.DOOR[1], abs=0.15) and values["lintel_cover"] > 0.8
+    assert values["jamb"] > 0.8 and values["opens"] > 1.0 and values["length"] < 0.5
+    assert door_probability(features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
+    parted = merge_regions(region, clearance, found, plan.edge, door_probability, 0.5, 0.2, 0.8)
+    never = merge_regions(region, clearance, found, plan.edge, lambda x: np.zeros(len(x)), 0.5, 0.2, 0.8)
+    always = merge_regions(region, clearance, found, plan.edge, lambda x: np.ones(len(x)), 0.5, 0.2, 0.0)
+    sizes = np.bincount(region[region >= 0])
+    assert len(np.unique(parted.room[sizes * 0.01 > 1])) == 2
+    assert len(np.unique(never.room)) == 1 and len(np.unique(always.room)) == len(sizes)
+
+
+def test_what_nothing_is_above_at_the_height_of_a_ceiling_is_no_storey() -> None:
+    levels = np.array([(0.0, 2.6, 90.0), (2.5, np.nan, 20.0)], STOREY_DTYPE)
+    assert _upper_side(levels[1], levels[:1])
+    for floor, ceiling in ((2.9, np.nan), (2.5, 5.1)):  # a slab above it; something above it
+        levels[1] = (floor, ceiling, 20.0)
+        assert not _upper_side(levels[1], levels[:1])
+    assert not _upper_side(levels[0], levels[:0])
+
+
+def test_a_storey_without_a_room_of_its_own_is_none() -> None:
+    """Stray cells beside a room that the room reaches: they are its own, not a second storey."""
+    floor = np.argwhere(np.ones((20, 20, 1), bool))
+    stray = floor[-3:] + (1, 0, 0)
+    grid = VoxelGrid.from_cells(np.concatenate([floor, stray]), np.zeros(3), 0.1, (21, 20, 2))
+    storeys = np.array([(0.05, 0.35, 0.0), (0.15, np.nan, 0.0)], STOREY_DTYPE)
+    parts = [
+        (cells, np.ones(len(cells), bool), np.full(len(cells), k), np.full(len(cells), -k), np.full(len(cells), -k))
+        for k, cells in enumerate((floor, stray))
+    ]
+    found = _floor(grid, storeys, parts, [np.zeros(1, np.int32)], np.full(len(grid), -1, np.int32), {})
+    assert len(found.storeys) == 1 and found.storeys["area"][0] == pytest.approx(4.0, abs=0.05)
+    assert (found.storey == 0).all() and (found.room == 0).all()

@@ -1,0 +1,128 @@
+"""What plans show of analytic buildings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.fusion.plans_of import doubled, grid_of, office
+from tests.scenes import HEIGHT, Scene
+from topomerge.errors import InputError
+from topomerge.fusion.storey_plan import extruded, plans, slices
+from topomerge.kernels.plan import column_bits, on_lines
+from topomerge.types import VoxelGrid
+
+
+def at(plan, mask, x, y) -> bool:
+    i, j = np.floor((np.array([x, y]) - plan.origin) / plan.cell).astype(int)
+    return bool(mask[i, j])
+
+
+@pytest.fixture(scope="module")
+def room():
+    return Scene().shell(0, 0, 6, 4).box(2, 1, 0, 3, 2, 0.75).points()
+
+
+def test_walls_floor_and_furniture_of_a_room(room):
+    (plan,) = plans(grid_of(room))
+    assert plan.floor == pytest.approx(0.021, abs=0.03)
+    assert plan.ceiling == pytest.approx(HEIGHT + 0.021, abs=0.06)
+    assert at(plan, plan.free, 1, 3) and at(plan, plan.free, 5, 2)
+    assert at(plan, plan.clutter, 2.5, 1.5) and not at(plan, plan.wall, 2.5, 1.5)
+    assert at(plan, plan.wall, 3, 0.05) and at(plan, plan.wall, 6.05, 2)
+    assert not (plan.wall & plan.free).any() and not (plan.clutter & (plan.wall | plan.free)).any()
+    assert plan.free.sum() * plan.cell**2 == pytest.approx(6 * 4 - 1, rel=0.06)
+
+
+def test_without_ceiling_and_without_all_that_is_low(room):
+    (low,) = plans(grid_of(room[room[:, 2] < 2.4]))
+    assert np.isfinite(low.floor) and np.isnan(low.ceiling) and at(low, low.free, 5, 2) and at(low, low.wall, 3, 0.05)
+    (high,) = plans(grid_of(room[room[:, 2] > 1.0]))
+    assert np.isnan(high.floor) and high.ceiling == pytest.approx(HEIGHT, abs=0.1)
+    assert at(high, high.free, 5, 2) and at(high, high.wall, 3, 0.05)
+    assert high.guess == pytest.approx(0.0, abs=0.15)
+
+
+def test_a_slice_shows_walls_and_what_rays_crossed(room):
+    cut = room[np.abs(room[:, 2] - 0.3) < 0.04]
+    grid = grid_of(cut)
+    inside = np.argwhere(np.ones((50, 30), bool)) + 5
+    free = grid.with_cells(np.column_stack([inside, np.zeros(len(inside), int)]))
+    (plan,) = plans(grid, free)
+    assert plan.sliced and slices(grid)
+    assert at(plan, plan.wall, 3, 0.05) and at(plan, plan.free, 4.5, 1)
+    assert not plans(grid)[0].free.any()
+
+
+def test_slices_of_two_storeys():
+    scene = office(furnished=False).points()
+    cut = scene[np.abs(scene[:, 2] - 0.3) < 0.04]
+    above = cut + np.array([0, 0, 3.1], np.float32)
+    found = plans(grid_of(np.concatenate([cut, above])))
+    assert [p.sliced for p in found] == [True, True]
+    assert found[1].floor - found[0].floor == pytest.approx(3.1, abs=0.05)
+
+
+def test_storeys_above_each_other():
+    found = plans(grid_of(doubled(office())))
+    assert len(found) == 2
+    assert found[1].floor - found[0].floor == pytest.approx(HEIGHT + 0.3, abs=0.1)
+    same = found[0].wall & found[1].wall
+    assert same.sum() > 0.9 * found[0].wall.sum()
+
+
+def test_a_tilted_floor_stays_free(room):
+    tilted = room.copy()
+    tilted[:, 2] += 0.06 * tilted[:, 0]  # 0.36 m over the room: more than a band
+    (plan,) = plans(grid_of(tilted))
+    assert plan.free.sum() * plan.cell**2 > 0.85 * 23
+
+
+def test_extruded_drawings_are_maps():
+    walls = Scene().wall((0, 0), (8, 0), height=2.5).wall((0, 5), (8, 5), height=2.5).wall((0, 0), (0, 5), height=2.5)
+    scene = walls.floor(0, 0, 8, 5)
+    (plan,) = plans(grid_of(scene.points()))
+    assert at(plan, plan.wall, 4, 0.05) and at(plan, plan.free, 4, 2.5)
+
+
+def test_an_empty_map_is_refused():
+    with pytest.raises(InputError, match="no occupied cells"):
+        plans(VoxelGrid.from_cells(np.zeros((0, 3), int)))
+
+
+def test_column_bits_equal_a_slow_twin():
+    rng = np.random.default_rng(0)
+    ix, iy, z = rng.integers(-1, 7, 300), rng.integers(-1, 6, 300), rng.uniform(-1, 9, 300)
+    z[::17] = np.nan
+    base = rng.uniform(0, 1, (6, 5))
+    slow = np.zeros((6, 5), np.uint32)
+    for x, y, h in zip(ix, iy, z, strict=True):
+        if 0 <= x < 6 and 0 <= y < 5 and not np.isnan(h):
+            k = int(np.floor((h - base[x, y] + 0.5) / 0.25))
+            slow[x, y] |= np.uint32(1 << k) if 0 <= k < 32 else np.uint32(0)
+    assert np.array_equal(column_bits(ix, iy, z, base, -0.5, 0.25), slow)
+
+
+def test_on_lines_keeps_straight_runs_only():
+    mask = np.zeros((40, 40), bool)
+    mask[5, 3:30] = True
+    mask[np.arange(10, 35), np.arange(10, 35)] = True
+    legs = [(20, 5), (22, 7), (33, 3), (35, 6), (30, 9)]
+    for leg in legs:
+        mask[leg] = True
+    angles = np.pi * np.arange(24) / 24
+    kept = on_lines(mask, np.cos(angles), np.sin(angles), 12, 11, 3)
+    assert kept[5, 3:30].all() and kept[np.arange(10, 35), np.arange(10, 35)].all()
+    assert not any(kept[leg] for leg in legs)
+
+
+def test_a_slice_that_was_given_walls_stays_a_slice(room):
+    """Its table is four legs at one height, and nothing is known of heights: extraction assumes walls and a floor."""
+    layer = room[np.abs(room[:, 2] - 0.3) < 0.05] * (1, 1, 0)
+    cells = grid_of(layer).cells
+    walls = np.concatenate([cells + (0, 0, k) for k in range(1, 25)])
+    inside = np.stack(np.meshgrid(np.arange(1, 59), np.arange(1, 39), [0]), -1).reshape(-1, 3)
+    raised = VoxelGrid.from_cells(np.concatenate([walls, inside]).astype(np.int32))
+    assert extruded(raised) and not extruded(grid_of(room))
+    (plan,) = plans(raised)
+    assert plan.sliced and at(plan, plan.wall | plan.clutter, 2.5, 0.05) and at(plan, plan.free, 1, 3)

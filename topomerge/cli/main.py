@@ -1,0 +1,178 @@
+"""The command line: parse, run one command, and turn every failure into one line and an exit status.
+
+Nothing heavy is imported here: `topomerge --help` must not wait for NumPy. The commands stand in `topomerge.cli.commands`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from topomerge import __version__
+from topomerge.cli.command import Command
+from topomerge.cli.commands import COMMANDS
+from topomerge.errors import printable
+
+EXIT_STATUSES = """\
+exit status:
+  0    done
+  1    bad input or a wrong command line: one line on stderr says which file and why; no output is written
+  2    no trustworthy merge: the reason is printed and stands in merge.json
+  130  interrupted
+  141  what read the output went away (`| head`)
+  143  terminated
+Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""
+
+
+SIGNED = ("--origin", "--up")  # options whose value may start with a dash
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, with status 1: 2 is kept for "no trustworthy merge"."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(1, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of every command."""
+    parser = _Parser(
+        prog="topomerge",
+        description="Rooms, doors and storeys out of partial indoor maps, matched and merged across sensors.",
+        epilog=f"example:\n  topomerge extract scan.ply -o a.tmap --figure a.png\n\n{EXIT_STATUSES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"topomerge {__version__}")
+    parser.set_defaults(run=None, paths=())
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    for command in COMMANDS:
+        _add(commands, command)
+    return parser
+
+
+def _add(commands: Any, command: Command) -> None:
+    parser = commands.add_parser(
+        command.name,
+        help=command.summary,
+        description=command.description or command.summary,
+        epilog=f"example:\n  {command.example}\n\n{EXIT_STATUSES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    for flags, settings in command.arguments:
+        parser.add_argument(*flags, **settings)
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="tell more; twice: with tracebacks")
+    parser.set_defaults(run=command.run, paths=command.paths)
+
+
+def _failure(error: BaseException, paths: Sequence[str]) -> str:
+    """One line about an error that names the file it is about."""
+    if isinstance(error, MemoryError):
+        text = "not enough memory; take larger voxels or a part of the input"
+    elif isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    elif isinstance(error, ImportError):
+        text = f"this needs the Python package {error.name or error}, which is not installed"
+    elif isinstance(error, ValueError):
+        text = str(error)
+    else:
+        text = f"unexpected {type(error).__name__}: {error} (a fault in topomerge: run again with -v -v and report it)"
+    text = " ".join(text.split()) or type(error).__name__
+    if paths and not any(path in text for path in paths):
+        text = f"{paths[0]}: {text}"
+    return printable(f"topomerge: {text}")
+
+
+def _named_paths(args: argparse.Namespace) -> list[str]:
+    """The files that the user named, the input first."""
+    given = [getattr(args, name) for name in args.paths if getattr(args, name, None)]
+    return [str(path) for value in given for path in (value if isinstance(value, list) else [value])]
+
+
+def _signal_behind(error: BaseException | None) -> BaseException | None:
+    """The Ctrl-C or SIGTERM that an error comes from, if any: one during compiled code comes out as a SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
+        error = error.__cause__ or error.__context__
+    return error
+
+
+def _refuse_empty_names(args: argparse.Namespace) -> None:
+    """An empty name is what a script's unset variable leaves; pathlib would take it for the current folder."""
+    for name in args.paths:
+        value = getattr(args, name, None)
+        if value == "" or (isinstance(value, list) and "" in value):
+            raise ValueError(f"the name given for {name} is empty; give the name of a file or folder")
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    """`--origin -33.9,151.2` as `--origin=-33.9,151.2`: argparse takes a value that starts with a dash for another option."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] in SIGNED and word.startswith("-"):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
+def _run(args: argparse.Namespace) -> int:
+    debug = args.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
+    logging.basicConfig(format="topomerge: %(message)s")
+    logging.getLogger("topomerge").setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[min(args.verbose, 2)])
+    try:
+        _refuse_empty_names(args)
+        status = int(args.run(args))
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        # The interpreter flushes stdout once more at exit: give it a place where that succeeds.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except (KeyboardInterrupt, Exception) as error:
+        signalled = _signal_behind(error)
+        if isinstance(signalled, SystemExit):
+            raise signalled from None
+        if signalled is not None:
+            print("topomerge: interrupted", file=sys.stderr)
+            return 130
+        if debug:
+            traceback.print_exc()
+        print(_failure(error, _named_paths(args)), file=sys.stderr)
+        return 1
+
+
+def _terminate(*_: object) -> NoReturn:
+    """On SIGTERM: leave through the `finally` clauses that delete half-written files."""
+    raise SystemExit(143)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: the words after `topomerge`; those of the process by default.
+
+    Returns:
+        The exit status, see `EXIT_STATUSES`.
+    """
+    if argv is None:
+        signal.signal(signal.SIGTERM, _terminate)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")  # a terminal without m² must not end the work
+    parser = build_parser()
+    try:
+        args = parser.parse_args(_joined(sys.argv[1:] if argv is None else argv))
+        if args.run is None:
+            parser.print_help(sys.stderr)
+            return 1
+        return _run(args)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 1 if stop.code else 0

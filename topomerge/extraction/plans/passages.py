@@ -1,0 +1,163 @@
+"""Where two regions of a storey meet, and what speaks for a door there (beyond the thesis: findings.md, "What worked").
+
+The regions are the basins of a watershed of the clearance: they part at every narrowing. Whether a narrowing is a door is judged
+by its width, what is on both sides of it, what is above it and how the walls beside it stand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import edt
+import numpy as np
+from scipy import ndimage
+
+from topomerge.extraction.plans.plan import Plan
+from topomerge.kernels import crossing
+from topomerge.kernels.watershed import contacts, watershed
+from topomerge.types import Array
+
+PROMINENCE = 0.1  # m: lower peaks of the clearance are noise of the walls
+AROUND = 1.2  # m: what lies so near to a narrowing is looked at
+LINTEL = 0.2  # m below the ceiling
+BARRIER = 0.5  # probability of a wall, a doorway or a shut door: what is more likely one parts regions
+
+FEATURES = (
+    "width",  # m, at the narrowest
+    "share",  # of the narrower side's greatest width
+    "wider",  # of the wider side's
+    "clearance",  # m, by which the clearance grows within 0.6 m, on the side where it grows less
+    "opens",  # m, by which the free width grows within 0.6 m, on the side where it grows less
+    "opens_wide",  # and where it grows more
+    "length",  # m, over which it is as narrow
+    "lintel",  # m by which what is above lies below both ceilings
+    "lintel_cover",  # share of the opening that has a lintel
+    "ceiling_seen",  # 0 or 1
+    "step",  # m between the two ceilings
+    "jamb",  # m by which the wall goes on in line with the narrowing, on the shorter side, up to 1
+    "longer_jamb",
+    "doorway",  # probability of a doorway along the opening, by the network of the plans (segment.py)
+    "boundary",  # of a wall, a doorway or a shut door
+    "small",  # log of the smaller side's area, m2
+    "large",
+)
+
+
+@dataclass(frozen=True)
+class Passage:
+    """The widest connection of two neighbouring regions; what does not depend on how the regions are merged."""
+
+    place: tuple[int, int]  # element of the plan
+    width: float  # m
+    across: tuple[float, float]  # unit vector from jamb to jamb
+    measured: tuple[float, ...]  # the features 3 to 14
+
+
+def clearance_of(plan: Plan) -> Array:
+    """(nx, ny) m from each open column to the next wall or to the end of what is known; 0 elsewhere."""
+    return np.asarray(edt.edt(plan.inside.view(np.uint8), black_border=True, parallel=1), np.float64) * plan.edge
+
+
+def regions_of(plan: Plan, chance: Array) -> Array:
+    """(nx, ny) int64 basin of each open column, -1 elsewhere.
+
+    What the network takes for a wall or a doorway parts basins as walls do: openings as wide as the room have no narrowing, and
+    sparse scans have holes in their walls. Its columns then go to the nearest basin.
+
+    Args:
+        chance: (nx, ny, 5) what probably stands in each column, see `segment.CLASSES`.
+    """
+    barrier = plan.inside & (chance[..., 1:4].sum(axis=-1) > BARRIER)
+    clearance = edt.edt((plan.inside & ~barrier).view(np.uint8), black_border=True, parallel=1) * plan.edge
+    order = np.argsort(-clearance, axis=None, kind="stable")
+    order = order[clearance.ravel()[order] > 0]
+    region = np.asarray(watershed(np.asarray(clearance, np.float64), order, PROMINENCE))
+    if not barrier.any() or not (region >= 0).any():
+        return region
+    nearest = ndimage.distance_transform_edt(region < 0, return_distances=False, return_indices=True)
+    return np.where(barrier, region[tuple(nearest)], region)
+
+
+def find_passages(plan: Plan, clearance: Array, region: Array, chance: Array) -> dict[tuple[int, int], Passage]:
+    """The widest connection of each pair of neighbouring regions.
+
+    Args:
+        chance: (nx, ny, 5) what probably stands in each column, see `segment.CLASSES`.
+    """
+    meet = contacts(region, clearance)
+    if not len(meet):
+        return {}
+    width = clearance.ravel()[meet[:, 2]]
+    order = np.lexsort((meet[:, 2], -width, meet[:, 1], meet[:, 0]))
+    meet = meet[order]
+    first = np.ones(len(meet), bool)
+    first[1:] = (meet[1:, :2] != meet[:-1, :2]).any(axis=1)
+    thick = ndimage.binary_dilation(plan.wall, np.ones((3, 3)))  # walls are not quite straight
+    nearest = ndimage.distance_transform_edt(plan.inside, return_distances=False, return_indices=True)
+    low = plan.clear < plan.ceiling - LINTEL  # nan: no
+    layers = low, np.ascontiguousarray(chance[..., 2]), chance[..., 1:4].sum(axis=-1)
+    return {
+        (int(a), int(b)): _passage(plan, clearance, region, nearest, thick, layers, int(a), int(b), int(at))
+        for a, b, at in meet[first]
+    }
+
+
+def _passage(
+    plan: Plan,
+    clearance: Array,
+    region: Array,
+    nearest: Array,
+    thick: Array,
+    layers: tuple[Array, Array, Array],
+    a: int,
+    b: int,
+    at: int,
+) -> Passage:
+    x, y = divmod(at, plan.wall.shape[1])
+    e, here = plan.edge, float(clearance[x, y])
+    wall = nearest[:, x, y] - (x, y)
+    dx, dy = (wall / max(float(np.hypot(*wall)), 1e-9)).tolist()
+    limit = 3.0 / e
+    ahead, behind = crossing.run(plan.inside, x, y, dx, dy, limit), crossing.run(plan.inside, x, y, -dx, -dy, limit)
+    mx, my, half = x + dx * (ahead - behind) / 2, y + dy * (ahead - behind) / 2, (ahead + behind) / 2
+    jambs = sorted(
+        crossing.run(thick, mx + s * (half + 1) * dx, my + s * (half + 1) * dy, s * dx, s * dy, 1.0 / e) * e for s in (1, -1)
+    )
+    steps = int(0.6 / e)
+    across = crossing.widths(plan.inside, mx, my, dx, dy, steps, limit) * e
+    narrow = max(float(across[steps]), e)
+    opens = sorted(max(float(side.max(initial=narrow)), narrow) - narrow for side in (across[:steps], across[steps + 1 :]))
+    length = float(((across > 0) & (across <= narrow + 0.15)).sum()) * e
+    lintel, seen, step, growth = _above(plan, clearance, region, a, b, x, y)
+    cover, doorway, boundary = (float(crossing.cover(v, mx, my, dx, dy, half, half, int(0.3 / e))) for v in layers)
+    width = min((2 * half + 1) * e, 2 * here + 2 * e)
+    return Passage((x, y), width, (dx, dy), (growth, *opens, length, lintel, cover, seen, step, *jambs, doorway, boundary))
+
+
+def _above(plan: Plan, clearance: Array, region: Array, a: int, b: int, x: int, y: int) -> tuple[float, float, float, float]:
+    """Depth of a lintel below both ceilings, was it seen, step between the ceilings, and growth of the clearance."""
+    reach = int(np.ceil(AROUND / plan.edge))
+    box = slice(max(x - reach, 0), x + reach + 1), slice(max(y - reach, 0), y + reach + 1)
+    near, c, clear = region[box], clearance[box], plan.clear[box]
+    u, v = np.ogrid[: near.shape[0], : near.shape[1]]
+    distance = np.hypot(u - (x - box[0].start), v - (y - box[1].start)) * plan.edge
+    growth, ceilings = [], []
+    for side in (near == a, near == b):
+        growth.append(float(c[side & (distance <= 0.6)].max(initial=clearance[x, y])) - float(clearance[x, y]))
+        heights = clear[side & (distance > 0.4)]
+        heights = heights[~np.isnan(heights)]
+        ceilings.append(float(np.median(heights)) if len(heights) >= 5 else np.nan)
+    strip = clear[(distance <= 0.35) & (near >= 0)]
+    strip = strip[~np.isnan(strip)]
+    if len(strip) < 3 or np.isnan(sum(ceilings)):
+        return 0.0, 0.0, 0.0, min(growth)
+    # A lintel is as deep as the wall, a fifth of the window; single low points are none.
+    return min(ceilings) - float(np.quantile(strip, 0.2)), 1.0, abs(ceilings[0] - ceilings[1]), min(growth)
+
+
+def features(passage: Passage, peaks: tuple[float, float], areas: tuple[float, float]) -> Array:
+    """(17,) what speaks for a door, see `FEATURES`; the sides are given by their greatest clearance (m) and their area (m2)."""
+    half = passage.width / 2
+    sides = half / max(min(peaks), half), half / max(max(peaks), half)
+    small, large = (float(np.log(max(a, 0.1))) for a in sorted(areas))
+    return np.array([passage.width, *sides, *passage.measured, small, large])

@@ -1,0 +1,158 @@
+"""What probably stands in each column of a plan: a small convolutional network, trained on simulated scans of training buildings
+(benchmarks/training/train_plan_network.py), in NumPy (beyond the thesis: docs/adr/0005).
+
+A U-Net (Ronneberger et al. 2015) over what the plan knows of each column. It sees a few metres around, so that it may take the
+legs of a table for furniture, a stub of wall for the jamb of a door, and a gap between two stubs for a doorway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.errors import InputError
+from topomerge.extraction.plans.plan import Plan, _bits
+from topomerge.types import Array
+
+FILE = "plan_network.npz"
+CLASSES = ("inside", "wall", "doorway", "shut", "outside")  # furniture is inside
+HEIGHTS = ((0.1, 0.5), (0.5, 1.2), (1.2, 2.0), (2.0, 2.4))  # m
+CHANNELS = 11
+STRIDE = 16  # of the coarsest level
+DOWN = ("a", "b", "c", "d")  # levels of 1/2, 1/4, 1/8, 1/16: each halves and goes on
+UP = ("e", "f", "g", "h")  # and back, each beside what went down
+ROWS = 64  # that are convolved at a time
+FURNITURE = 0.6, 0.95  # probability of the inside of a room from which what looked like wall is none: without and with a ceiling
+DOORWAY, WALL = 0.3, 0.02  # probabilities: less of a door and more of a wall around it, and a passage leads through a wall
+AROUND = 0.3  # m
+
+
+def evidence(plan: Plan) -> Array:
+    """(nx, ny, 11) float32 of what was seen in each column: known, wall, how full four bands of heights are, floor, lintel,
+    ceiling and its height, and how large a column is."""
+    levels = []
+    for low, high in HEIGHTS:
+        mask = _bits(low, high, plan.edge)
+        levels.append(np.bitwise_count(plan.profile & mask) / float(np.bitwise_count(mask)))
+    seen = ~np.isnan(plan.clear)
+    lintel = plan.clear < plan.ceiling - 0.2  # nan: no
+    height = np.where(seen, np.clip(plan.clear, 1.9, 4.5) - 2.5, 0.0)
+    floor = (plan.profile & _bits(-0.3, 0.3, plan.edge)) != 0
+    size = np.full(plan.wall.shape, 5 * plan.edge)
+    return np.stack(
+        [plan.inside, plan.wall, *levels, floor, lintel, seen, height, size], axis=-1, dtype=np.float32, casting="unsafe"
+    )
+
+
+def segment(plan: Plan) -> Array:
+    """(nx, ny, 5) float32 probability of each of `CLASSES`."""
+    x = evidence(plan)
+    nx, ny = x.shape[:2]
+    x = np.pad(x, ((STRIDE, -nx % STRIDE + STRIDE), (STRIDE, -ny % STRIDE + STRIDE), (0, 0)))
+    score = forward(x, weights())[STRIDE : STRIDE + nx, STRIDE : STRIDE + ny]
+    score = np.exp(score - score.max(axis=-1, keepdims=True))
+    return np.asarray(score / score.sum(axis=-1, keepdims=True))
+
+
+def without_furniture(plan: Plan, chance: Array) -> Plan:
+    """The plan without the walls that are probably furniture: the legs of tables in slices and grid maps, cupboards.
+
+    Where a ceiling was seen it told most cupboards from walls already (`plan`). What touches a wall stays: a blurred wall
+    keeps its face.
+    """
+    furniture = plan.wall & (chance[..., 0] > np.where(np.isnan(plan.ceiling), *FURNITURE))
+    furniture &= ~ndimage.binary_dilation(plan.wall & ~furniture, np.ones((3, 3)))
+    return replace(plan, wall=plan.wall & ~furniture, inside=plan.inside | furniture)
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What the network says of a storey, in the frame of the map.
+
+    Args:
+        chance: (nx, ny, 5) probability of each of `CLASSES`.
+        origin: (2,) m, lower corner of the first column.
+        edge: m, of a column.
+        height: m, of the floor.
+    """
+
+    chance: Array
+    origin: Array
+    edge: float
+    height: float
+
+
+def through_wall(told: Sequence[Told], centre: Array) -> bool:
+    """Does a passage at `centre` (3,) lead through a wall: none of its columns is of a door, and some are of a wall?"""
+    if not told:
+        return False
+    here = min(told, key=lambda t: abs(t.height - float(centre[2])))
+    reach = max(int(AROUND / here.edge), 1)
+    low = np.floor((centre[:2] - here.origin) / here.edge).astype(np.int64) - reach
+    box = tuple(slice(max(k, 0), max(k + 2 * reach + 1, 0)) for k in low.tolist())
+    near = here.chance[box]
+    return bool(near.size and near[..., 2:4].sum(axis=-1).max() < DOORWAY and near[..., 1].mean() > WALL)
+
+
+def forward(x: Array, w: dict[str, Array]) -> Array:
+    """(nx, ny, 5) float32 scores from (nx, ny, 11) evidence; both sides are multiples of 16."""
+    skips = [x]
+    for name in DOWN:
+        x = convolve(x, w[f"{name}1.w"], w[f"{name}1.b"], 2)
+        x = convolve(x, w[f"{name}2.w"], w[f"{name}2.b"])
+        skips.append(x)
+    x = skips.pop()
+    for name in UP:
+        x = np.concatenate([x.repeat(2, axis=0).repeat(2, axis=1), skips.pop()], axis=-1)
+        x = convolve(x, w[f"{name}1.w"], w[f"{name}1.b"])
+    return np.asarray(x @ w["out.w"] + w["out.b"])
+
+
+def convolve(x: Array, w: Array, b: Array, stride: int = 1) -> Array:
+    """Rectified 3 x 3 convolution of (nx, ny, c) with weights (9 c, k), bias (k,) and zeros around."""
+    nx, ny = x.shape[0] // stride, x.shape[1] // stride
+    x = np.pad(x, ((1, 1), (1, 1), (0, 0)))
+    out = np.empty((nx, ny, w.shape[1]), np.float32)
+    for i in range(0, nx, ROWS):  # all at once would take nine times the memory
+        n = min(ROWS, nx - i)
+        at = stride * i
+        taps = [x[at + u : at + u + stride * n : stride, v : v + stride * ny : stride] for u in range(3) for v in range(3)]
+        columns = np.concatenate(taps, axis=-1).reshape(n * ny, -1)
+        out[i : i + n] = (columns @ w + b).reshape(n, ny, -1)
+    return np.maximum(out, 0.0, out=out)
+
+
+@lru_cache(maxsize=1)
+def weights() -> dict[str, Array]:
+    """The shipped weights."""
+    with resources.as_file(resources.files("topomerge.extraction.plans").joinpath(FILE)) as path:
+        return read_weights(path)
+
+
+def read_weights(path: Path) -> dict[str, Array]:
+    """Weights as float32 by their names.
+
+    Raises:
+        InputError: not the network that this version knows, or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = {name: file[name].astype(np.float32) for name in file.files}
+    except Exception as error:  # zip, header and data each have their own errors
+        raise InputError(f"{path}: is no network of plans ({error}); install topomerge again") from error
+    names = [f"{n}{k}" for n in DOWN for k in (1, 2)] + [f"{n}1" for n in UP]
+    channels = dict.fromkeys(names, 9) | {"out": 1}
+    for name, taps in channels.items():
+        w, b = found.get(f"{name}.w"), found.get(f"{name}.b")
+        fits = w is not None and b is not None and w.ndim == 2 and not w.shape[0] % taps and b.shape == w.shape[1:]
+        if not fits or not np.isfinite(found[f"{name}.w"]).all() or not np.isfinite(found[f"{name}.b"]).all():
+            raise InputError(f"{path}: is no network of plans (layer {name}); install topomerge again")
+    if found["a1.w"].shape[0] != 9 * CHANNELS or found["out.w"].shape[1] != len(CLASSES):
+        raise InputError(f"{path}: was trained with other inputs or answers; install topomerge again")
+    return found

@@ -1,0 +1,260 @@
+"""Hypotheses of pairs -> sets of maps that lie in one frame without contradiction (method 3: agreement around cycles).
+
+Links are taken in the order of their probability, as in a maximum spanning tree, but each is heard before: every two maps that it
+would bring over each other say what they think of that, its own two if they contradict it. What contradicts better evidence is
+thrown out, and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from topomerge.fusion.atlas.pairs import Check, Checks, Hypothesis, alike
+from topomerge.fusion.atlas.pose_graph import Measured, optimise
+from topomerge.types import Sim3
+
+BACKING = 1.5  # log odds that other maps may add: look-alikes of a place are alike to all maps of it
+VOICE, LOUD = 3.0, -2.0  # log odds of one of them at most, and below which nothing makes up for it
+FOUND = 4.0  # log odds that an independent registration which finds the same place adds to its own
+DOUBT = 0.3  # a hypothesis more probable than that contradicts another place
+BELIEVED = 0.5
+BETTER = 0.5  # log odds by which another link must be better to take a link's place
+HEAVY = 20.0  # m2 of walls in common, above which a measurement counts no more
+Hypotheses = Mapping[tuple[int, int], tuple[Hypothesis, ...]]
+Poses = Mapping[int, Sim3]
+
+
+@dataclass(frozen=True)
+class Link:
+    """A hypothesis that was taken, or thrown out.
+
+    Args:
+        maps: i and j; `hypothesis` is the pose T_ij.
+        log_odds: that it is right, with what all maps say that it brings over each other.
+        against: the pair that spoke loudest against it, if any did.
+    """
+
+    maps: tuple[int, int]
+    hypothesis: Hypothesis
+    log_odds: float
+    against: tuple[int, int] | None = None
+
+    @property
+    def probability(self) -> float:
+        """Of `log_odds`."""
+        return float(1 / (1 + np.exp(-np.clip(self.log_odds, -30, 30))))
+
+
+@dataclass(eq=False)
+class Assembly:
+    """Components: each a dictionary map -> pose in the component's frame; and the links that hold them."""
+
+    components: list[dict[int, Sim3]]
+    links: list[Link] = field(default_factory=list)
+    thrown: list[Link] = field(default_factory=list)
+
+    def of(self, k: int) -> dict[int, Sim3]:
+        """The component of a map."""
+        return next(c for c in self.components if k in c)
+
+
+class Assembler:
+    """Builds assemblies of `count` maps from the hypotheses that are known.
+
+    Args:
+        limit: log odds from which a link is believed.
+    """
+
+    def __init__(self, count: int, known: Hypotheses, checks: Checks, limit: float, scaled: bool = False) -> None:
+        self.count, self.known, self.checks, self.limit, self.scaled = count, known, checks, limit, scaled
+
+    def build(self) -> Assembly:
+        """The most probable assembly without contradictions."""
+        banned: set[tuple[int, int]] = set()
+        while True:  # ends: each time one more pair is banned
+            found = self._grown(banned)
+            self._exchange(found)
+            links = self._heard(found)
+            weak = [link for link in links if link.log_odds < self.limit]
+            if not weak:
+                break
+            banned.add(min(weak, key=lambda link: link.log_odds).maps)
+        found.links = links
+        found.thrown = self._thrown(found)
+        return found
+
+    def _candidates(self, banned: set[tuple[int, int]]) -> list[tuple[tuple[int, int], Hypothesis]]:
+        """Hypotheses that could be believed with all backing, most probable first."""
+        every = [(pair, h) for pair, hs in self.known.items() if pair not in banned for h in hs]
+        every = [(pair, h) for pair, h in every if h.log_odds + self._most(pair, h) >= self.limit]
+        return sorted(every, key=lambda e: (-e[1].log_odds, e[0]))
+
+    def _most(self, pair: tuple[int, int], h: Hypothesis) -> float:
+        """Log odds that backing may add: it may tell a hypothesis from its rivals, and speak for it."""
+        every = min(sum(other.probability for other in self.known[pair]), 0.999)
+        return max(Hypothesis(h.pose, every).log_odds - h.log_odds, 0.0) + BACKING
+
+    def _grown(self, banned: set[tuple[int, int]]) -> Assembly:
+        found = Assembly([{k: Sim3()} for k in range(self.count)])
+        candidates = self._candidates(banned)
+        again = True
+        while again:
+            again = False
+            for pair, h in candidates:
+                a, b = found.of(pair[0]), found.of(pair[1])
+                if a is b:
+                    continue
+                link = self.heard(a, b, pair, h)
+                if link.log_odds >= self.limit:
+                    self._join(found, a, b, link)
+                    again = True
+                    break
+        return found
+
+    def _join(self, found: Assembly, a: dict[int, Sim3], b: dict[int, Sim3], link: Link) -> None:
+        """Bring component b into a's frame, and settle all poses."""
+        move = across(a, b, link.maps, link.hypothesis.pose)
+        joined = {**a, **{k: move @ pose for k, pose in b.items()}}
+        found.components = [c for c in found.components if c is not a and c is not b]
+        found.links.append(link)
+        found.components.append(self.settled(joined, found.links)[0])
+
+    def heard(self, a: Poses, b: Poses, pair: tuple[int, int], h: Hypothesis, rival_of: tuple[int, int] | None = None) -> Link:
+        """A link between two components with what all their maps say to it.
+
+        Args:
+            rival_of: the pair whose claim this one contradicts; it is not asked, and contradictions are not looked into.
+        """
+        move = across(a, b, pair, h.pose)
+        place = {**a, **{j: move @ pose for j, pose in b.items()}}
+        own = self.checks(*pair, place[pair[0]].inverse() @ place[pair[1]])
+        backing, against, loudest, worst = 0.0, own.log_odds if own.log_odds < LOUD else 0.0, None, 0.0
+        for one, two in ((min(i, j), max(i, j)) for i in a for j in b):
+            if (one, two) in (pair, rival_of):
+                continue
+            said, other = self._voice(one, two, place[one].inverse() @ place[two])
+            if other is not None and rival_of is None:  # a claim weighs as much as the rest leaves of it
+                other_odds = self.heard(a, b, (one, two), other, pair).log_odds
+                said = min(said, -max(other_odds + 1.0, 0.0))
+            elif other is not None:
+                said = min(said, -other.log_odds - 1.0)
+            if said > LOUD:
+                backing += said
+            else:
+                against += said
+            if said < worst:
+                loudest, worst = (one, two), said
+        return Link(pair, h, h.log_odds + min(backing, self._most(pair, h)) + against, loudest)
+
+    def _voice(self, i: int, j: int, pose: Sim3) -> tuple[float, Hypothesis | None]:
+        """What maps i < j say to a pose T_ij that other maps propose, log odds; and their own claim, if it is another one."""
+        check = self.checks(i, j, pose)
+        best = next(iter(self.known.get((i, j), ())), None)
+        if best is None:
+            return check.log_odds, None
+        if self.agrees(i, j, best.pose, pose):
+            return max(check.log_odds, float(np.clip(best.log_odds + FOUND, 0.0, VOICE))), None
+        return check.log_odds, best if best.probability > DOUBT else None
+
+    def agrees(self, i: int, j: int, p: Sim3, q: Sim3) -> bool:
+        """Are two poses T_ij one, where the maps overlap?"""
+        return alike(p, q, self.checks.place(i, j, p).mean(axis=0))
+
+    def _heard(self, found: Assembly) -> list[Link]:
+        """The links as they are seen now that everything is in its place."""
+        out = []
+        for link in found.links:
+            a, b = self._parted(found, link)
+            i, j = link.maps
+            seen = self.heard(a, b, link.maps, replace(link.hypothesis, pose=a[i].inverse() @ b[j]))
+            out.append(replace(seen, hypothesis=link.hypothesis))
+        return out
+
+    def _parted(self, found: Assembly, link: Link) -> tuple[dict[int, Sim3], dict[int, Sim3]]:
+        """The two components that a link holds together: that of its first map, and the other one."""
+        whole = found.of(link.maps[0])
+        side, left = {link.maps[0]}, [other.maps for other in found.links if other is not link]
+        grown = True
+        while grown:
+            new = {k for pair in left if side & set(pair) for k in pair} - side
+            side |= new
+            grown = bool(new)
+        return {k: p for k, p in whole.items() if k in side}, {k: p for k, p in whole.items() if k not in side}
+
+    def _contradicted(self, found: Assembly) -> Iterator[tuple[tuple[int, int], Hypothesis]]:
+        """Best hypotheses of pairs that lie elsewhere in their component."""
+        for (i, j), hypotheses in sorted(self.known.items()):
+            own = found.of(i)
+            if not hypotheses or j not in own or hypotheses[0].probability < BELIEVED:
+                continue
+            if not self.agrees(i, j, hypotheses[0].pose, own[i].inverse() @ own[j]):
+                yield (i, j), hypotheses[0]
+
+    def _exchange(self, found: Assembly) -> None:
+        """Put contradicted hypotheses in the place of links, where everything agrees better then."""
+        for _ in range(2 * self.count):
+            change = next(self._better(found), None)
+            if change is None:
+                return
+            old, new, (a, b) = change
+            found.components = [c for c in found.components if old.maps[0] not in c] + [a, b]
+            found.links = [link for link in found.links if link is not old]
+            first, second = (a, b) if new.maps[0] in a else (b, a)
+            self._join(found, first, second, new)
+
+    def _better(self, found: Assembly) -> Iterator[tuple[Link, Link, tuple[dict[int, Sim3], dict[int, Sim3]]]]:
+        for pair, h in self._contradicted(found):
+            for link in found.links:
+                a, b = self._parted(found, link) if link.maps[0] in found.of(pair[0]) else ({}, {})
+                first, second = (a, b) if pair[0] in a else (b, a)
+                if pair[0] not in first or pair[1] not in second:
+                    continue
+                i, j = link.maps
+                now = self.heard(a, b, link.maps, replace(link.hypothesis, pose=a[i].inverse() @ b[j]))
+                then = self.heard(first, second, pair, h)
+                if then.log_odds >= max(now.log_odds + BETTER, self.limit):
+                    yield link, then, (a, b)
+
+    def _thrown(self, found: Assembly) -> list[Link]:
+        """Hypotheses that were believed by themselves and contradict the rest."""
+        out = [Link(pair, h, -h.log_odds, self._weakest(found, pair)) for pair, h in self._contradicted(found)]
+        for (i, j), hypotheses in sorted(self.known.items()):
+            a, b = found.of(i), found.of(j)
+            if a is not b and hypotheses and hypotheses[0].log_odds >= self.limit:
+                out.append(self.heard(a, b, (i, j), hypotheses[0]))
+        return out
+
+    def _weakest(self, found: Assembly, pair: tuple[int, int]) -> tuple[int, int] | None:
+        """The link on the way between two maps that says most against their hypothesis."""
+        held = [link for link in found.links if link.maps[0] in found.of(pair[0])]
+        between = [link for link in held if len(set(pair) & set(self._parted(found, link)[0])) == 1]
+        return min(between, key=lambda link: link.log_odds).maps if between else None
+
+    def settled(self, poses: Poses, links: Sequence[Link], fine: bool = False) -> tuple[dict[int, Sim3], list[Measured]]:
+        """Poses of a component that agree best with all that is measured between its maps, and that."""
+        edges = list(self._measured(poses, links, fine))
+        return optimise(poses, edges, self.scaled, min(poses)), edges
+
+    def _measured(self, poses: Poses, links: Sequence[Link], fine: bool) -> Iterator[Measured]:
+        held = {link.maps: link.hypothesis.pose for link in links}
+        names = sorted(poses)
+        for i in names:
+            for j in (k for k in names if k > i):
+                check = self.checks(i, j, poses[i].inverse() @ poses[j])
+                if (i, j) in held and not check.overlap:
+                    check = Check(held[i, j], 0.0, True, {"walls": 1.0})
+                if check.overlap and ((i, j) in held or self._voice(i, j, poses[i].inverse() @ poses[j])[0] > 0):
+                    pose = self.checks.fine(i, j, check.pose) if fine else check.pose
+                    weight = float(np.clip(check.features["walls"], 0.5, HEAVY))
+                    yield Measured((i, j), pose, self.checks.place(i, j, pose), weight)
+
+
+def across(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Sim3:
+    """Where component b lies in component a, if map j of the one lies at T_ij in map i of the other; in any order."""
+    i, j = pair
+    if i not in a:
+        i, j, pose = j, i, pose.inverse()
+    return a[i] @ pose @ b[j].inverse()
