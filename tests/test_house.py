@@ -31,7 +31,7 @@ RANKS = {
     "cli": 13,
     "__main__": 15,
 }
-HEAVY = ("torch", "torch_geometric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell", "trimesh", "lightning")
+HEAVY = ("torch", "torch_geometric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell", "trimesh", "lightning_fabric")
 
 
 def sources() -> list[tuple[str, str, Path]]:

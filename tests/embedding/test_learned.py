@@ -118,7 +118,7 @@ def test_torch_is_never_imported():
     code = (
         "import sys, topomerge as tm; from tests.scenes_map import building; from topomerge.cli.commands import COMMANDS\n"
         "found = tm.merge([building(1), building(2)]); tm.load_embedder()(building(1)); assert found.descriptor == 'learned'\n"
-        "print([m for m in ('torch', 'torch_geometric', 'safetensors', 'hydra', 'lightning') if m in sys.modules])"
+        "print([m for m in ('torch', 'torch_geometric', 'safetensors', 'hydra', 'lightning_fabric') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

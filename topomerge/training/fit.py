@@ -228,9 +228,9 @@ def about(settings: Training, row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fabric(settings: Training) -> Any:
-    from lightning.fabric import Fabric
+    from lightning_fabric import Fabric
 
-    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     devices = int(os.environ.get("LOCAL_WORLD_SIZE", settings.devices))
     fabric = Fabric(
         accelerator=settings.accelerator, devices=devices, precision=settings.precision,  # type: ignore[arg-type]
