@@ -31,7 +31,8 @@ RANKS = {
     "cli": 13,
     "__main__": 15,
 }
-HEAVY = ("torch", "torch_geometric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell", "trimesh", "lightning_fabric")
+HEAVY = ("torch", "torch_geometric", "lightning_fabric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell")
+HEAVY += ("trimesh",)
 
 
 def sources() -> list[tuple[str, str, Path]]:

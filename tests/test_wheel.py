@@ -19,7 +19,8 @@ NO_TORCH = """
 import sys
 class Refuse:
     def find_spec(self, name, *_):
-        if name.split(".")[0] in ("torch", "torch_geometric", "hydra", "omegaconf", "lightning_fabric", "open3d", "laspy", "pye57"):
+        heavy = ("torch", "torch_geometric", "lightning_fabric", "hydra", "omegaconf", "open3d", "laspy", "pye57")
+        if name.split(".")[0] in heavy:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Refuse())
 from topomerge.cli.main import main
