@@ -15,6 +15,7 @@ RANKS = {
     "kernels": 0,
     "types": 1,
     "io": 2,
+    "numpy_nn": 2,
     "extraction": 3,
     "embedding": 4,
     "matching": 5,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.extraction.plans.passages import FEATURES
+from topomerge.numpy_nn import perceptron, sigmoid
 from topomerge.types import Array
 
 FILE = "door_classifier.json"
@@ -23,12 +24,7 @@ def door_probability(x: Array) -> Array:
     """(n,) probability that a door parts the two sides of each narrowing, from its (n, 17) features."""
     weights = _weights()
     h = (np.clip(x, weights["low"], weights["high"]) - weights["mean"]) / weights["scale"]
-    layers = weights["layers"]
-    for k, (w, b) in enumerate(layers):
-        h = h @ w + b
-        if k + 1 < len(layers):
-            h = np.maximum(h, 0.0)
-    return np.asarray(1 / (1 + np.exp(-h[:, 0])))
+    return sigmoid(perceptron(h, weights["layers"])[:, 0])
 
 
 @lru_cache(maxsize=1)

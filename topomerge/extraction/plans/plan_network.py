@@ -1,5 +1,5 @@
 """What probably stands in each column of a plan: a small convolutional network, trained on simulated scans of training buildings
-(benchmarks/training/train_plan_network.py), in NumPy (beyond the thesis: docs/adr/0005).
+(benchmarks/training/train_plan_network.py), in NumPy (`numpy_nn`; beyond the thesis: docs/adr/0005).
 
 A U-Net (Ronneberger et al. 2015) over what the plan knows of each column. It sees a few metres around, so that it may take the
 legs of a table for furniture, a stub of wall for the jamb of a door, and a gap between two stubs for a doorway.
@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.extraction.plans.plan import Plan, _bits
+from topomerge.numpy_nn import convolution, linear, softmax
 from topomerge.types import Array
 
 FILE = "plan_network.npz"
@@ -27,7 +28,6 @@ CHANNELS = 11
 STRIDE = 16  # of the coarsest level
 DOWN = ("a", "b", "c", "d")  # levels of 1/2, 1/4, 1/8, 1/16: each halves and goes on
 UP = ("e", "f", "g", "h")  # and back, each beside what went down
-ROWS = 64  # that are convolved at a time
 FURNITURE = 0.6, 0.95  # probability of the inside of a room from which what looked like wall is none: without and with a ceiling
 DOORWAY, WALL = 0.3, 0.02  # probabilities: less of a door and more of a wall around it, and a passage leads through a wall
 AROUND = 0.3  # m
@@ -56,8 +56,7 @@ def segment(plan: Plan) -> Array:
     nx, ny = x.shape[:2]
     x = np.pad(x, ((STRIDE, -nx % STRIDE + STRIDE), (STRIDE, -ny % STRIDE + STRIDE), (0, 0)))
     score = forward(x, weights())[STRIDE : STRIDE + nx, STRIDE : STRIDE + ny]
-    score = np.exp(score - score.max(axis=-1, keepdims=True))
-    return np.asarray(score / score.sum(axis=-1, keepdims=True))
+    return softmax(score)
 
 
 def without_furniture(plan: Plan, chance: Array) -> Plan:
@@ -104,28 +103,14 @@ def forward(x: Array, w: dict[str, Array]) -> Array:
     """(nx, ny, 5) float32 scores from (nx, ny, 11) evidence; both sides are multiples of 16."""
     skips = [x]
     for name in DOWN:
-        x = convolve(x, w[f"{name}1.w"], w[f"{name}1.b"], 2)
-        x = convolve(x, w[f"{name}2.w"], w[f"{name}2.b"])
+        x = convolution(x, w[f"{name}1.w"], w[f"{name}1.b"], 2)
+        x = convolution(x, w[f"{name}2.w"], w[f"{name}2.b"])
         skips.append(x)
     x = skips.pop()
     for name in UP:
         x = np.concatenate([x.repeat(2, axis=0).repeat(2, axis=1), skips.pop()], axis=-1)
-        x = convolve(x, w[f"{name}1.w"], w[f"{name}1.b"])
-    return np.asarray(x @ w["out.w"] + w["out.b"])
-
-
-def convolve(x: Array, w: Array, b: Array, stride: int = 1) -> Array:
-    """Rectified 3 x 3 convolution of (nx, ny, c) with weights (9 c, k), bias (k,) and zeros around."""
-    nx, ny = x.shape[0] // stride, x.shape[1] // stride
-    x = np.pad(x, ((1, 1), (1, 1), (0, 0)))
-    out = np.empty((nx, ny, w.shape[1]), np.float32)
-    for i in range(0, nx, ROWS):  # all at once would take nine times the memory
-        n = min(ROWS, nx - i)
-        at = stride * i
-        taps = [x[at + u : at + u + stride * n : stride, v : v + stride * ny : stride] for u in range(3) for v in range(3)]
-        columns = np.concatenate(taps, axis=-1).reshape(n * ny, -1)
-        out[i : i + n] = (columns @ w + b).reshape(n, ny, -1)
-    return np.maximum(out, 0.0, out=out)
+        x = convolution(x, w[f"{name}1.w"], w[f"{name}1.b"])
+    return linear(x, w["out.w"], w["out.b"])
 
 
 @lru_cache(maxsize=1)
