@@ -25,6 +25,7 @@ def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schem
         from omegaconf.errors import OmegaConfBaseException
     except ImportError as error:
         raise InputError("settings need Hydra: pip install topomerge[learn]") from error
+    register(name, schema)
     try:
         with initialize_config_module("topomerge.configs", version_base="1.3"):
             given = hydra_compose(name, overrides=list(words))
@@ -33,11 +34,32 @@ def compose(name: str, schema: type[Schema], words: Sequence[str] = ()) -> Schem
     return typed(given, schema)
 
 
-def register(name: str, schema: type[Any]) -> None:
-    """Let `configs/<name>.yaml` begin with `<name>_schema`: then every field of the dataclass is a key with its default."""
-    from hydra.core.config_store import ConfigStore
+def register(name: str, schema: type[Any], group: str | None = None) -> None:
+    """Let `configs/<name>.yaml` begin with `<name>_schema`: then every field of the dataclass is a key with its default, so that
+    each can be overridden, and new entries of tables (weights by name) can be set.
 
-    ConfigStore.instance().store(f"{name}_schema", schema)
+    Args:
+        group: folder of the file below `configs/`; its keys stand at the top all the same.
+    """
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import OmegaConf
+
+    node = OmegaConf.structured(schema)
+    _open_tables(node)
+    ConfigStore.instance().store(f"{name}_schema", node, group=group, package="_global_" if group else None)
+
+
+def _open_tables(node: Any) -> None:
+    """Let fields of type dict take keys that they do not have yet; Hydra closes everything else."""
+    from omegaconf import DictConfig, OmegaConf
+
+    for key in node:
+        value = node._get_node(key)
+        if isinstance(value, DictConfig) and not value._is_missing() and not value._is_none():
+            if OmegaConf.get_type(value) is dict:
+                OmegaConf.set_struct(value, False)
+            else:
+                _open_tables(value)
 
 
 def typed(given: Any, schema: type[Schema]) -> Schema:

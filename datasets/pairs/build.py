@@ -2,7 +2,7 @@
 
 The cache holds `pairs/<hash of the inputs>.npz`, or `.refused` with the reason, and a manifest `<name>.jsonl`. A build that
 was killed goes on where it was; the result has the same bytes. Work is shared out by joblib: over processes of this machine
-(``jobs=2``), or over a Dask cluster (``+cluster=tcp://host:8786``), whose workers must see the cache under the same path.
+(``jobs=2``), or over a Dask cluster (``cluster=tcp://host:8786``), whose workers must see the cache under the same path.
 Machines that share nothing make a part each (``part=[1,2]`` and ``part=[2,2]``); with the files of all parts in one cache, the
 build without a part writes the whole manifest.
 """

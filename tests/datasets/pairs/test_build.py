@@ -211,7 +211,7 @@ def test_mistakes_are_named(word: str, key: str, capsys: pytest.CaptureFixture[s
 
 def test_settings_reach_the_build(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("hydra")
-    settings = compose("build", Build, [*WORDS, "jobs=2", "+cluster=tcp://host:8786", "data.pairs=3"])
+    settings = compose("build", Build, [*WORDS, "jobs=2", "cluster=tcp://host:8786", "data.pairs=3"])
     assert settings.jobs == 2 and settings.cluster == "tcp://host:8786"
     drawn = {k: v for k, v in settings.data.kinds.items() if v > 0}
     assert drawn == {"house": 1.0} or drawn == {"house": 1}
