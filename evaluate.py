@@ -2,7 +2,7 @@
 
     python evaluate.py data=heldout_small merge=false
     python evaluate.py data=heldout run=runs/x
-    python evaluate.py data=real run=runs/x write=docs/results.md section=real-pairs
+    python evaluate.py data=real run=runs/x write=docs/results/real-pairs.md section=matching-real
 
 Predictions go to disk first (`runs/eval/<name>/predictions`), then they are scored: a run that was killed goes on where it was.
 Keys: configs/evaluate.yaml and configs/data/*.yaml.

@@ -4,7 +4,7 @@
 everything
 else, ``--quick`` two cases of each set. Scans are made once and kept under ``cache/scans/`` (``--fresh`` makes them again). Each
 case gives a line of ``OUT/results.jsonl``; it is run again only when its scan, the preset or the code has changed.
-``--write docs/results.md`` writes the tables there. The definitions are in `topomerge/metrics.py` and
+``--write docs/results/rooms.md`` writes the tables there. The definitions are in `topomerge/metrics.py` and
 `datasets/simulation/floor_truth.py`.
 """
 

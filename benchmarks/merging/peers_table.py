@@ -1,6 +1,6 @@
-"""The section "Beside other methods" of docs/results.md from what `peers.py` left in ``cache/merge``.
+"""The section "Beside other methods" of docs/results/peers.md from what `peers.py` left in ``cache/merge``.
 
-``python -m benchmarks.merging.peers_table docs/results.md``
+``python -m benchmarks.merging.peers_table docs/results/peers.md``
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def section() -> str:
     other = {m: float(np.median(s)) for m, s in taken.items() if s}
     return "\n\n".join([
         "`python -m benchmarks.merging.pairs test 175; python -m benchmarks.merging.drawings test 110; "
-        "python -m benchmarks.merging.peers 9000; python -m benchmarks.merging.peers_table docs/results.md`",
+        "python -m benchmarks.merging.peers 9000; python -m benchmarks.merging.peers_table docs/results/peers.md`",
         TEXT,
         by(rows, keys[0], list(BINS), "in common", HEADS, measures),
         by(rows, keys[1], kinds, "kind", HEADS, measures),

@@ -1,6 +1,6 @@
-"""The section "Merging" of docs/results.md from what `register.py` and `merge_strangers.py` left in ``cache/merge``.
+"""The section "Merging" of docs/results/merging.md from what `register.py` and `merge_strangers.py` left in ``cache/merge``.
 
-``python -m benchmarks.merging.results docs/results.md``
+``python -m benchmarks.merging.results docs/results/merging.md``
 """
 
 from __future__ import annotations
@@ -251,7 +251,7 @@ def section() -> str:
         "`python -m benchmarks.merging.pairs test 175; python -m benchmarks.merging.drawings test 110; "
         "python -m benchmarks.merging.drawings test differs; python -m benchmarks.merging.register test 1000 ours; "
         "python -m benchmarks.merging.register test_drawings 1000 ours; "
-        "python -m benchmarks.merging.strangers test 430; python -m benchmarks.merging.results docs/results.md`",
+        "python -m benchmarks.merging.strangers test 430; python -m benchmarks.merging.results docs/results/merging.md`",
         f"{len(mine)} simulated pairs of {buildings} test buildings, in 0.1 m cells, every sixth with much moved furniture, "
         "every eighth with glass walls. Right: within 0.5 m and 5° in the middle of what both maps saw (slices: horizontally); "
         f"believed: probability {THRESHOLD} or more. In brackets 95 % intervals over buildings. Seconds of processor.",

@@ -77,15 +77,16 @@ def all_of(items: list[Item], jobs: int) -> float:
     return seconds
 
 
-def main(pairs: int = 24) -> None:
+def main(pairs: int = 24, rooms: int = 15) -> None:
+    """Print the lines, of `pairs` pairs of maps of `rooms` rooms."""
     from joblib.externals.loky import get_reusable_executor
 
-    items = draw_items(replace(RECIPE, pairs=pairs), {})
+    items = draw_items(replace(RECIPE, pairs=pairs, rooms=[rooms, rooms]), {})
     one(items[0])  # compiles
     seconds, worked = zip(*(one(item) for item in items[:8]), strict=True)
     line("pair", median(seconds), TARGET)
     line("pair_cpu", median(worked), TARGET)
-    print(f"# pairs of 15 rooms took {min(seconds):.1f} to {max(seconds):.1f} s")
+    print(f"# pairs of {rooms} rooms took {min(seconds):.1f} to {max(seconds):.1f} s")
     items.sort(key=lambda item: -item.rooms)
     alone = all_of(items, 1)
     line("two_workers", all_of(items, 2), alone)

@@ -49,21 +49,23 @@ def in_a_process(floors: int, preset: str = "default", points: int = 6_000_000, 
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
 
 
-def main(most: int = 16) -> None:
+def main(most: int = 16, points: int = 6_000_000) -> None:
+    """Print the lines; `most` floors at the most."""
     in_a_process(1, points=100_000)
-    one = min((in_a_process(1) for _ in range(3)), key=lambda m: m["seconds"])
-    thesis = in_a_process(1, "thesis")
+    one = min((in_a_process(1, points=points) for _ in range(3)), key=lambda m: m["seconds"])
+    thesis = in_a_process(1, "thesis", points)
     line("extract_floor", one["seconds"], thesis["seconds"])
     for step, seconds in one["steps"].items():
         print(f"#   {step}: {seconds:.2f} s")
     print(f"# {one['cells']} cells, {one['rooms']} rooms, peak {one['peak_mb']:.0f} MB; thesis: {thesis['rooms']} rooms")
-    small = min((in_a_process(1, points=2_000_000) for _ in range(3)), key=lambda m: m["seconds"])
+    small = min((in_a_process(1, points=points // 3) for _ in range(3)), key=lambda m: m["seconds"])
     for place in ("beside", "above"):
         floors = 2
         while floors <= most:
-            many = in_a_process(floors, points=2_000_000, place=place)
-            line(f"{place}_{floors}", many["seconds"], floors * small["seconds"])
-            print(f"# {many['cells']} cells, {many['rooms']} rooms, {many['storeys']} storeys, peak {many['peak_mb']:.0f} MB")
+            floor_run = in_a_process(floors, points=points // 3, place=place)
+            line(f"{place}_{floors}", floor_run["seconds"], floors * small["seconds"])
+            size = f"{floor_run['cells']} cells, {floor_run['rooms']} rooms, {floor_run['storeys']} storeys"
+            print(f"# {size}, peak {floor_run['peak_mb']:.0f} MB")
             floors *= 2
 
 

@@ -1,8 +1,7 @@
 """Time and memory of `register` against the size of the maps: 10, 100 and 1,000 rooms.
 
 ``python -m benchmarks.speed.merge_growth [rooms ...]``: a floor of corridors with rooms of many widths on both sides, drawn as
-cells;
-two maps of three quarters of it each, one of them turned. Each size runs in a process of its own, whose peak memory is told.
+cells; two maps of three quarters of it each, one of them turned. Each size runs in a process of its own, whose peak memory is told.
 """
 
 from __future__ import annotations
@@ -10,13 +9,15 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
 from topomerge.fusion.registration import register
 from topomerge.types import Array, Sim3, VoxelGrid
 
-EDGE, HIGH = 0.1, 27  # m, cells from floor to ceiling
+CELL_EDGE, CEILING_CELLS = 0.1, 27  # m, cells from floor to ceiling
+SIZES = (10, 100, 1000)  # rooms
 ROW = 20  # rooms along one side of a corridor
 TURN = Sim3(0.7, (12.3, -4.1, 0.2))
 
@@ -46,10 +47,10 @@ def floor_plan(rooms: int, seed: int = 0) -> tuple[Array, Array]:
 def as_cells(wall: Array, door: Array) -> Array:
     """(n, 3) cells of floor, ceiling and walls with open doors under lintels."""
     x, y = np.indices(wall.shape).reshape(2, -1)
-    level = [np.column_stack([x, y, np.full(x.size, z)]) for z in (0, HIGH)]
-    up = np.arange(HIGH)
+    level = [np.column_stack([x, y, np.full(x.size, z)]) for z in (0, CEILING_CELLS)]
+    up = np.arange(CEILING_CELLS)
     at, over = np.argwhere(wall & ~door), np.argwhere(wall & door)
-    walls = np.column_stack([np.repeat(at, HIGH, axis=0), np.tile(up, len(at))])
+    walls = np.column_stack([np.repeat(at, CEILING_CELLS, axis=0), np.tile(up, len(at))])
     lintels = np.column_stack([np.repeat(over, 6, axis=0), np.tile(up[-6:], len(over))])
     return np.concatenate([*level, walls, lintels]).astype(np.int64)
 
@@ -61,28 +62,33 @@ def measure(rooms: int) -> None:
     wall, door = floor_plan(rooms)
     cells = as_cells(wall, door)
     quarter = wall.shape[0] // 4
-    a = VoxelGrid.from_cells(cells[cells[:, 0] < 3 * quarter], np.zeros(3), EDGE)
-    points = TURN.apply((cells[cells[:, 0] > quarter] + 0.5) * EDGE)
-    base = np.floor(points.min(axis=0) / EDGE).astype(np.int64)
-    b = VoxelGrid.from_cells(np.unique(np.floor(points / EDGE).astype(np.int64) - base, axis=0), base * EDGE, EDGE)
+    a = VoxelGrid.from_cells(cells[cells[:, 0] < 3 * quarter], np.zeros(3), CELL_EDGE)
+    points = TURN.apply((cells[cells[:, 0] > quarter] + 0.5) * CELL_EDGE)
+    base = np.floor(points.min(axis=0) / CELL_EDGE).astype(np.int64)
+    b = VoxelGrid.from_cells(np.unique(np.floor(points / CELL_EDGE).astype(np.int64) - base, axis=0), base * CELL_EDGE, CELL_EDGE)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     began = time.process_time()
-    found = register(a, b)
+    registration = register(a, b)
     seconds = time.process_time() - began
     middle = points.mean(axis=0)[None]
     off = float("nan")
-    if found.transform is not None:
-        off = float(np.linalg.norm(found.transform.apply(middle) - TURN.inverse().apply(middle)))
+    if registration.transform is not None:
+        off = float(np.linalg.norm(registration.transform.apply(middle) - TURN.inverse().apply(middle)))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    steps = ", ".join(f"{k} {v:.2f}" for k, v in found.seconds.items())
-    told = f"p {found.probability:.2f} | off {off:.2f} m"
+    steps = ", ".join(f"{k} {v:.2f}" for k, v in registration.seconds.items())
+    outcome = f"p {registration.probability:.2f} | off {off:.2f} m"
     size = f"{rooms} rooms | {(len(a) + len(b)) / 1e6:.1f} M cells"
-    print(f"{size} | {seconds:.1f} s | {peak:.0f} MB ({before:.0f} before) | {told} | {steps}")
+    print(f"{size} | {seconds:.1f} s | {peak:.0f} MB ({before:.0f} before) | {outcome} | {steps}")
+
+
+def main(rooms: Sequence[int] = SIZES) -> None:
+    """Print a line for each size, measured in a process of its own."""
+    for number in rooms:
+        subprocess.run([sys.executable, "-m", "benchmarks.speed.merge_growth", "one", str(number)], check=True)
 
 
 if __name__ == "__main__":
     if len(sys.argv) == 3 and sys.argv[1] == "one":
         measure(int(sys.argv[2]))
     else:
-        for number in sys.argv[1:] or ["10", "100", "1000"]:
-            subprocess.run([sys.executable, "-m", "benchmarks.speed.merge_growth", "one", number], check=True)
+        main([int(number) for number in sys.argv[1:]] or SIZES)

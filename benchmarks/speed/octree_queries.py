@@ -23,9 +23,9 @@ from topomerge.extraction.octree import SparseVoxelOctree
 from topomerge.kernels.lookup import row
 from topomerge.types import VoxelGrid
 
-EDGE = 0.1  # m
+CELL_EDGE = 0.1  # m
 RADII = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0)  # m
-SLACK = 1e-6 * EDGE  # m: cells exactly at r count, as they do for the octree
+RADIUS_SLACK = 1e-6 * CELL_EDGE  # m: cells exactly at r count, as they do for the octree
 CSR = tuple[np.ndarray, np.ndarray]
 
 
@@ -43,8 +43,8 @@ def floor_grid() -> VoxelGrid:
     rng = np.random.default_rng(0)
     for x, y in rng.integers(2, 385, (400, 2)):
         volume[x : x + 12, y : y + 6, 7] = True  # tables
-    kept = volume & (rng.random(volume.shape) < 0.95)  # scans have holes
-    return VoxelGrid.from_cells(np.argwhere(kept), edge=EDGE)
+    scanned = volume & (rng.random(volume.shape) < 0.95)  # scans have holes
+    return VoxelGrid.from_cells(np.argwhere(scanned), edge=CELL_EDGE)
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
@@ -52,10 +52,10 @@ def _by_bricks(table, bricks, cells, offsets, indptr, rows, fill):  # type: igno
     for i in prange(len(cells)):
         count = 0
         for j in range(len(offsets)):
-            found = row(table, bricks, cells[i, 0] + offsets[j, 0], cells[i, 1] + offsets[j, 1], cells[i, 2] + offsets[j, 2])
-            if found >= 0:
+            cell_row = row(table, bricks, cells[i, 0] + offsets[j, 0], cells[i, 1] + offsets[j, 1], cells[i, 2] + offsets[j, 2])
+            if cell_row >= 0:
                 if fill:
-                    rows[indptr[i] + count] = found
+                    rows[indptr[i] + count] = cell_row
                 count += 1
         if not fill:
             indptr[i + 1] = count
@@ -106,7 +106,7 @@ def _by_hash(keys, values, cells, offsets, indptr, rows, fill):  # type: ignore[
 
 def _two_passes(kernel: Callable[..., None], tables: CSR, cells: np.ndarray, radius: float) -> CSR:
     """Count, then fill: as the octree does. Rows stay in the order of the stencil."""
-    offsets = sphere(radius, EDGE).offsets
+    offsets = sphere(radius, CELL_EDGE).offsets
     indptr, rows = np.zeros(len(cells) + 1, np.int64), np.empty(0, np.int64)
     kernel(*tables, cells, offsets, indptr, rows, False)
     np.cumsum(indptr, out=indptr)
@@ -123,26 +123,26 @@ def methods(grid: VoxelGrid, queries: np.ndarray) -> dict[str, Callable[[float],
     keys = np.full(1 << int(len(grid) * 2 - 1).bit_length(), -1, np.int64)  # at most half full
     values = np.empty_like(keys)
     _hash(grid.cells, keys, values)
-    found: dict[str, Callable[[float], Any]] = {
+    by_name: dict[str, Callable[[float], Any]] = {
         "octree": lambda r: octree.radius_many(queries, r),
-        "kdtree": lambda r: tree.query_ball_point(centres, r + SLACK, workers=2),
+        "kdtree": lambda r: tree.query_ball_point(centres, r + RADIUS_SLACK, workers=2),
         "bricks": lambda r: _two_passes(_by_bricks, grid._bricks, cells, r),
         "hash": lambda r: _two_passes(_by_hash, (keys, values), cells, r),
     }
     try:
         import open3d as o3d
     except ImportError:
-        return found
+        return by_name
     points, tensor = o3d.core.Tensor(centroids), o3d.core.Tensor(centres)
     searches: dict[float, Any] = {}
 
     def by_open3d(r: float) -> Any:
         if r not in searches:  # its index is made for one radius: not timed, as the others' is not
             searches[r] = o3d.core.nns.NearestNeighborSearch(points)
-            searches[r].fixed_radius_index(r + SLACK)
-        return searches[r].fixed_radius_search(tensor, r + SLACK)
+            searches[r].fixed_radius_index(r + RADIUS_SLACK)
+        return searches[r].fixed_radius_search(tensor, r + RADIUS_SLACK)
 
-    return {**found, "open3d": by_open3d}
+    return {**by_name, "open3d": by_open3d}
 
 
 def counts(result: Any) -> np.ndarray:
@@ -152,12 +152,12 @@ def counts(result: Any) -> np.ndarray:
     return np.diff(result[0] if len(result) == 2 else result[2].numpy())
 
 
-def main(queries: int = 5000) -> None:
+def main(queries: int = 5000, radii: tuple[float, ...] = RADII) -> None:
     """Verify, then time."""
     grid = floor_grid()
     chosen = np.random.default_rng(1).choice(len(grid), queries, replace=False)
     by_name = methods(grid, grid.cells[np.sort(chosen)])
-    for radius in RADII:
+    for radius in radii:
         expected = counts(by_name["octree"](radius))
         for name, method in by_name.items():
             if not np.array_equal(counts(method(radius)), expected):

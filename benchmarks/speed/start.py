@@ -12,18 +12,17 @@ from benchmarks.speed.bench import best
 from topomerge.cli.commands import COMMANDS
 
 
-def run(*words: str) -> float:
-    """Seconds of a process, the least disturbed of five."""
-    return best(lambda: subprocess.run([sys.executable, *words], stdout=subprocess.DEVNULL, check=True))
+def main(repeat: int = 5, commands: int | None = None) -> None:
+    """Print a table of the least disturbed of `repeat` runs; of the first `commands` commands, or of all."""
 
+    def run(*words: str) -> float:
+        return best(lambda: subprocess.run([sys.executable, *words], stdout=subprocess.DEVNULL, check=True), repeat)
 
-def main() -> None:
-    """Print a table."""
     print("| command | s |\n|---|---|")
     print(f"| `python -c pass` | {run('-c', 'pass'):.3f} |")
     print(f"| `python -c 'import topomerge'` | {run('-c', 'import topomerge'):.3f} |")
     print(f"| `topomerge --help` | {run('-m', 'topomerge', '--help'):.3f} |", flush=True)
-    for command in COMMANDS:
+    for command in COMMANDS[:commands]:
         print(f"| `topomerge {command.name} --help` | {run('-m', 'topomerge', command.name, '--help'):.3f} |", flush=True)
 
 
