@@ -48,8 +48,9 @@ docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "The documentation: build/site/index.html"
 
+# All benchmarks of speed, about half an hour; what measures rooms and merges takes hours: see docs/benchmarks.md.
 bench: setup
-	@for b in benchmarks/[a-z]*.py; do case $$b in benchmarks/speed/bench.py) ;; *) $(BIN)/python $$b || exit 1 ;; esac; done
+	$(BIN)/python -m benchmarks.speed
 
 clean:
 	rm -rf build demo dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -1,0 +1,136 @@
+"""Rules of the house about size and language that a machine can hold."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+import topomerge
+
+ROOT = Path(__file__).parent.parent
+LONGEST_FILE, LONGEST_FUNCTION, MOST_PARAMETERS = 300, 60, 8
+SAME_CONSTANT = 2  # files that may define a constant of one name
+REPEATED = 6  # lines: a run of so many stands in one place only
+PROTOCOLS = {  # constants that modules of one kind must all have, as the module that calls them says
+    "datasets/real/sources.py": {"FOLDER"},
+    "datasets/public/sources.py": {"FOLDER"},
+}
+VAGUE = {"found", "known", "kept", "told"}  # they say that a thing is there, never what it is
+
+
+def product_files() -> list[Path]:
+    """Every Python file but the tests."""
+    folders = [ROOT / name for name in ("topomerge", "models", "datasets", "benchmarks")]
+    return sorted(path for folder in folders for path in folder.rglob("*.py")) + [ROOT / "train.py", ROOT / "evaluate.py"]
+
+
+def identify(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+FILES = [pytest.param(path, id=identify(path)) for path in product_files()]
+
+
+@pytest.mark.parametrize("path", FILES)
+def test_files_and_functions_are_short(path: Path) -> None:
+    text = path.read_text()
+    assert text.count("\n") <= LONGEST_FILE, f"{identify(path)} has {text.count(chr(10))} lines: split it by what it does"
+    if path.parent.name == "kernels":  # compiled loops take plain arrays, many of them
+        return
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            where = f"{identify(path)}:{node.lineno}: {node.name}"
+            assert node.end_lineno is not None
+            assert node.end_lineno - node.lineno + 1 <= LONGEST_FUNCTION, f"{where} is longer than {LONGEST_FUNCTION} lines"
+            names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            count = len(names) - (names[:1] in (["self"], ["cls"]))
+            compiled = any("njit" in ast.unparse(d) for d in node.decorator_list)
+            assert compiled or count <= MOST_PARAMETERS, f"{where} has {count} parameters"
+
+
+def identifiers(tree: ast.AST) -> set[tuple[str, int]]:
+    """(name, line) of variables, arguments, attributes, functions, classes and keywords."""
+    names: set[tuple[str, int]] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            names.add((node.id, node.lineno))
+        elif isinstance(node, ast.arg):
+            names.add((node.arg, node.lineno))
+        elif isinstance(node, ast.Attribute):
+            names.add((node.attr, node.lineno))
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add((node.name, node.lineno))
+        elif isinstance(node, ast.keyword) and node.arg:
+            names.add((node.arg, node.value.lineno))
+    return names
+
+
+@pytest.mark.parametrize("path", FILES)
+def test_names_say_what_a_thing_is(path: Path) -> None:
+    vague = sorted((line, name) for name, line in identifiers(ast.parse(path.read_text())) if name.strip("_") in VAGUE)
+    assert not vague, f"{identify(path)}: {vague}: name the thing, not that it is there"
+
+
+def test_constants_are_qualified() -> None:
+    homes: dict[str, set[str]] = defaultdict(set)
+    for path in product_files():
+        protocol = PROTOCOLS.get(f"{identify(path.parent)}/sources.py", set())
+        for node in ast.parse(path.read_text()).body:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+            for name in (n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)):
+                if re.fullmatch(r"[A-Z][A-Z0-9_]*", name) and name not in protocol:
+                    homes[name].add(identify(path))
+    shared = {name: sorted(files) for name, files in homes.items() if len(files) > SAME_CONSTANT}
+    assert not shared, "\n".join(f"{name}: {', '.join(files)}" for name, files in sorted(shared.items()))
+
+
+def lines_of(path: Path) -> list[tuple[int, str]]:
+    """(number, text) of the lines that do something: no blank ones, comments, imports or lone brackets."""
+    tree = ast.parse(path.read_text())
+    skipped: set[int] = set()
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        texts = (
+            [b for b in body if isinstance(b, ast.Expr) and isinstance(b.value, ast.Constant)] if isinstance(body, list) else []
+        )
+        for part in (node, *texts):
+            if isinstance(part, ast.Import | ast.ImportFrom | ast.Expr) and (part is not node or not isinstance(node, ast.Expr)):
+                skipped |= set(range(part.lineno, (part.end_lineno or part.lineno) + 1))
+    numbered = enumerate(path.read_text().splitlines(), 1)
+    return [(k, s) for k, line in numbered if k not in skipped and len(s := line.strip()) > 2 and not s.startswith("#")]
+
+
+def test_nothing_is_written_twice() -> None:
+    places: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for path in product_files():
+        lines = lines_of(path)
+        for at in range(len(lines) - REPEATED + 1):
+            run = tuple(text for _, text in lines[at : at + REPEATED])
+            places[run].append(f"{identify(path)}:{lines[at][0]}")
+    repeated = sorted({" = ".join(where) for where in places.values() if len(where) > 1})
+    assert not repeated, "\n".join(repeated)
+
+
+def test_the_api_is_explained() -> None:
+    """Every public name stands in the glossary or in a docstring; every parameter and field in the docstring of its owner."""
+    glossary = (ROOT / "docs" / "glossary.md").read_text()
+    unexplained = []
+    for name in topomerge.__all__:
+        thing = getattr(topomerge, name)
+        text = inspect.getdoc(thing) or ""
+        if not callable(thing):
+            unexplained += [name] if not re.search(rf"`{name}`", glossary) and name != "__version__" else []
+            continue
+        unexplained += [] if len(text) > 20 else [name]
+        words = set(re.findall(r"\w+", text + glossary))
+        if not (inspect.isclass(thing) and issubclass(thing, Exception)):
+            unexplained += [f"{name}({p})" for p in inspect.signature(thing).parameters if p not in words]
+        if inspect.isclass(thing):
+            members = [a for a in vars(thing) if not a.startswith("_")]
+            unexplained += [f"{name}.{a}" for a in members if a not in words and not inspect.getdoc(getattr(thing, a, None))]
+    assert not unexplained, unexplained
