@@ -1,7 +1,8 @@
 """Time and memory of `register` against the size of the maps: 10, 100 and 1,000 rooms.
 
 ``python -m benchmarks.speed.merge_growth [rooms ...]``: a floor of corridors with rooms of many widths on both sides, drawn as
-cells; two maps of three quarters of it each, one of them turned. Each size runs in a process of its own, whose peak memory is told.
+cells; two maps of three quarters of it each, one of them turned. Each size runs in a process of its own; its peak memory is
+printed.
 """
 
 from __future__ import annotations
