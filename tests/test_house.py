@@ -12,6 +12,7 @@ ROOT = Path(__file__).parent.parent
 # Lower may not import higher. Names of the same rank may import each other within their package only.
 RANKS = {
     "errors": 0,
+    "code_digest": 0,
     "kernels": 0,
     "types": 1,
     "io": 2,

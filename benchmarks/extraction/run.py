@@ -25,17 +25,10 @@ from benchmarks.extraction.cases import GROUPS, chosen
 from benchmarks.extraction.measure import Row, measure
 from benchmarks.extraction.scans import Case
 from benchmarks.extraction.tables import listing, summary, write
+from topomerge.code_digest import code_digest
 
 ROOT = Path(__file__).parent.parent.parent
-CODE = ("topomerge/extraction", "topomerge/kernels", "topomerge/metrics.py", "topomerge/types.py",
-"datasets/simulation/floor_truth.py")
-
-
-def code_hash() -> str:
-    """Of all that the numbers depend on beside the scan."""
-    paths = [ROOT / name for name in CODE]
-    files = [f for p in paths for f in (sorted(p.rglob("*.*")) if p.is_dir() else [p]) if f.suffix in (".py", ".json", ".npz")]
-    return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
+MAKERS = tuple(f"topomerge.{name}" for name in ("extraction.extract", "metrics", "datasets.simulation.floor_truth"))  # of a row
 
 
 def key_of(case: Case, preset: str, code: str) -> str:
@@ -71,7 +64,7 @@ def known_rows(path: Path) -> dict[str, Row]:
 
 def results(cases: list[Case], presets: list[str], settings: argparse.Namespace) -> list[Row]:
     """A row for each case and preset; those that are missing are made now."""
-    out, scans, code = Path(settings.out), Path(settings.scans), code_hash()
+    out, scans, code = Path(settings.out), Path(settings.scans), code_digest(*MAKERS)
     out.mkdir(parents=True, exist_ok=True)
     known = known_rows(out / "results.jsonl")
     if settings.fresh:

@@ -20,11 +20,15 @@ from topomerge.datasets.pairs.pairs import HARD
 from topomerge.datasets.plans import splits
 from topomerge.datasets.simulation.sensors import get_sensor
 
+from topomerge.code_digest import code_digest, data_digest
 from topomerge.embedding import graph
 from topomerge.errors import InputError
 from topomerge.io.listing import plain
 
-FORMAT = 6  # raise it when the same item gives other bytes: it is part of the files' names
+# Raise it when the same item gives other bytes, by whatever step: simulation, extraction, truth. It is part of the files' names.
+PAIR_FORMAT = 6
+EXTRACTION = "topomerge.extraction.extract"
+MAKER = "topomerge.datasets.pairs.example"  # what makes the files
 LEAST_ROOMS = 5  # of a real plan: fewer have no two parts
 LEAST_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told apart
 LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
@@ -115,10 +119,18 @@ class Item:
 
     @property
     def name(self) -> str:
-        """A hash of the inputs and of the versions of what is made from them."""
-        known = asdict(self)
+        """A hash of the inputs and of what makes the file from them: the name of its files in a cache.
+
+        A set for evaluation (`maps`) takes minutes, and its numbers must be those of the code as it stands: the name has the
+        digest of all code and data that make its files. A set for training takes hours, and an edit that changes no bytes must
+        not cost them: the name has the versions of the steps (`PAIR_FORMAT`, `graph.FORMAT`), which whoever changes their
+        results raises, and the digest of the weights that the extraction reads, which change by training alone.
+        """
+        values = asdict(self)
         later = {"maps": False, "change": UNCHANGED}  # these came later: at their defaults older names hold
-        inputs = [FORMAT, graph.FORMAT, plain({k: v for k, v in known.items() if k not in later or v != later[k]})]
+        values = {key: value for key, value in values.items() if key not in later or value != later[key]}
+        maker = code_digest(MAKER) if self.maps else data_digest(EXTRACTION)
+        inputs = [PAIR_FORMAT, graph.FORMAT, maker, plain(values)]
         return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:24]
 
 

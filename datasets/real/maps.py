@@ -11,10 +11,10 @@ from pathlib import Path
 from topomerge.datasets.pairs.evaluation_pair import kept_arrays, save_maps, told_of_maps
 from topomerge.datasets.pairs.example import pair_arrays, time_limit
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.pairs.recipe import FORMAT
 from topomerge.datasets.plans.floorplans import Refusal
 from topomerge.datasets.real.sources import collect
 
+from topomerge.code_digest import code_digest
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io import archive
@@ -69,9 +69,9 @@ def _makers(module: object, data: Path, source: str) -> list[tuple[str, Callable
 
 
 def digest(data: Path, source: str, voxel_size: float) -> str:
-    """Hash of a source's files, the voxel size and the format."""
+    """Hash of a source's files, of the voxel size, and of the code and weights that make pairs and maps of them."""
     module = import_module(f"topomerge.datasets.real.{source}")
-    whole = hashlib.sha256(f"{FORMAT} {voxel_size}".encode())
+    whole = hashlib.sha256(f"{code_digest(__name__)} {voxel_size}".encode())
     for file in sorted(p for p in (data / module.FOLDER).rglob("*") if p.is_file()):
         whole.update(file.relative_to(data).as_posix().encode() + hashlib.sha256(file.read_bytes()).digest())
     return whole.hexdigest()[:16]

@@ -47,7 +47,7 @@ class Counted:
         rows: what is told of each pair (`example.make_arrays`).
         bytes: of each file.
         apart: m, of all pairs: see `middles_apart`.
-        outdated: pairs in the folder that are of another version of the data (`recipe.FORMAT`); none of them is counted.
+        outdated: pairs in the folder that are of another version of the data (`recipe.PAIR_FORMAT`); none of them is counted.
         refused: reasons and how often, without the names and numbers in them; of all versions in the folder. What took too
             long, or failed in a way that may not happen again, leaves no file and is not among them.
     """

@@ -17,7 +17,6 @@ from topomerge.datasets.pairs.recipe import check as check_recipe
 from topomerge.config import compose
 from topomerge.errors import InputError
 from topomerge.evaluation import predict as predicting
-from topomerge.evaluation.describe import bare
 from topomerge.evaluation.evaluate import claim, evaluate
 from topomerge.evaluation.settings import Evaluation, Pairs, check, difference, folder_of, run_title, told, variants
 from topomerge.evaluation.tables import Table, write_section
@@ -107,12 +106,6 @@ def test_runs_are_called_by_what_they_are_made_of() -> None:
     assert [v.name for v in variants(settings)] == ["scalars, gat around, infonce"] == list(told(settings)["run"])
     with pytest.raises(InputError, match="two are called 'scalars, gat around, infonce'"):
         check(replace(settings, run=[run, f"{run}/embedder.json"]))
-
-
-def test_comments_do_not_change_code() -> None:
-    text = 'X = 1\n\n\ndef f(x):\n    """Twice."""\n    return x + X\n'
-    assert bare(text) == bare(text.replace('"""Twice."""', "# once more\n    'no'"))
-    assert bare(text) != bare(text.replace("x + X", "x - X"))
 
 
 def test_the_first_difference_is_told() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import json
 import time
@@ -14,7 +13,8 @@ from typing import Any
 import numpy as np
 
 import topomerge
-from topomerge.embedding.embedders import embedder
+from topomerge.code_digest import code_digest
+from topomerge.embedding.embedders import EMBEDDERS, embedder
 from topomerge.embedding.learned import EXTRAS
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.evaluation.settings import Evaluation, Variant
@@ -23,30 +23,6 @@ from topomerge.io.listing import plain
 from topomerge.types import Array, TopometricMap
 
 Maps = tuple[TopometricMap, TopometricMap]
-UNTRAINED = (
-    *(f"embedding/{n}" for n in ("engineered.*", "shapedna.py", "laplacian.py", "feather.py", "context.py", "room_cells.py")),
-    "kernels/voronoi.py",
-)
-
-
-@cache
-def code(*patterns: str) -> str:
-    """Digest of the code that something comes from: files of the package, by pattern, without comments and docstrings."""
-    whole = hashlib.sha256()
-    for pattern in patterns:
-        for file in sorted(Path(topomerge.__file__).parent.glob(pattern)):
-            whole.update(bare(file.read_text(encoding="utf-8")).encode() if file.suffix == ".py" else file.read_bytes())
-    return whole.hexdigest()[:12]
-
-
-def bare(source: str) -> str:
-    """Python without what it does not do: comments, blank lines, docstrings and other texts that nobody reads."""
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [b for b in body if not (isinstance(b, ast.Expr) and isinstance(b.value, ast.Constant))]  # type: ignore[attr-defined]
-    return ast.dump(tree)
 
 
 @cache
@@ -103,12 +79,17 @@ def described(
     return (found[0], found[1]), seconds
 
 
+def code_of(name: str) -> str:
+    """Digest of the code and data that the descriptors of a name, alone or joined with surroundings, come from."""
+    return code_digest(EMBEDDERS[name].__module__, "topomerge.embedding.context")
+
+
 def _gives(rows: Array) -> Descriptor:
     return lambda m: rows
 
 
 class Shelf:
-    """Cached descriptors of the map of one file, named by a hash of the map, the options and the code.
+    """Cached descriptors of the map of one file, named by a hash of the map, the options, the code and its data.
 
     Joined surroundings of fewer steps are the first columns of those of more, so that only the most are made.
     """
@@ -120,7 +101,7 @@ class Shelf:
     def rows(self, m: TopometricMap, options: Mapping[str, Any], steps: int) -> tuple[Array, float]:
         """(R, (steps + 1) D) the rooms' own and those of their joined surroundings; and the seconds that they took."""
         digest = hashlib.sha256(self.source.read_bytes()).hexdigest()
-        inputs = json.dumps([digest, plain(dict(options)), steps, code(*UNTRAINED)], sort_keys=True)
+        inputs = json.dumps([digest, plain(dict(options)), steps, code_of(str(options["name"]))], sort_keys=True)
         file = self.folder / f"{hashlib.sha256(inputs.encode()).hexdigest()[:24]}.npz"
         if not file.exists():
             describe = embedder(str(options["name"]), **{k: v for k, v in options.items() if k != "name"})

@@ -10,11 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from topomerge.code_digest import code_digest
 from topomerge.datasets.pairs.build import Build, build
 from topomerge.datasets.pairs.recipe import Recipe
 from topomerge.datasets.real.maps import keep_real
 from topomerge.errors import InputError
-from topomerge.evaluation.describe import code
 from topomerge.evaluation.figures import save_figures
 from topomerge.evaluation.predict import CODE, predict_all
 from topomerge.evaluation.score import Row, score_all
@@ -67,7 +67,7 @@ def evaluate(settings: Evaluation, say: Say = lambda text: None, command: str = 
         raise InputError(f"{settings.data.name}: no pair could be made; see the reasons above")
     files = predict_all(pairs, folder / "predictions", settings, say)
     matches, ranks, merges = score_all(pairs, files, settings)
-    old = {r["pair"] for r in (*ranks, *merges) if r["code"] != code(*CODE)}
+    old = {r["pair"] for r in (*ranks, *merges) if r["code"] != code_digest(*CODE)}
     if old:
         say(f"{len(old)} of {len(files)} pairs were predicted by another version of the code; remake=true predicts them again")
     parts = report(matches, ranks, merges, settings)

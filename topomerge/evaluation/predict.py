@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 import topomerge
+from topomerge.code_digest import code_digest
 from topomerge.datasets.pairs.evaluation_pair import KeptPair, load_kept
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
-from topomerge.evaluation.describe import UNTRAINED, Inputs, Maps, code, described, trained
+from topomerge.evaluation.describe import Inputs, Maps, described, trained
 from topomerge.evaluation.settings import Evaluation, Variant, variants
 from topomerge.fusion.merge import merge
 from topomerge.fusion.verify import model
@@ -27,7 +28,7 @@ from topomerge.matching.costs import descriptor_costs
 from topomerge.matching.match import match
 from topomerge.types import Array
 
-CODE = ("matching/*.py", "fusion/*.py", *UNTRAINED)  # that predictions come from
+CODE = tuple(f"topomerge.{name}" for name in ("embedding.embedders", "matching.costs", "matching.match", "fusion.merge"))
 
 
 def predict(path: Path, target: Path, settings: Evaluation) -> str:
@@ -40,7 +41,7 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
     maps = kept.maps()
     some = list(variants(settings))
     arrays: dict[str, Array] = {}
-    told: dict[str, Any] = {"pair": kept.name, "version": topomerge.__version__, "code": code(*CODE)}
+    told: dict[str, Any] = {"pair": kept.name, "version": topomerge.__version__, "code": code_digest(*CODE)}
     inputs = Inputs()
     rows = {v.name: described(v, maps, path, settings, inputs) for v in some}
     told["seconds"] = {name: seconds for name, (_, seconds) in rows.items()}

@@ -9,18 +9,21 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from topomerge.datasets.core.plan import Opening, Plan
 from topomerge.datasets.pairs import build as module
-from topomerge.datasets.pairs import example
+from topomerge.datasets.pairs import example, recipe
 from topomerge.datasets.pairs.build import Build, build, main
 from topomerge.datasets.pairs.example import PairSet, Row, load_example
 from topomerge.datasets.pairs.recipe import Item, Recipe, check, draw_items, plans_of
 
 from tests.datasets.boxes import room
+from tests.package_copy import copied, edited_kernel
+from topomerge.code_digest import code_digest, data_digest
 from topomerge.config import compose
 from topomerge.errors import InputError
 
@@ -62,6 +65,27 @@ def test_what_is_there_is_not_made_again(whole: Path) -> None:
     report = build(Build(SMALL, str(whole)))
     assert report.made == 0 and report.pairs == 3
     assert contents(whole) == before and set(before) == {"small.jsonl", *(f"pairs/{i.name}.npz" for i in draw_items(SMALL, {}))}
+
+
+@pytest.mark.parametrize(("addition", "maps", "same"), [
+    ("ANOTHER = 1", True, False), ("# another word", True, True), ("ANOTHER = 1", False, True),
+])  # fmt: skip
+def test_another_kernel_refuses_cached_maps(monkeypatch, tmp_path, addition: str, maps: bool, same: bool) -> None:
+    item = replace(draw_items(SMALL, {})[0], maps=maps)
+    before = item.name
+    monkeypatch.setattr(recipe, "code_digest", partial(code_digest, package=edited_kernel(tmp_path, addition)))
+    assert (item.name == before) is same
+
+
+@pytest.mark.parametrize("maps", [False, True])
+def test_other_weights_of_the_extraction_refuse_cached_pairs(monkeypatch, tmp_path, maps: bool) -> None:
+    item = replace(draw_items(SMALL, {})[0], maps=maps)
+    before, package = item.name, copied(tmp_path)
+    with (package / "extraction" / "plans" / "plan_network.npz").open("ab") as file:
+        file.write(b" ")
+    for digest in (code_digest, data_digest):
+        monkeypatch.setattr(recipe, digest.__name__, partial(digest, package=package))
+    assert item.name != before
 
 
 def test_what_is_missing_or_damaged_is_made_again(whole: Path, tmp_path: Path) -> None:

@@ -1,0 +1,212 @@
+"""What a cache depends on, as one short hash: the code that made its files, and the data that this code reads.
+
+    key = code_digest("topomerge.extraction.extract")     # of everything that `extract` may run
+    key = data_digest("topomerge.extraction.extract")     # of its packaged weights and tables only
+
+A cache whose files are cheap to make again puts `code_digest` of the module that makes them into their names: no edit, neither of
+a kernel three imports away nor of `calibration.json`, can leave an old file in use. A cache whose files take hours puts a version
+number of its steps there instead, which whoever changes their results raises, and `data_digest`: packaged weights change without
+anyone reading code. Name the modules that *make* the files, not those that only score or print them.
+
+The walk reads syntax trees and imports nothing, so that it needs no torch and costs a second or two, once a process. It follows
+
+- imports, also within functions, but not those for type checkers;
+- ``import_module("topomerge.…")``, and where the name is put together (``f"topomerge.io.{name}"``) all modules of that package;
+- names of the library's lazy face (``topomerge.extract``, ``from topomerge import extract``) to their homes;
+- the `__init__` of every package on the way but the face;
+- data files: those beside a module, or in a folder beside it, whose name, or that of the folder, stands as a text in the module.
+
+Comments, docstrings and the layout of lines do not count. Python's own version and that of other libraries do not either.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+HERE = Path(__file__).parent
+TOP = "topomerge"
+BESIDE = ("models", "datasets", "configs")  # installed below topomerge; in a checkout they stand next to it
+LENGTH = 16  # hexadecimal digits
+SKIPPED = (".py", ".pyc", ".pyi")
+
+
+@cache
+def code_digest(*modules: str, package: Path = HERE) -> str:
+    """Hash of modules, of all that they import within the house, and of the data files that these read.
+
+    Args:
+        modules: full names, such as ``"topomerge.extraction.extract"``; their order counts for nothing.
+        package: folder of the package; another one than that of this file is for tests.
+
+    Raises:
+        ModuleNotFoundError: no such module.
+    """
+    files = reached(*modules, package=package)
+    lines = [f"{name} {_source(path).hash}" for name, path in files.items()]
+    return _hash("\n".join([*lines, *_data_lines(files)]))
+
+
+@cache
+def data_digest(*modules: str, package: Path = HERE) -> str:
+    """As `code_digest`, of the data files alone: weights and tables that were trained or measured."""
+    return _hash("\n".join(_data_lines(reached(*modules, package=package))))
+
+
+@cache
+def reached(*modules: str, package: Path = HERE) -> dict[str, Path]:
+    """Name -> file of modules and of all that they import within the house, sorted by name."""
+    files: dict[str, Path] = {}
+    waiting = list(modules)
+    for module in modules:
+        if _file_of(module, package) is None:
+            raise ModuleNotFoundError(f"{module}: no such module below {package}", name=module)
+    while waiting:
+        module = waiting.pop()
+        path = _file_of(module, package)
+        if path is None or module in files or module == TOP:
+            continue
+        files[module] = path
+        waiting.append(module.rpartition(".")[0])
+        waiting += _imports(path, package)
+    return dict(sorted(files.items()))
+
+
+def data_files(path: Path) -> list[Path]:
+    """Data files that a module names, beside it or in a folder beside it; sorted."""
+    texts = _source(path).texts
+    files = []
+    for entry in path.parent.iterdir():
+        if entry.is_dir():
+            inner = [p for p in entry.rglob("*") if p.is_file()]
+            if not any(p.suffix in SKIPPED for p in inner):
+                files += [p for p in inner if entry.name in texts or p.name in texts]
+        elif entry.suffix not in SKIPPED and entry.name in texts:
+            files.append(entry)
+    return sorted(files)
+
+
+def _data_lines(files: dict[str, Path]) -> list[str]:
+    """A line for each data file: its place and its hash."""
+    lines = set()
+    for name, path in files.items():
+        above = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        for file in data_files(path):
+            place = file.relative_to(path.parent).as_posix()
+            lines.add(f"{above}/{place} {hashlib.sha256(file.read_bytes()).hexdigest()}")
+    return sorted(lines)
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:LENGTH]
+
+
+def _file_of(module: str, package: Path) -> Path | None:
+    """File of a module of the house; None of anything else, such as a function's name behind its module's."""
+    top, *parts = module.split(".")
+    if top != TOP:
+        return None
+    beside = parts and parts[0] in BESIDE and not (package / parts[0]).is_dir()
+    path = (package.parent if beside else package).joinpath(*parts)
+    candidates = (path.with_name(f"{path.name}.py"), path / "__init__.py") if parts else (path / "__init__.py",)
+    return next((p for p in candidates if p.is_file()), None)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What a walk over a file needs: hash of its code, names that it takes from elsewhere, and its texts.
+
+    Args:
+        names: full names of modules, or of what stands in them; with ``*`` behind the dot: all modules of a package.
+    """
+
+    hash: str
+    names: frozenset[str]
+    texts: frozenset[str]
+
+
+@cache
+def _source(path: Path) -> _Source:
+    reading = _Reading()
+    reading.read(ast.parse(path.read_text(encoding="utf-8")))
+    words = hashlib.sha256("\n".join(reading.words).encode())
+    return _Source(words.hexdigest(), frozenset(reading.names), frozenset(reading.texts))
+
+
+class _Reading:
+    """One pass over a syntax tree, which is all that the walk costs."""
+
+    def __init__(self) -> None:
+        self.words: list[str] = []  # the code, without comments, docstrings and layout
+        self.names: set[str] = set()
+        self.texts: set[str] = set()
+
+    def read(self, node: ast.AST, counts: bool = True) -> None:
+        """Take in a node and all below it.
+
+        Args:
+            counts: do its imports? Those for type checkers do not run.
+        """
+        counts = counts and not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))
+        if counts:
+            self.names.update(_named(node))
+        self.words.append(node.__class__.__name__)
+        for field in node._fields:
+            value = getattr(node, field, None)
+            if value is None or value == [] or isinstance(value, ast.expr_context):
+                continue  # newer versions of Python have more fields that are empty
+            self.words.append(field)
+            for item in value if isinstance(value, list) else [value]:
+                if not isinstance(item, ast.AST):
+                    self.words.append(repr(item))
+                    if isinstance(item, str):
+                        self.texts.add(item)
+                elif not (isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant)):  # a docstring
+                    self.read(item, counts)
+        self.words.append("end")
+
+
+def _named(node: ast.AST) -> Iterator[str]:
+    """What a node of a syntax tree imports, or takes from the library's face."""
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        yield node.module
+        yield from (f"{node.module}.{alias.name}" for alias in node.names)
+    elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == TOP:
+        yield f"{TOP}.{node.attr}"  # topomerge.extract
+    elif isinstance(node, ast.Call) and node.args and ast.unparse(node.func).endswith("import_module"):
+        name = node.args[0]
+        if isinstance(name, ast.Constant):
+            yield str(name.value)
+        elif isinstance(name, ast.JoinedStr) and isinstance(name.values[0], ast.Constant):
+            yield str(name.values[0].value).rpartition(".")[0] + ".*"
+
+
+def _imports(path: Path, package: Path) -> Iterator[str]:
+    """Names in the house that a file imports; those behind a module's name may be functions or classes of it."""
+    homes = _homes(package)
+    for name in _source(path).names:
+        name = homes.get(name, name)
+        if name.split(".")[0] != TOP:
+            continue
+        folder, _, last = name.rpartition(".")
+        init = _file_of(folder, package) if last == "*" else None
+        if init is None:
+            yield name
+        else:
+            yield from (f"{folder}.{p.stem}" for p in init.parent.glob("*.py") if p != init)
+
+
+@cache
+def _homes(package: Path) -> dict[str, str]:
+    """``topomerge.extract`` -> the module that it comes from: `_HOMES` of the face."""
+    for node in ast.parse((package / "__init__.py").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and [ast.unparse(t) for t in node.targets] == ["_HOMES"]:
+            homes: dict[str, str] = ast.literal_eval(node.value)
+            return {f"{TOP}.{name}": home for name, home in homes.items()}
+    return {}
