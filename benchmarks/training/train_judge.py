@@ -19,8 +19,8 @@ import numpy as np
 
 from benchmarks.training.training_plans import files_of, load
 from topomerge.extraction.plans.passages import FEATURES, clearance_of, features, find_passages, regions_of
-from topomerge.extraction.plans.plan import Plan
 from topomerge.extraction.plans.plan_network import segment, without_furniture
+from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.types import Array
 
 WEIGHTS = Path("topomerge/extraction/plans/door_classifier.json")
@@ -28,7 +28,7 @@ SEEDS = 5  # networks that are averaged
 PURE = 0.7  # share of a region in its true room; regions between rooms are no example
 
 
-def regions_and_links(plan: Plan, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
+def regions_and_links(plan: StoreyPlan, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
     """Features and answers for the neighbouring regions of one plan, before and while those of one room are merged."""
     chance = segment(plan)
     plan = without_furniture(plan, chance)

@@ -6,7 +6,7 @@
 What `train_plan_network.py` and `train_judge.py` learn from: the judge hears the network, and must not hear it on scans that it
 was trained on. Procedural buildings and, with TOPOMERGE_DATA set, real plans; never one of validation or evaluation. All sensors,
 several voxel sizes, spoilt points, and grid maps drawn from the plans with furniture in them, as robots make them; most of them
-turned. A file holds what a `Plan` needs of each storey, `room` (-1 none) and `truth` (`TRUTHS`).
+turned. A file holds what a `StoreyPlan` needs of each storey, `room` (-1 none) and `truth` (`TRUTHS`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from benchmarks.extraction.sources import _drift_of, _exact, _spoilt
 from topomerge.errors import InputError
 from topomerge.extraction.extract import PRESETS, _grid, _standing, _upright
 from topomerge.extraction.noise import without_gaps
-from topomerge.extraction.plans.plan import Plan, storey_plan
+from topomerge.extraction.plans.plan import columns_of, profile_bands, storey_plan
+from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.types import Array, PointCloud, Sim3
 
@@ -48,14 +49,14 @@ WALL = 0.4  # m: so far from a room it is wall, further outside
 LEVEL = 0.6  # m between a storey and the true floor
 LOW = 1.0  # m: lower furniture is in a drawn grid
 HUNG = ("leaf", "board", "lamp", "beam", "duct")  # in no drawn grid
-KEPT = ("edge", "profile", "wall", "inside", "ceiling", "clear")
+KEPT = ("edge", "profile", "wall", "inside", "ceiling")
 
 
 @dataclass(frozen=True, eq=False)
 class Example:
     """A plan with what is true about it."""
 
-    plan: Plan
+    plan: StoreyPlan
     room: Array  # (nx, ny) int16 true room, -1 none
     truth: Array  # (nx, ny) uint8, index into TRUTHS
     visited: Array  # (n,) rooms that the surveyor was in
@@ -90,7 +91,7 @@ def save(path: Path, examples: list[Example]) -> None:
     arrays: dict[str, Any] = {"count": len(examples)}
     for k, e in enumerate(examples):
         small = {name: getattr(e.plan, name) for name in KEPT}
-        small |= {name: np.asarray(small[name], np.float32) for name in ("ceiling", "clear")}
+        small["ceiling"] = np.asarray(small["ceiling"], np.float32)
         arrays |= {f"{name}.{k}": v for name, v in small.items()}
         arrays |= {f"{name}.{k}": getattr(e, name) for name in ("room", "truth", "visited", "source")}
     beside = path.with_name(f"new_{path.name}")
@@ -104,9 +105,8 @@ def load(path: Path) -> list[Example]:
         a = dict(file)
     out = []
     for k in range(int(a["count"])):
-        nothing = np.zeros(a[f"wall.{k}"].shape, np.int64)
-        of = {name: a[f"{name}.{k}"] for name in KEPT[1:]}
-        plan = Plan(edge=float(a[f"edge.{k}"]), low=np.zeros(2, np.int64), base=nothing, top=nothing, **of)
+        edge, rasters = float(a[f"edge.{k}"]), {name: a[f"{name}.{k}"] for name in ("wall", "inside", "profile", "ceiling")}
+        plan = StoreyPlan(np.zeros(2), edge, bands=profile_bands(edge), floor=np.zeros(rasters["wall"].shape), **rasters)
         out.append(Example(plan, a[f"room.{k}"], a[f"truth.{k}"], a[f"visited.{k}"], str(a[f"source.{k}"])))
     return out
 
@@ -225,7 +225,7 @@ def near(mask: Array, reach: float) -> Array:
     return np.asarray(ndimage.distance_transform_edt(~mask) * FINE <= reach) if mask.any() else mask
 
 
-def storeys_of(cloud: PointCloud, edge: float) -> list[tuple[Plan, Array]]:
+def storeys_of(cloud: PointCloud, edge: float) -> list[tuple[StoreyPlan, Array]]:
     """The plans of a scan as the extraction makes them, and the places (nx, ny, 3) of their columns' floors."""
     p = PRESETS["default"]
     known: dict[str, Any] = {"warnings": []}
@@ -236,13 +236,14 @@ def storeys_of(cloud: PointCloud, edge: float) -> list[tuple[Plan, Array]]:
     for k in range(len(storeys)):
         if (storey == k).any():
             plan = storey_plan(grid, navigable, storey, k)
-            columns = np.stack(np.meshgrid(*(np.arange(n) for n in plan.wall.shape), indexing="ij"), axis=-1) + plan.low
-            cells = np.concatenate([columns, np.full((*plan.wall.shape, 1), np.median(plan.base))], axis=-1)
+            low, base = columns_of(plan, grid)
+            columns = np.stack(np.meshgrid(*(np.arange(n) for n in plan.wall.shape), indexing="ij"), axis=-1) + low
+            cells = np.concatenate([columns, np.full((*plan.wall.shape, 1), np.median(base))], axis=-1)
             out.append((plan, grid.origin + (cells + 0.5) * grid.edge))
     return out
 
 
-def truth_of(building: Building, plan: Plan, places: Array, frame: Sim3, shift: Any) -> tuple[Array, Array]:
+def truth_of(building: Building, plan: StoreyPlan, places: Array, frame: Sim3, shift: Any) -> tuple[Array, Array]:
     """True room and `TRUTHS` of each column of a plan."""
     from scipy.spatial import cKDTree
 

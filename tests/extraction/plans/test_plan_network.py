@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.extraction.plans.plan import BELOW, Plan
+from topomerge.extraction.plans.plan import BELOW, profile_bands
 from topomerge.extraction.plans.plan_network import (
     CHANNELS,
     CLASSES,
@@ -21,23 +21,23 @@ from topomerge.extraction.plans.plan_network import (
     weights,
     without_furniture,
 )
+from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.types import Array
 
 WALL, FLOOR = ((1 << 24) - 1) << BELOW, 1 << BELOW
 
 
-def drawn(wall: Array) -> Plan:
+def drawn(wall: Array) -> StoreyPlan:
     """The plan of a raised grid map: walls of 2.4 m, a floor everywhere else but outside."""
     profile = np.where(wall, WALL, FLOOR).astype(np.uint64)
     none = np.full(wall.shape, np.nan)
-    nothing = np.zeros(wall.shape, np.int64)
     inside = ~wall
     inside[[0, -1]] = inside[:, [0, -1]] = False
-    return Plan(0.1, np.zeros(2, np.int64), nothing, nothing + 30, profile, wall, inside, none, none)
+    return StoreyPlan(np.zeros(2), 0.1, wall, inside, profile, profile_bands(0.1), np.zeros(wall.shape), none)
 
 
 @pytest.fixture(scope="module")
-def two_rooms() -> Plan:
+def two_rooms() -> StoreyPlan:
     """5 m by 4 m each, with a door of 0.9 m and four legs of a table."""
     wall = np.zeros((106, 46), bool)
     wall[1:3], wall[-3:-1], wall[:, 1:3], wall[:, -3:-1], wall[52:54] = True, True, True, True, True
@@ -62,7 +62,7 @@ def test_numpy_as_torch() -> None:
     assert np.abs(forward(x, exported(net)) - wanted).max() < 1e-4
 
 
-def test_what_it_sees(two_rooms: Plan) -> None:
+def test_what_it_sees(two_rooms: StoreyPlan) -> None:
     chance = segment(two_rooms)
     assert chance.shape == (106, 46, len(CLASSES)) and np.allclose(chance.sum(axis=-1), 1, atol=1e-5)
     answer = chance.argmax(axis=-1)
@@ -72,13 +72,13 @@ def test_what_it_sees(two_rooms: Plan) -> None:
     assert chance[52:54, 20:25, CLASSES.index("doorway")].mean() > 0.5
 
 
-def test_furniture_is_no_wall(two_rooms: Plan) -> None:
+def test_furniture_is_no_wall(two_rooms: StoreyPlan) -> None:
     plan = without_furniture(two_rooms, segment(two_rooms))
     assert not plan.wall[65:90, 10:30].any() and plan.inside[65:90, 10:30].all()
     assert plan.wall[52:54, 5:15].any(axis=0).all() and not (plan.wall & plan.inside).any()
 
 
-def test_through_a_wall(two_rooms: Plan) -> None:
+def test_through_a_wall(two_rooms: StoreyPlan) -> None:
     told = [Told(segment(two_rooms), np.zeros(2), 0.1, 0.0), Told(np.zeros((106, 46, 5)), np.zeros(2), 0.1, 3.0)]
     assert not through_wall(told, np.array([5.3, 2.25, 0.1])) and not through_wall(told, np.array([2.5, 2.0, 0.0]))
     assert through_wall(told, np.array([5.3, 0.8, 0.1])) and not through_wall(told, np.array([5.3, 0.8, 2.9]))
@@ -86,7 +86,7 @@ def test_through_a_wall(two_rooms: Plan) -> None:
 
 
 @pytest.mark.parametrize("turn", [1, 2, 3])
-def test_turned_and_shifted(two_rooms: Plan, turn: int) -> None:
+def test_turned_and_shifted(two_rooms: StoreyPlan, turn: int) -> None:
     """A plan that is turned, mirrored and shifted by a few columns is told alike."""
     wall = np.pad(two_rooms.wall, ((turn, 7), (3, turn)))
     there = segment(drawn(np.rot90(wall, turn)[::-1])).argmax(axis=-1)[::-1]
@@ -95,10 +95,10 @@ def test_turned_and_shifted(two_rooms: Plan, turn: int) -> None:
     assert same[4:-4, 4:-4].mean() > 0.97
 
 
-def test_evidence(two_rooms: Plan) -> None:
+def test_evidence(two_rooms: StoreyPlan) -> None:
     x = evidence(two_rooms)
     assert x.shape == (106, 46, CHANNELS) and x.dtype == np.float32 and np.isfinite(x).all()
-    assert x[52, 5].tolist() == pytest.approx([0, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0.5])
+    assert x[52, 5].tolist() == pytest.approx([0, 1, 1, 1, 1, 1, 1, 0, 1, -0.6, 0.5])
     assert x[20, 20].tolist() == pytest.approx([1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0.5])
 
 

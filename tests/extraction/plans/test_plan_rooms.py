@@ -172,7 +172,7 @@ def test_passages_measure_the_door() -> None:
     chance = segment(plan)
     region = regions_of(plan, chance)
     found = find_passages(plan, clearance, region, chance)
-    x = grid.origin[0] + (plan.low[0] + 0.5) * grid.edge
+    x = plan.origin[0] + 0.5 * grid.edge
     at_the_door = [p for p in found.values() if abs(x + p.place[0] * grid.edge - 4.0) < 0.3]
     assert len(at_the_door) == 1
     values = dict(zip(FEATURES, features(at_the_door[0], (2.0, 1.5), (20.0, 15.0)), strict=True))

@@ -12,7 +12,7 @@ import edt
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.plans.plan import Plan
+from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.kernels import crossing
 from topomerge.kernels.watershed import contacts, watershed
 from topomerge.types import Array
@@ -53,12 +53,12 @@ class Passage:
     measured: tuple[float, ...]  # the features 3 to 14
 
 
-def clearance_of(plan: Plan) -> Array:
+def clearance_of(plan: StoreyPlan) -> Array:
     """(nx, ny) m from each open column to the next wall or to the end of what is known; 0 elsewhere."""
     return np.asarray(edt.edt(plan.inside.view(np.uint8), black_border=True, parallel=1), np.float64) * plan.edge
 
 
-def regions_of(plan: Plan, chance: Array) -> Array:
+def regions_of(plan: StoreyPlan, chance: Array) -> Array:
     """(nx, ny) int64 basin of each open column, -1 elsewhere.
 
     What the network takes for a wall or a doorway parts basins as walls do: openings as wide as the room have no narrowing, and
@@ -78,7 +78,7 @@ def regions_of(plan: Plan, chance: Array) -> Array:
     return np.where(barrier, region[tuple(nearest)], region)
 
 
-def find_passages(plan: Plan, clearance: Array, region: Array, chance: Array) -> dict[tuple[int, int], Passage]:
+def find_passages(plan: StoreyPlan, clearance: Array, region: Array, chance: Array) -> dict[tuple[int, int], Passage]:
     """The widest connection of each pair of neighbouring regions.
 
     Args:
@@ -103,7 +103,7 @@ def find_passages(plan: Plan, clearance: Array, region: Array, chance: Array) ->
 
 
 def _passage(
-    plan: Plan,
+    plan: StoreyPlan,
     clearance: Array,
     region: Array,
     nearest: Array,
@@ -134,7 +134,9 @@ def _passage(
     return Passage((x, y), width, (dx, dy), (growth, *opens, length, lintel, cover, seen, step, *jambs, doorway, boundary))
 
 
-def _above(plan: Plan, clearance: Array, region: Array, a: int, b: int, x: int, y: int) -> tuple[float, float, float, float]:
+def _above(
+    plan: StoreyPlan, clearance: Array, region: Array, a: int, b: int, x: int, y: int
+) -> tuple[float, float, float, float]:
     """Depth of a lintel below both ceilings, was it seen, step between the ceilings, and growth of the clearance."""
     reach = int(np.ceil(AROUND / plan.edge))
     box = slice(max(x - reach, 0), x + reach + 1), slice(max(y - reach, 0), y + reach + 1)

@@ -6,23 +6,26 @@ alone fills a column up to the ceiling (findings.md, "Rooms").
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
-
 import edt
 import numpy as np
 from scipy import ndimage
 
+from topomerge.extraction.plans.storey_plan import (
+    WALL_HEIGHTS,
+    HeightBands,
+    StoreyPlan,
+    WallRule,
+    band_stack,
+    first_above,
+    observed_bands,
+    wall_columns,
+)
 from topomerge.extraction.storeys import lowest_of_column
-from topomerge.kernels.profile import BELOW, LEVELS, lowest_bit, profiles
+from topomerge.kernels.profile import BELOW, LEVELS, profiles
 from topomerge.types import Array, VoxelGrid
 
-BANDS = np.linspace(0.5, 2.0, 7)  # m above the floor: a wall is seen in most of these
-WALL_BANDS = 4 / 6
-LEAST_BANDS = 3  # with fewer looked at, nothing is known of walls
+WALLS = WallRule(lacking=2, neighbours=8, least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
 THIN = 0.4  # share of the usual wall's levels: what has fewer is no wall
-OBSERVED = 0.2  # of the fullest band's columns: below, the sensor did not look at that height
-UPRIGHT = 1.9  # m: nothing lower is a ceiling
 OVER_FURNITURE = 2.05  # m: cupboards end below
 BLOCK = 0.5  # m: ceilings are measured on tiles of this size
 CLUTTER = 0.9  # m: free-standing pieces of wall shorter than this are pillars and the like
@@ -34,26 +37,14 @@ MARGIN = 0.6  # m
 SLAB = 0.1  # m at least, between a ceiling and the floor above it
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """One storey as rasters (nx, ny) of columns; heights are in m above the local floor."""
-
-    edge: float  # m
-    low: Array  # (2,) int64 column of the grid that is element (0, 0)
-    base: Array  # int64 level of the floor in the grid
-    top: Array  # int64 level of the grid up to which it goes
-    profile: Array  # uint64, see `kernels.profile`
-    wall: Array  # bool
-    inside: Array  # bool: known and no wall
-    ceiling: Array  # float64, smoothed over lamps, beams and lintels; nan where none was seen
-    clear: Array  # float64, height of the first thing above 1.9 m; nan where nothing was seen
-
-    def columns(self, cells: Array) -> Array:
-        """(m, 2) elements of the rasters that hold the given cells of the grid; they may lie outside."""
-        return np.asarray(cells)[:, :2].astype(np.int64) - self.low
+def columns_of(plan: StoreyPlan, grid: VoxelGrid) -> tuple[Array, Array]:
+    """Where a plan lies in the grid that it was made of: (2,) int64 column that is element (0, 0), and (nx, ny) int64 level of
+    the floor."""
+    low = np.rint((plan.origin - grid.origin[:2]) / plan.edge).astype(np.int64)
+    return low, np.rint((plan.floor - grid.origin[2]) / plan.edge - 0.5).astype(np.int64)
 
 
-def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) -> Plan:
+def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) -> StoreyPlan:
     """The plan of storey `k`.
 
     Args:
@@ -77,15 +68,17 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
         top = np.minimum(top, np.where(near * e < 1.0, upper, nominal) - int(np.ceil(SLAB / e)))
     profile = np.zeros(size, np.uint64)
     profiles(grid.cells, low, base, top, profile)
-    wall_like = _bands(profile, e)
-    clear = _first_above(profile, e, UPRIGHT)
+    bands = profile_bands(e)
+    wall_like = _filled_like_walls(profile, bands)
+    clear = first_above(profile, bands)
     ceiling = _ceiling(np.where(wall_like, np.nan, clear), e)
     wall = wall_like & ~_below_ceiling(profile, ceiling, e)
     wall = _without_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
-    on_floor = (profile & _bits(-0.3, 0.3, e)) != 0
+    on_floor = (profile & np.uint64(bands.mask(-0.3, 0.3))) != 0
     inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (~np.isnan(clear) & (far * e <= 2 * FLOOR_REACH))
     inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), ~np.isnan(clear), e)
-    return Plan(e, low, base, top, profile, wall, inside, ceiling, clear)
+    origin, floor = grid.origin[:2] + low * e, grid.origin[2] + (base + 0.5) * e
+    return StoreyPlan(origin, e, wall, inside, profile, bands, floor, ceiling, (top - base) * e)
 
 
 def _within(at: Array, size: Array) -> Array:
@@ -106,34 +99,23 @@ def _heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[A
     return base[tuple(nearest)], seen, far
 
 
-def _bits(low: float, high: float, edge: float) -> np.uint64:
-    """Mask of the levels from `low` up to, not including, `high` m above the floor."""
-    a = min(max(round(low / edge) + BELOW, 0), LEVELS)
-    b = min(max(round(high / edge) + BELOW, a + 1), LEVELS)
-    return np.uint64(((1 << b) - 1) & ~((1 << a) - 1))
+def profile_bands(edge: float) -> HeightBands:
+    """What the bits of a profile (`kernels.profile`) mean: a band is as high as a cell, m."""
+    return HeightBands(edge, BELOW, LEVELS)
 
 
-def _bands(profile: Array, edge: float) -> Array:
+def _filled_like_walls(profile: Array, bands: HeightBands) -> Array:
     """Is the column filled like a wall, at the heights at which the sensor looked?"""
-    filled = np.stack([(profile & _bits(a, b, edge)) != 0 for a, b in pairwise(BANDS)])
-    count = filled.sum(axis=(1, 2))
-    filled = filled[count >= OBSERVED * count.max()]
-    if len(filled) < LEAST_BANDS:  # the upper side of a ceiling, beside higher ones
-        return np.zeros(profile.shape, bool)
-    need = np.ceil(WALL_BANDS * len(filled) - 1e-6)
-    own = filled.sum(axis=0)
-    around = np.stack([ndimage.maximum_filter(f, 3) for f in filled]).sum(axis=0)
-    like = (own >= need) | ((own >= 0.5 * need) & (around > need))
+    filled = band_stack(profile, bands)
+    filled = filled[observed_bands(filled)]
+    like = wall_columns(filled, WALLS)
+    if len(filled) < WALLS.least_bands:
+        return like
     # flying points hang in every height of a doorway, but few of them
-    levels = np.bitwise_count(profile & _bits(BANDS[0], BANDS[-1], edge))
-    usual = np.median(levels[own >= need]) if (own >= need).any() else 0
+    levels = np.bitwise_count(profile & np.uint64(bands.mask(WALL_HEIGHTS[0], WALL_HEIGHTS[-1])))
+    full = filled.sum(axis=0) >= WALLS.least_of(len(filled))
+    usual = np.median(levels[full]) if full.any() else 0
     return np.asarray(like & (levels >= THIN * usual))
-
-
-def _first_above(profile: Array, edge: float, height: float) -> Array:
-    """Height (m) of the lower side of the first thing above `height`; nan where there is none."""
-    bit = lowest_bit(profile.ravel(), round(height / edge) + BELOW).reshape(profile.shape)
-    return np.where(bit >= 0, (bit - BELOW) * edge, np.nan)
 
 
 def _ceiling(clear: Array, edge: float) -> Array:
@@ -160,14 +142,14 @@ def _nanmedian(values: Array) -> Array:
 def _below_ceiling(profile: Array, ceiling: Array, edge: float) -> Array:
     """Columns over which the ceiling was seen with empty space below it: what stands there is no wall."""
     height = np.where(np.isnan(ceiling), 0.0, ceiling)
-    out = np.zeros(profile.shape, bool)
+    out, bands = np.zeros(profile.shape, bool), profile_bands(edge)
     for level in np.unique(np.round(height / edge)):
         top = level * edge
         if top < OVER_FURNITURE + 0.25:
             continue
         here = np.round(height / edge) == level
-        empty = (profile & _bits(OVER_FURNITURE, max(top - 0.25, OVER_FURNITURE + 0.1), edge)) == 0
-        out |= here & empty & ((profile & _bits(top - 0.15, top + 0.35, edge)) != 0)
+        empty = (profile & np.uint64(bands.mask(OVER_FURNITURE, max(top - 0.25, OVER_FURNITURE + 0.1)))) == 0
+        out |= here & empty & ((profile & np.uint64(bands.mask(top - 0.15, top + 0.35))) != 0)
     return out
 
 

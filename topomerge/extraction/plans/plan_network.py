@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.plans.plan import Plan, _bits
+from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.numpy_nn import convolution, linear, softmax
 from topomerge.types import Array
 
@@ -33,24 +33,24 @@ DOORWAY, WALL = 0.3, 0.02  # probabilities: less of a door and more of a wall ar
 AROUND = 0.3  # m
 
 
-def evidence(plan: Plan) -> Array:
+def evidence(plan: StoreyPlan) -> Array:
     """(nx, ny, 11) float32 of what was seen in each column: known, wall, how full four bands of heights are, floor, lintel,
     ceiling and its height, and how large a column is."""
     levels = []
     for low, high in HEIGHTS:
-        mask = _bits(low, high, plan.edge)
+        mask = np.uint64(plan.bands.mask(low, high))
         levels.append(np.bitwise_count(plan.profile & mask) / float(np.bitwise_count(mask)))
     seen = ~np.isnan(plan.clear)
     lintel = plan.clear < plan.ceiling - 0.2  # nan: no
     height = np.where(seen, np.clip(plan.clear, 1.9, 4.5) - 2.5, 0.0)
-    floor = (plan.profile & _bits(-0.3, 0.3, plan.edge)) != 0
+    floor = plan.occupied(-0.3, 0.3)
     size = np.full(plan.wall.shape, 5 * plan.edge)
     return np.stack(
         [plan.inside, plan.wall, *levels, floor, lintel, seen, height, size], axis=-1, dtype=np.float32, casting="unsafe"
     )
 
 
-def segment(plan: Plan) -> Array:
+def segment(plan: StoreyPlan) -> Array:
     """(nx, ny, 5) float32 probability of each of `CLASSES`."""
     x = evidence(plan)
     nx, ny = x.shape[:2]
@@ -59,7 +59,7 @@ def segment(plan: Plan) -> Array:
     return softmax(score)
 
 
-def without_furniture(plan: Plan, chance: Array) -> Plan:
+def without_furniture(plan: StoreyPlan, chance: Array) -> StoreyPlan:
     """The plan without the walls that are probably furniture: the legs of tables in slices and grid maps, cupboards.
 
     Where a ceiling was seen it told most cupboards from walls already (`plan`). What touches a wall stays: a blurred wall

@@ -12,8 +12,9 @@ from topomerge.extraction.components import spread_labels
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.partition import Pair, merge_regions
 from topomerge.extraction.plans.passages import clearance_of, find_passages, regions_of
-from topomerge.extraction.plans.plan import Plan, storey_plan
+from topomerge.extraction.plans.plan import columns_of, storey_plan
 from topomerge.extraction.plans.plan_network import Told, segment, without_furniture
+from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.rooms import Floor
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling, lowest_of_column
 from topomerge.kernels.columns import hollow_below
@@ -64,7 +65,8 @@ def rooms_of_plans(grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: f
         plan = storey_plan(coarse, walk, level, k)
         chance = segment(plan)
         plan = without_furniture(plan, chance)
-        corner = coarse.origin + np.append(plan.low, np.median(plan.base)) * plan.edge
+        low, base = columns_of(plan, coarse)
+        corner = coarse.origin + np.append(low, np.median(base)) * plan.edge
         told.append(Told(chance, corner[:2], plan.edge, float(corner[2])))
         room, area, owner, doors = _partition(coarse, plan, chance, door, narrow, k > 0)
         _label_cells(label, grid, plan, np.where(room >= 0, room + rooms, -1), factor)
@@ -78,7 +80,7 @@ def rooms_of_plans(grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: f
 
 
 def _partition(
-    grid: VoxelGrid, plan: Plan, chance: Array, door: float, narrow: float, above_another: bool
+    grid: VoxelGrid, plan: StoreyPlan, chance: Array, door: float, narrow: float, above_another: bool
 ) -> tuple[Array, Array, Array, dict[Pair, float]]:
     """Room and area of each column (numbered from 0), room of each area, and how likely doors part two rooms."""
     clearance = clearance_of(plan)
@@ -107,7 +109,7 @@ def _upper_side(top: Array, below: Array) -> bool:
     return bool(np.isnan(top["ceiling"]) and (np.abs(below["ceiling"] - top["floor"]) < SLAB).any())
 
 
-def _without_ceilings(grid: VoxelGrid, plan: Plan, region: Array) -> Array:
+def _without_ceilings(grid: VoxelGrid, plan: StoreyPlan, region: Array) -> Array:
     """The regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls around
     or so thin that nobody is carried, with a storey right below."""
     count = int(region.max(initial=-1)) + 1
@@ -122,34 +124,35 @@ def _without_ceilings(grid: VoxelGrid, plan: Plan, region: Array) -> Array:
     if not suspect.any():
         return region
     at = np.argwhere(known & suspect[np.where(known, region, 0)])
-    cells = np.column_stack([at + plan.low, plan.base[tuple(at.T)]])
+    low, base = columns_of(plan, grid)
+    cells = np.column_stack([at + low, base[tuple(at.T)]])
     hollow = hollow_below(*grid._bricks, cells, 1, *(round(height / grid.edge) for height in (SHEET, HEADROOM, HIGHEST)))
     thin = np.bincount(region[tuple(at.T)], hollow, minlength=count) > 0.5 * total
     ceiling = suspect & (thin | (beside < OPEN_ALL_AROUND))
     return np.where(known & ceiling[np.where(known, region, 0)], -1, region)
 
 
-def _label_cells(label: Array, grid: VoxelGrid, plan: Plan, room: Array, factor: int) -> None:
+def _label_cells(label: Array, grid: VoxelGrid, plan: StoreyPlan, room: Array, factor: int) -> None:
     """Give the occupied cells of a storey the room of their column; walls go to the nearest room."""
     far, nearest = ndimage.distance_transform_edt(room < 0, return_indices=True)
     room = np.where(far * plan.edge <= WALL_REACH, room[tuple(nearest)], -1)
-    at = plan.columns(grid.cells // factor if factor > 1 else grid.cells)
+    low, base = columns_of(plan, grid)
+    at = (grid.cells // factor if factor > 1 else grid.cells)[:, :2].astype(np.int64) - low
     rows = np.flatnonzero(((at >= 0) & (at < room.shape)).all(axis=1))
     at = at[rows]
-    base, ceiling = plan.base[tuple(at.T)], plan.ceiling[tuple(at.T)]
-    z = (grid.cells[rows, 2] // factor - base) * plan.edge
-    top = np.minimum(
-        np.where(np.isnan(ceiling), np.inf, ceiling + OVER_CEILING), (plan.top[tuple(at.T)] - base + 0.5) * plan.edge
-    )
+    ceiling, above = (np.broadcast_to(height, room.shape)[tuple(at.T)] for height in (plan.ceiling, plan.top))
+    z = (grid.cells[rows, 2] // factor - base[tuple(at.T)]) * plan.edge
+    top = np.minimum(np.where(np.isnan(ceiling), np.inf, ceiling + OVER_CEILING), above + 0.5 * plan.edge)
     mine = (z >= -UNDER_FLOOR) & (z <= top) & (room[tuple(at.T)] >= 0)
     label[rows[mine]] = room[tuple(at[mine].T)]
 
 
 def _cells_of(
-    plan: Plan, navigable: VoxelGrid, mine: Array, room: Array, area: Array, factor: int, k: int, rooms: int, areas: int
+    plan: StoreyPlan, navigable: VoxelGrid, mine: Array, room: Array, area: Array, factor: int, k: int, rooms: int, areas: int
 ) -> tuple[Array, ...]:
     """Cells, standing, storey, room and area of a storey's floor."""
-    at = plan.columns(navigable.cells[mine] // factor)
+    corner, base = columns_of(plan, navigable)
+    at = (navigable.cells[mine] // factor)[:, :2].astype(np.int64) - corner
     inside = ((at >= 0) & (at < room.shape)).all(axis=1)
     at = at[inside]
     walk = navigable.cells[mine][inside]
@@ -157,7 +160,7 @@ def _cells_of(
     seen = np.zeros(room.shape, bool)
     seen[tuple(at.T)] = True
     under = columns[~seen[tuple(columns.T)]]
-    low = np.column_stack([under + plan.low, plan.base[tuple(under.T)]]) * factor
+    low = np.column_stack([under + corner, base[tuple(under.T)]]) * factor
     steps = np.argwhere(np.ones((factor, factor, 1), bool))
     low = (low[:, None] + steps).reshape(-1, 3)
     cells = np.concatenate([walk, low])

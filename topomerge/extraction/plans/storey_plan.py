@@ -1,0 +1,182 @@
+"""A storey seen from above: the one type for it, and the one rule for which of its columns are walls (beyond the thesis).
+
+A wall fills most of the heights between furniture and lintels; what fills fewer is clutter. The extraction makes such plans from
+the navigable volume (`extraction.plans.plan`), the merging from bare cells (`fusion.storey_plan`), the matching from finished
+maps (`matching.room_plans`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from topomerge.kernels.profile import lowest_bit
+from topomerge.types import Array
+
+WALL_HEIGHTS = np.linspace(0.5, 2.0, 7)  # m above the floor, limits of the bands in most of which a wall is seen
+BODY_HEIGHTS = (0.25, 2.0)  # m above the floor: empty where one can walk
+OBSERVED_SHARE = 0.2  # of the fullest band's columns: below, the sensor did not look at that height
+UPRIGHT = 1.9  # m: nothing lower is a ceiling
+USUAL_HEIGHT = 2.7  # m, floor to ceiling
+
+
+@dataclass(frozen=True)
+class HeightBands:
+    """How the bits of a profile divide heights above the floor: bit k begins at (k - below) * step m."""
+
+    step: float
+    below: int
+    count: int
+
+    def mask(self, low: float, high: float) -> int:
+        """Bits of the bands from `low` up to, not including, `high` m; of one at least, where any is as high."""
+        first = min(max(round(low / self.step) + self.below, 0), self.count)
+        last = min(max(round(high / self.step) + self.below, first + 1), self.count)
+        return (1 << last) - (1 << first)
+
+
+@dataclass(frozen=True, eq=False)
+class StoreyPlan:
+    """One storey as rasters (nx, ny) of columns, the first axis is x; column (0, 0) has its corner at `origin`.
+
+    Args:
+        origin: (2,) float64 m.
+        edge: m, of a column.
+        wall: bool.
+        inside: bool, known and no wall: empty ground and what stands on it. A column that is neither is unknown.
+        profile: unsigned, occupied bands of heights above the local floor.
+        bands: what the bits of `profile` mean.
+        floor: float64 m, height of the local floor; a guess where it was not seen.
+        ceiling: float64 m above the local floor; nan where none was seen.
+        top: float64 m above the local floor, where the storey above begins; inf where none is known.
+        levels: m, heights of the storey's floor and of its ceiling; nan where not seen.
+        observed: bits of the bands at which the map looked at all.
+        sliced: was it seen at one height only? Its floor is a guess then.
+    """
+
+    origin: Array
+    edge: float
+    wall: Array
+    inside: Array
+    profile: Array
+    bands: HeightBands
+    floor: Array
+    ceiling: Array
+    top: Array | float = np.inf
+    levels: tuple[float, float] = (np.nan, np.nan)
+    observed: int = 0
+    sliced: bool = False
+
+    @cached_property
+    def standing(self) -> Array:
+        """(nx, ny) bool: something is at the height of a body."""
+        return self.occupied(*BODY_HEIGHTS)
+
+    @cached_property
+    def clutter(self) -> Array:
+        """(nx, ny) bool: inside, and something stands there."""
+        return self.inside & self.standing
+
+    @cached_property
+    def free(self) -> Array:
+        """(nx, ny) bool: inside, and nothing stands there."""
+        return self.inside & ~self.standing
+
+    @cached_property
+    def known(self) -> Array:
+        """(nx, ny) bool."""
+        return self.wall | self.inside
+
+    @cached_property
+    def clear(self) -> Array:
+        """(nx, ny) float64 m above the local floor, lower side of the first thing above 1.9 m; nan where nothing was seen."""
+        return first_above(self.profile, self.bands)
+
+    @cached_property
+    def floor_height(self) -> Array:
+        """(nx, ny) float32 m, `floor`."""
+        return self.floor.astype(np.float32)
+
+    @cached_property
+    def ceiling_height(self) -> Array:
+        """(nx, ny) float32 m, height of the ceiling in the map's frame."""
+        return (self.floor + self.ceiling).astype(np.float32)
+
+    @property
+    def floor_guess(self) -> float:
+        """Height of the storey's floor, m; where it was not seen, that below its ceiling."""
+        floor, ceiling = self.levels
+        return floor if np.isfinite(floor) else ceiling - USUAL_HEIGHT
+
+    def occupied(self, low: float, high: float) -> Array:
+        """(nx, ny) bool: is anything between two heights above the floor, m?"""
+        out: Array = (self.profile & self.profile.dtype.type(self.bands.mask(low, high))) != 0
+        return out
+
+    def points(self, mask: Array) -> Array:
+        """(n, 2) float64 middles of masked columns, m."""
+        return self.origin + (np.argwhere(mask) + 0.5) * self.edge
+
+
+@dataclass(frozen=True)
+class WallRule:
+    """What makes a column a wall.
+
+    Args:
+        share: of the observed bands that it fills.
+        lacking: bands that it may have fewer, though not less than half, where it fills more than enough with its neighbours.
+        neighbours: 4 or 8 columns around it that help.
+        least_bands: observed ones; with fewer, nothing is known of walls.
+    """
+
+    share: float = 4 / 6
+    lacking: int = 1
+    neighbours: int = 4
+    least_bands: int = 1
+
+    def least_of(self, observed: int) -> int:
+        """How many of the observed bands a wall fills."""
+        return max(int(np.ceil(self.share * observed - 1e-6)), 1)
+
+
+def first_above(profile: Array, bands: HeightBands, height: float = UPRIGHT) -> Array:
+    """(nx, ny) float64 m above the local floor, lower side of the first thing above a height; nan where there is none."""
+    bit = lowest_bit(profile.ravel(), round(height / bands.step) + bands.below).reshape(profile.shape)
+    return np.where(bit >= 0, (bit - bands.below) * bands.step, np.nan)
+
+
+def band_stack(profile: Array, bands: HeightBands, heights: Array = WALL_HEIGHTS) -> Array:
+    """(B, nx, ny) bool: is anything between each two of B + 1 heights, m, of a profile (nx, ny)?"""
+    masks = [profile.dtype.type(bands.mask(low, high)) for low, high in pairwise(heights)]
+    return np.stack([(profile & mask) != 0 for mask in masks])
+
+
+def observed_bands(filled: Array) -> Array:
+    """(B,) bool: does a band (B, nx, ny) hold enough to say that the map looked there?"""
+    count = filled.sum(axis=(1, 2))
+    return np.asarray(count >= OBSERVED_SHARE * max(int(count.max()), 1)) & (count.max() > 0)
+
+
+def wall_columns(filled: Array, rule: WallRule) -> Array:
+    """(nx, ny) bool: which columns are walls, by the observed bands of heights (B, nx, ny) that they fill."""
+    if len(filled) < rule.least_bands:
+        return np.zeros(filled.shape[1:], bool)
+    need = rule.least_of(len(filled))
+    nearly = max(need - rule.lacking, -(-need // 2))
+    own = filled.sum(axis=0)
+    around = _spread(filled, rule.neighbours).sum(axis=0)
+    return np.asarray((own >= need) | ((own >= nearly) & (around > need)))
+
+
+def _spread(filled: Array, neighbours: int) -> Array:
+    """Bands that each column or any neighbour fills: a noisy wall is spread over columns."""
+    out = filled.copy()
+    out[:, 1:] |= filled[:, :-1]
+    out[:, :-1] |= filled[:, 1:]
+    rows = out.copy() if neighbours == 8 else filled
+    out[:, :, 1:] |= rows[:, :, :-1]
+    out[:, :, :-1] |= rows[:, :, 1:]
+    return out
