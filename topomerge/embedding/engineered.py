@@ -1,23 +1,19 @@
 """Engineered features of a room: the twelve of the thesis, and its place in the graph (seeds 3.1.1; method, section 2).
 
 Lengths are metres and nothing depends on the frame. Sizes are taken as logarithms, then all is scaled by statistics of a training
-set, kept in `engineered.json` (made by ``python -m benchmarks.training.engineered_scale``): either every feature by its spread
-over rooms
-(``"standard"``), or all of them by how much they differ between two maps' views of one room (``"matched"``: features that a
-partial view changes count less).
+set, kept in `engineered.json` (made by ``train.py task=feature_scale``): either every feature by its spread over
+rooms (``"standard"``), or all of them by how much they differ between two maps' views of one room (``"matched"``: features that
+a partial view changes count less).
 """
 
 from __future__ import annotations
-
-import json
-from functools import cache
-from importlib import resources
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 from topomerge.embedding.room_cells import Descriptor, room_cells, rows_of
 from topomerge.errors import InputError
+from topomerge.io.weight_files import read_weights_json
 from topomerge.types import Array, TopometricMap
 
 THESIS_FEATURES = (
@@ -85,14 +81,12 @@ def scaled(values: Array, scaling: str) -> Array:
     return out
 
 
-@cache
 def _statistics() -> tuple[Array, Array, Array]:
     """Mean (D,), standard deviation (D,) and covariance (D, D) of the differences between two views of a room."""
-    text = resources.files("topomerge.embedding").joinpath("engineered.json").read_text(encoding="utf-8")
-    known = json.loads(text)
-    if tuple(known["features"]) != FEATURES:
-        raise RuntimeError("engineered.json is of other features: run benchmarks/training/engineered_scale.py")
-    return np.array(known["mean"]), np.array(known["spread"]), np.array(known["differences"])
+    scale = read_weights_json("topomerge.embedding", "engineered.json")
+    if tuple(scale["features"]) != FEATURES:
+        raise InputError("engineered.json is of other features: run train.py task=feature_scale export=package")
+    return np.array(scale["mean"]), np.array(scale["spread"]), np.array(scale["differences"])
 
 
 def thesis_features(cells: Array, edge: float) -> Array:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -14,6 +11,7 @@ from scipy import ndimage
 
 from topomerge.fusion.search import MARGIN, Candidate, View, distinct, pairs_at
 from topomerge.fusion.storey_plan import BODY
+from topomerge.io.weight_files import read_weights_json
 from topomerge.kernels import align
 from topomerge.types import Array, Sim3
 
@@ -236,14 +234,10 @@ def vector(f: Features) -> Array:
     )
 
 
-@cache
 def model() -> dict[str, Any]:
-    """Coefficients and the threshold, fitted on simulated training pairs (benchmarks/training/calibrate_merge.py): of two
-    models each for
+    """Coefficients and the threshold, fitted on simulated training pairs (`train.py task=merge_belief`): of two models each for
     pairs of maps with heights (``solid``) and for those of which one is a slice or a drawing (``flat``)."""
-    text = resources.files("topomerge.fusion").joinpath("calibration.json").read_text(encoding="utf-8")
-    found: dict[str, Any] = json.loads(text)
-    return found
+    return read_weights_json("topomerge.fusion", "calibration.json")
 
 
 def _models(f: Features) -> dict[str, Any]:

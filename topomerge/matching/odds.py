@@ -1,7 +1,6 @@
 """How likely what geometry proposes is so: a hypothesis, and that two rooms which it lays over each other are one room.
 
-Logistic models, fitted to 100 simulated training pairs by ``benchmarks/training/matching_odds.py``, which prints both lines of
-weights.
+Logistic models, fitted to 100 simulated training pairs by ``train.py task=match_odds``; their weights stand in `odds.json`.
 Of left-out buildings the expected calibration error was 0.05 for hypotheses and 0.01 for matches under the true transform.
 """
 
@@ -9,13 +8,27 @@ from __future__ import annotations
 
 import numpy as np
 
+from topomerge.errors import InputError
+from topomerge.io.weight_files import read_weights_json
 from topomerge.types import Array, TopometricMap
 
 CONFLICT = 2.0  # weight of a metre that disagrees against one that agrees
 FLOOR = 0.1  # m of wall that a m2 of floor in common is worth
 SCRAP = 0.5  # m2
-HYPOTHESIS = (-5.71, 0.41, -0.52, 1.5)  # against "none", of `hypothesis_features`
-MATCH = (1.09, 0.2, 1.24, -0.06, -2.53)  # of `match_features`
+ODDS_LENGTHS = {"hypothesis": 4, "match": 5}
+HYPOTHESIS, MATCH = "hypothesis", "match"  # weights of `hypothesis_features`, against "none", and of `match_features`
+
+
+def odds_weights(model: str) -> Array:
+    """(4,) or (5,) weights of one of both models.
+
+    Raises:
+        InputError: `odds.json` holds none of that length.
+    """
+    weights = np.array(read_weights_json("topomerge.matching", "odds.json").get(model, ()), float)
+    if weights.shape != (ODDS_LENGTHS[model],) or not np.isfinite(weights).all():
+        raise InputError(f"odds.json: {model} must be {ODDS_LENGTHS[model]} numbers: run train.py task=match_odds export=package")
+    return weights
 
 
 def hypothesis_features(evidence: Array) -> Array:
@@ -28,7 +41,7 @@ def hypothesis_features(evidence: Array) -> Array:
 
 def hypothesis_probability(evidence: Array) -> Array:
     """(H,) that each is the right one; with "none of them" they sum to 1."""
-    odds = np.exp(np.clip(hypothesis_features(evidence) @ HYPOTHESIS, -50, 50))
+    odds = np.exp(np.clip(hypothesis_features(evidence) @ odds_weights(HYPOTHESIS), -50, 50))
     out: Array = odds / (odds.sum() + 1)
     return out
 
@@ -49,5 +62,5 @@ def match_features(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array)
 
 def match_probability(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array) -> Array:
     """(M,) that rooms which share floor under the right transform are one: scraps, glimpses and pieces of a room seldom are."""
-    out: Array = 1 / (1 + np.exp(-match_features(a, b, rooms, fit) @ MATCH))
+    out: Array = 1 / (1 + np.exp(-match_features(a, b, rooms, fit) @ odds_weights(MATCH)))
     return out

@@ -107,6 +107,7 @@ def test_damaged_weights(tmp_path: Path) -> None:
     for change in ({"a1.w": known["a1.w"][:-9]}, {"h1.b": known["h1.b"][:-1]}, {"out.b": known["out.b"] * np.nan}):
         path = tmp_path / "other.npz"
         np.savez(path, **{**known, **change})
+        read_weights.cache_clear()
         with pytest.raises(InputError, match=r"other\.npz"):
             read_weights(path)
     np.savez(path, **{k: v for k, v in known.items() if k != "e1.w"})

@@ -1,5 +1,5 @@
 """What probably stands in each column of a plan: a small convolutional network, trained on simulated scans of training buildings
-(benchmarks/training/train_plan_network.py), in NumPy (`numpy_nn`; beyond the thesis: docs/adr/0005).
+(`train.py task=plan_segmentation`), in NumPy (`numpy_nn`; beyond the thesis: docs/adr/0005).
 
 A U-Net (Ronneberger et al. 2015) over what the plan knows of each column. It sees a few metres around, so that it may take the
 legs of a table for furniture, a stub of wall for the jamb of a door, and a gap between two stubs for a doorway.
@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.io.weight_files import weights_file
 from topomerge.numpy_nn import convolution, linear, softmax
 from topomerge.types import Array
 
@@ -113,13 +113,12 @@ def forward(x: Array, w: dict[str, Array]) -> Array:
     return linear(x, w["out.w"], w["out.b"])
 
 
-@lru_cache(maxsize=1)
 def weights() -> dict[str, Array]:
-    """The shipped weights."""
-    with resources.as_file(resources.files("topomerge.extraction.plans").joinpath(FILE)) as path:
-        return read_weights(path)
+    """The weights that ship, or those in their place (`io.weight_files`)."""
+    return read_weights(weights_file("topomerge.extraction.plans", FILE))
 
 
+@lru_cache(maxsize=4)
 def read_weights(path: Path) -> dict[str, Array]:
     """Weights as float32 by their names.
 
