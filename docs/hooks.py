@@ -28,8 +28,7 @@ def others(markdown: str) -> str:
 
 def commands() -> str:
     """Every command with its example and its help, as Markdown."""
-    from topomerge.cli.commands import COMMANDS
-    from topomerge.cli.main import build_parser
+    from topomerge.cli.main import COMMANDS, build_parser
 
     parser = build_parser()
     (sub,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))

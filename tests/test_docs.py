@@ -15,8 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.docs_examples import ROOT, Example, commands, examples, pages
-from topomerge.cli.commands import COMMANDS
-from topomerge.cli.main import EXIT_STATUSES
+from topomerge.cli.main import COMMANDS, EXIT_STATUSES
 from topomerge.cli.main import main as cli
 
 QUICK = ("cli.md",)  # pages whose examples need no scans; those of all others are slow

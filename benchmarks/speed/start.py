@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 from benchmarks.speed.bench import best
-from topomerge.cli.commands import COMMANDS
+from topomerge.cli.main import COMMANDS
 
 
 def main(repeat: int = 5, commands: int | None = None) -> None:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from topomerge.cli.commands import COMMANDS
 from topomerge.cli.completion import SHELLS, script
+from topomerge.cli.main import COMMANDS
 
 
 def typed(words: list[str], folder: Path, keys: str, wanted: str, setup: str) -> str:
@@ -40,22 +40,31 @@ def typed(words: list[str], folder: Path, keys: str, wanted: str, setup: str) ->
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with the scripts, a scan and a folder."""
+    """A folder with the scripts, scans, maps and folders."""
     for shell in SHELLS:
         (tmp_path / f"complete.{shell}").write_text(script(shell, COMMANDS))
-    (tmp_path / "a scan.ply").touch()
-    (tmp_path / "pairs").mkdir()
+    for name in ("a scan.ply", "b.tmap", "pairs/c.tmap", "two words/d.tmap"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
     return tmp_path
 
 
 CASES = [
     ("topomerge ext\t", "topomerge extract "),
+    ("topomerge --ver\t", "topomerge --version "),
     ("topomerge extract --preset th\t", "topomerge extract --preset thesis "),
-    ("topomerge merge --fo\t", "topomerge merge --force "),
+    ("topomerge extract --unit=f\t", "topomerge extract --unit=ft "),
     ("topomerge extract a\t", "topomerge extract a\\ scan.ply "),
+    ("topomerge extract --ceiling a\t", "topomerge extract --ceiling a\\ scan.ply "),
+    ("topomerge info two\\ words/d\t", "topomerge info two\\ words/d.tmap "),
     ("topomerge simulate -o pa\t", "topomerge simulate -o pairs/"),
     ("topomerge completion fi\t", "topomerge completion fish "),
-    ("topomerge extract --unit=f\t", "topomerge extract --unit=ft "),
+    ("topomerge merge --fo\t", "topomerge merge --force "),
+    ("topomerge merge b.tmap pairs/c\t", "topomerge merge b.tmap pairs/c.tmap "),
+    ("topomerge merge b.tmap -o x --scale=free pairs/c\t", "topomerge merge b.tmap -o x --scale=free pairs/c.tmap "),
+    ("topomerge atlas ad\t", "topomerge atlas add "),
+    ("topomerge atlas add pa\t", "topomerge atlas add pairs/"),
+    ("topomerge atlas add --scale free pairs b.tmap pairs/c\t", "topomerge atlas add --scale free pairs b.tmap pairs/c.tmap "),
 ]
 
 
@@ -80,11 +89,11 @@ def test_fish_completes(folder: Path, keys: str, wanted: str) -> None:
     if shutil.which("fish") is None:
         pytest.skip("no fish")
     line = keys.split("\t")[0]
-    words = ["fish", "--no-config", "-c", f"source complete.fish; complete -C '{line}'"]
+    words = ["fish", "--no-config", "-c", "source complete.fish; complete -C $argv[1]", line]
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=60, check=True)
     offered = [text.split("\t")[0] for text in done.stdout.splitlines()]
-    begun = wanted.strip().removeprefix(line[: line.rfind(" ") + 1]).split()[0].replace("\\", "")
-    assert begun in [text.replace("\\", "") for text in offered] or begun == "a"
+    completed = wanted.replace("\\", "").strip().rstrip("/")
+    assert any(completed.endswith(word.replace("\\", "").rstrip("/")) for word in offered if word.strip("/"))
 
 
 @pytest.mark.parametrize("shell", SHELLS)

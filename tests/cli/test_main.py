@@ -17,7 +17,7 @@ import pytest
 import topomerge
 from tests.scenes_map import building, same
 from topomerge.cli import console
-from topomerge.cli.commands import COMMANDS
+from topomerge.cli.main import COMMANDS
 from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
 from topomerge.io.maps import load_map, save_map
@@ -299,11 +299,11 @@ def test_sigterm_leaves_nothing(tmp_path: Path) -> None:
     code = """
 import sys, time
 import topomerge, topomerge.cli.console as console
-from topomerge.cli import commands
+from topomerge.cli import main
 from topomerge.cli.main import main as cli
 def slow(args):
     console.write_all([("a.tmap", lambda path: (print("here", flush=True), time.sleep(30)))])
-commands.COMMANDS[0].__dict__["run"] = slow
+main.COMMANDS[0].__dict__["run"] = slow
 sys.argv[1:] = ["extract", "x", "-o", "a.tmap"]
 sys.exit(cli())
 """

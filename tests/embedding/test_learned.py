@@ -116,7 +116,7 @@ def test_networks_that_read_points_go_through_torch(torch, tmp_path, monkeypatch
 
 def test_torch_is_never_imported():
     code = (
-        "import sys, topomerge as tm; from tests.scenes_map import building; from topomerge.cli.commands import COMMANDS\n"
+        "import sys, topomerge as tm; from tests.scenes_map import building; from topomerge.cli.main import COMMANDS\n"
         "found = tm.merge([building(1), building(2)]); tm.load_embedder()(building(1)); assert found.descriptor == 'learned'\n"
         "print([m for m in ('torch', 'torch_geometric', 'safetensors', 'hydra', 'lightning_fabric') if m in sys.modules])"
     )

@@ -1,49 +1,61 @@
-"""Shell completion: scripts for bash, zsh and fish, written from the table of commands.
+"""The command `completion`: scripts for bash, zsh and fish, written from the table of commands.
 
 A script stands alone: pressing Tab starts no Python. It knows the commands, their options, the values of options that have
 choices, and where a file or a folder comes; after an update that brings new options it is to be printed again.
+`docs/adr/0007-shell-completion.md` says why this is not left to a library.
 """
 
 from __future__ import annotations
 
+import argparse
 import re
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from topomerge.cli.command import Command, option
+
 SHELLS = ("bash", "zsh", "fish")
-FOLDER = ("DIR", "FOLDER")  # metavars
+FOLDER_METAVARS = ("DIR", "FOLDER")
 
 
 @dataclass(frozen=True)
 class Word:
-    """An option, or an argument without a flag (`flags` is empty)."""
+    """An option, or an argument without a flag (`flags` is empty), which may `repeat`."""
 
     flags: tuple[str, ...]
     help: str
     value: str  # "none", "file", "folder", "other" or "choice"
     choices: tuple[str, ...] = ()
+    repeat: bool = False
 
 
-def script(shell: str, commands: Sequence[Any]) -> str:
+def completion_command(args: argparse.Namespace) -> int:
+    """`topomerge completion`: print the script that completes all of `args.commands`."""
+    sys.stdout.write(script(args.shell, args.commands))
+    return 0
+
+
+def script(shell: str, commands: Sequence[Command]) -> str:
     """The script that completes `topomerge` in a shell.
 
     Args:
-        shell: "bash", "zsh" or "fish".
-        commands: as `topomerge.cli.commands.COMMANDS`: `name`, `summary`, `arguments` and `paths` of each.
+        shell: one of `SHELLS`.
+        commands: those that it shall know.
     """
-    words = {c.name: [*(_word(flags, more, c.paths) for flags, more in c.arguments), *COMMON] for c in commands}
+    words = {c.name: [*(_word(flags, settings, c.paths) for flags, settings in c.arguments), *COMMON_OPTIONS] for c in commands}
     return {"bash": _bash, "zsh": _zsh, "fish": _fish}[shell](words, {c.name: c.summary for c in commands})
 
 
-COMMON = (
+COMMON_OPTIONS = (
     Word(("-v", "--verbose"), "tell more", "none"),
     Word(("-h", "--help"), "show the help", "none"),
 )
 
 
 def _word(flags: tuple[str, ...], settings: dict[str, Any], paths: tuple[str, ...]) -> Word:
-    named = flags if flags[0].startswith("-") else ()
+    option_flags = flags if flags[0].startswith("-") else ()
     dest = settings.get("dest") or next((f for f in flags if f.startswith("--")), flags[0]).lstrip("-").replace("-", "_")
     choices = tuple(str(c) for c in settings.get("choices") or ())
     if settings.get("action") in ("store_true", "store_false", "count"):
@@ -51,43 +63,49 @@ def _word(flags: tuple[str, ...], settings: dict[str, Any], paths: tuple[str, ..
     elif choices:
         value = "choice"
     elif dest in paths:
-        value = "folder" if settings.get("metavar") in FOLDER else "file"
+        value = "folder" if settings.get("metavar") in FOLDER_METAVARS else "file"
     else:
         value = "other"
-    return Word(named, settings.get("help") or "", value, choices)
+    return Word(option_flags, settings.get("help") or "", value, choices, settings.get("nargs") in ("*", "+"))
 
 
 def _options(words: Iterable[Word]) -> list[str]:
     return [flag for word in words for flag in word.flags]
 
 
-def _cases(command: str, words: Iterable[Word]) -> Iterable[str]:
-    """What bash offers after each option that takes a value."""
+def _bash_value(word: Word) -> str:
+    return {"choice": f'_words "{" ".join(word.choices)}"', "file": "_files -f", "folder": "_files -d"}.get(word.value, ":")
+
+
+def _bash_cases(command: str, words: Sequence[Word]) -> Iterable[str]:
+    """What bash offers after each option that takes a value, and for each argument without a flag."""
     for word in words:
-        if not word.flags or word.value == "none":
-            continue
-        pattern = "|".join(f'"{command} {flag}"' for flag in word.flags)
-        offer = {"choice": f'_words "{" ".join(word.choices)}"', "file": "_files -f", "folder": "_files -d"}.get(word.value, ":")
-        yield f"    {pattern}) {offer}; return ;;"
+        if word.flags and word.value != "none":
+            pattern = "|".join(f'"{command} {flag}"' for flag in word.flags)
+            yield f"    {pattern}) {_bash_value(word)}; return ;;"
 
 
-def _bash(words: dict[str, list[Word]], about: dict[str, str]) -> str:
-    del about
-    cases = "\n".join(line for name, all in words.items() for line in _cases(name, all))
-    options = "\n".join(f'    {name}) _words "{" ".join(_options(all))}" ;;' for name, all in words.items())
-    rest = "\n".join(f"    {name}) {_positional_bash(all)} ;;" for name, all in words.items() if any(not w.flags for w in all))
-    return BASH % {"names": " ".join(words), "cases": cases, "options": options, "rest": rest}
+def _bash_positions(command: str, words: Sequence[Word]) -> Iterable[str]:
+    for place, word in enumerate(w for w in words if not w.flags):
+        yield f'    "{command} "{"*" if word.repeat else place}) {_bash_value(word)} ;;'
 
 
-def _positional_bash(words: Iterable[Word]) -> str:
-    word = next(w for w in words if not w.flags)
-    return f'_words "{" ".join(word.choices)}"' if word.choices else "_files -f" if word.value == "file" else ":"
+def _bash(words: dict[str, list[Word]], summaries: dict[str, str]) -> str:
+    del summaries
+    takes_value = {f'"{name} {flag}"' for name, all in words.items() for w in all if w.value != "none" for flag in w.flags}
+    return BASH_SCRIPT % {
+        "names": " ".join(words),
+        "takes_value": "|".join(sorted(takes_value)),
+        "cases": "\n".join(line for name, all in words.items() for line in _bash_cases(name, all)),
+        "options": "\n".join(f'    {name}) _words "{" ".join(_options(all))}" ;;' for name, all in words.items()),
+        "positions": "\n".join(line for name, all in words.items() for line in _bash_positions(name, all)),
+    }
 
 
-BASH = """\
+BASH_SCRIPT = """\
 # Completion of topomerge for bash. Written by: topomerge completion bash >> ~/.bashrc
 _topomerge() {
-  local word=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD-1]} command= i
+  local word=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD-1]} command= place=0 i
   [[ $word == = ]] && word=
   [[ $before == = ]] && before=${COMP_WORDS[COMP_CWORD-2]}
   COMPREPLY=()
@@ -100,6 +118,13 @@ _topomerge() {
     _words "%(names)s --help --version"
     return
   fi
+  for ((i++; i < COMP_CWORD; i++)); do  # how many arguments without a flag stand before the word
+    [[ ${COMP_WORDS[i]} == -* || ${COMP_WORDS[i]} == = || ${COMP_WORDS[i-1]} == = ]] && continue
+    case "$command ${COMP_WORDS[i-1]}" in
+      %(takes_value)s) ;;
+      *) ((place++)) ;;
+    esac
+  done
   case "$command $before" in
 %(cases)s
   esac
@@ -109,8 +134,8 @@ _topomerge() {
     esac
     return
   fi
-  case $command in
-%(rest)s
+  case "$command $place" in
+%(positions)s
   esac
 }
 complete -F _topomerge topomerge
@@ -127,8 +152,8 @@ def _zsh_value(word: Word) -> str:
     return f":value:{action}" if action else ""
 
 
-def _zsh(words: dict[str, list[Word]], about: dict[str, str]) -> str:
-    names = "\n".join(f"    '{name}:{_plain(text)}'" for name, text in about.items())
+def _zsh(words: dict[str, list[Word]], summaries: dict[str, str]) -> str:
+    names = "\n".join(f"    '{name}:{_plain(text)}'" for name, text in summaries.items())
     cases = []
     for name, all in words.items():
         specs = [
@@ -136,14 +161,13 @@ def _zsh(words: dict[str, list[Word]], about: dict[str, str]) -> str:
             for w in all
             for flag in w.flags
         ]
-        word = next((w for w in all if not w.flags), None)
-        if word is not None:
-            specs.append(f"'*{_zsh_value(word)}'")
+        positional = [w for w in all if not w.flags]
+        specs += [f"'{'*' if w.repeat else place}{_zsh_value(w)}'" for place, w in enumerate(positional, 1)]
         cases.append(f"    {name}) _arguments " + " ".join(specs) + " ;;")
-    return ZSH % {"names": names, "cases": "\n".join(cases)}
+    return ZSH_SCRIPT % {"names": names, "cases": "\n".join(cases)}
 
 
-ZSH = """\
+ZSH_SCRIPT = """\
 # Completion of topomerge for zsh. Written by: topomerge completion zsh >> ~/.zshrc
 _topomerge() {
   local -a names
@@ -167,22 +191,37 @@ compdef _topomerge topomerge
 """
 
 
-def _fish(words: dict[str, list[Word]], about: dict[str, str]) -> str:
+def _fish(words: dict[str, list[Word]], summaries: dict[str, str]) -> str:
     lines = [
         "# Completion of topomerge for fish. Written by: topomerge completion fish > ~/.config/fish/completions/topomerge.fish",
         "complete -c topomerge -f",
     ]
-    lines += [f"complete -c topomerge -n __fish_use_subcommand -a {n} -d '{_plain(text)}'" for n, text in about.items()]
+    lines += [
+        f"complete -c topomerge -n __fish_use_subcommand -l {name} -d '{text}'"
+        for name, text in (("help", "show the help"), ("version", "show the version"))
+    ]
+    lines += [f"complete -c topomerge -n __fish_use_subcommand -a {n} -d '{_plain(text)}'" for n, text in summaries.items()]
     for name, all in words.items():
-        here = f"complete -c topomerge -n '__fish_seen_subcommand_from {name}'"
-        lines += [f"{here} {_fish_word(word)}" for word in all]
+        start = f"complete -c topomerge -n '__fish_seen_subcommand_from {name}'"
+        lines += [f"{start} {_fish_word(word)}" for word in all]
     return "\n".join(lines) + "\n"
 
 
 def _fish_word(word: Word) -> str:
     flags = [f"-l {f[2:]}" if f.startswith("--") else f"-s {f[1:]}" for f in word.flags]
-    value = {"file": "-r -F", "folder": "-x -a '(__fish_complete_directories)'", "other": "-x", "none": ""}
-    given = f"-x -a '{' '.join(word.choices)}'" if word.choices else value[word.value]
+    values = {"file": "-r -F", "folder": "-x -a '(__fish_complete_directories)'", "other": "-x", "none": ""}
+    value = f"-x -a '{' '.join(word.choices)}'" if word.choices else values[word.value]
     if not word.flags:
-        given = given.replace("-r ", "").replace("-x ", "")
-    return " ".join([*flags, given, f"-d '{_plain(word.help)}'" if word.flags else ""]).strip()
+        value = value.replace("-r ", "").replace("-x ", "")
+    return " ".join([*flags, value, f"-d '{_plain(word.help)}'" if word.flags else ""]).strip()
+
+
+COMPLETION = Command(
+    "completion",
+    completion_command,
+    "print a script that completes commands and options in your shell",
+    "topomerge completion bash >> ~/.bashrc",
+    (option("shell", choices=SHELLS, help="the shell that is to learn it"),),
+    description="Print a script with which the Tab key completes commands, options and their values: for bash to go into "
+    "~/.bashrc, for zsh into ~/.zshrc, for fish into ~/.config/fish/completions/topomerge.fish.",
+)

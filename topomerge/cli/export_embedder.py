@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from topomerge.cli.command import Command, option, output, quiet
+from topomerge.cli.command import Command, option
 from topomerge.cli.console import output_folder
+from topomerge.cli.options import output, quiet
 from topomerge.errors import InputError
 
 

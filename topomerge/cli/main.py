@@ -1,6 +1,7 @@
 """The command line: parse, run one command, and turn every failure into one line and an exit status.
 
-Nothing heavy is imported here: `topomerge --help` must not wait for NumPy. The commands stand in `topomerge.cli.commands`.
+Nothing heavy is imported here: `topomerge --help` must not wait for NumPy. To add a command, write a file like the others of
+this folder and enter it in `COMMANDS`; what it needs of the package it imports inside its functions.
 """
 
 from __future__ import annotations
@@ -15,9 +16,21 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from topomerge import __version__
+from topomerge.cli.atlas import ATLAS
 from topomerge.cli.command import Command
-from topomerge.cli.commands import COMMANDS
+from topomerge.cli.completion import COMPLETION
+from topomerge.cli.embed import EMBED
+from topomerge.cli.export import EXPORT
+from topomerge.cli.export_embedder import EXPORT_EMBEDDER
+from topomerge.cli.extract import EXTRACT
+from topomerge.cli.info import INFO
+from topomerge.cli.match import MATCH
+from topomerge.cli.merge import MERGE
+from topomerge.cli.simulate import SIMULATE
+from topomerge.cli.view import VIEW
 from topomerge.errors import printable
+
+COMMANDS = (EXTRACT, INFO, EMBED, MATCH, MERGE, SIMULATE, COMPLETION, ATLAS, EXPORT, EXPORT_EMBEDDER, VIEW)
 
 EXIT_STATUSES = """\
 exit status:
@@ -29,12 +42,11 @@ exit status:
   143  terminated
 Set TOPOMERGE_DEBUG=1, or give -v twice, to see the traceback of a failure."""
 
-
-SIGNED = ("--origin", "--up")  # options whose value may start with a dash
+SIGNED_OPTIONS = ("--origin", "--up")  # their value may start with a dash
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, with status 1: 2 is kept for "no trustworthy merge"."""
+    """Says what is wrong in one line, with status 1: 2 is reserved for "no trustworthy merge"."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(1, f"{self.prog}: {message} (see {self.prog} --help)\n")
@@ -50,7 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"topomerge {__version__}")
-    parser.set_defaults(run=None, paths=())
+    parser.set_defaults(run=None, paths=(), commands=COMMANDS)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in COMMANDS:
         _add(commands, command)
@@ -92,8 +104,8 @@ def _failure(error: BaseException, paths: Sequence[str]) -> str:
 
 def _named_paths(args: argparse.Namespace) -> list[str]:
     """The files that the user named, the input first."""
-    given = [getattr(args, name) for name in args.paths if getattr(args, name, None)]
-    return [str(path) for value in given for path in (value if isinstance(value, list) else [value])]
+    values = [getattr(args, name) for name in args.paths if getattr(args, name, None)]
+    return [str(path) for value in values for path in (value if isinstance(value, list) else [value])]
 
 
 def _signal_behind(error: BaseException | None) -> BaseException | None:
@@ -115,7 +127,7 @@ def _joined(words: Sequence[str]) -> list[str]:
     """`--origin -33.9,151.2` as `--origin=-33.9,151.2`: argparse takes a value that starts with a dash for another option."""
     joined: list[str] = []
     for word in words:
-        if joined and joined[-1] in SIGNED and word.startswith("-"):
+        if joined and joined[-1] in SIGNED_OPTIONS and word.startswith("-"):
             joined[-1] += f"={word}"
         else:
             joined.append(word)

@@ -1,0 +1,47 @@
+"""The command `embed`: a row of numbers for each room."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from topomerge.cli.command import Command, option
+from topomerge.cli.console import check_outputs, write_all
+from topomerge.cli.options import CLOUD_OPTIONS, CONTEXT_STEPS, DESCRIPTOR, map_from, output, quiet
+
+
+def embed_command(args: argparse.Namespace) -> int:
+    """`topomerge embed`: describe each room of a map; write a NumPy array (rooms, numbers)."""
+    check_outputs([args.output], [args.input])
+    from topomerge.embedding.embedders import embedder
+
+    describe = embedder(args.descriptor, args.k)
+    rows = describe(map_from(args.input, args))
+    import numpy as np
+
+    def save(path: Path) -> None:
+        with path.open("wb") as file:  # np.save would add .npy to another name
+            np.save(file, rows, allow_pickle=False)
+
+    write_all([(args.output, save)])
+    if not args.quiet:
+        print(f"{len(rows)} rooms, {rows.shape[1]} numbers each -> {args.output}")
+    return 0
+
+
+EMBED = Command(
+    "embed",
+    embed_command,
+    "describe each room of a map by numbers",
+    "topomerge embed a.tmap --descriptor shapedna --k 1 -o a.npy",
+    (
+        option("input", metavar="A", help="a .tmap, or a cloud, which is extracted first"),
+        output("A.npy", "NumPy array, a row for each room"),
+        DESCRIPTOR,
+        CONTEXT_STEPS,
+        *CLOUD_OPTIONS,
+        quiet(),
+    ),
+    paths=("input", "output"),
+    description="Describe each room of a map by numbers: rooms that look alike get rows that are close.",
+)

@@ -1,0 +1,51 @@
+"""The command `match`: which rooms of two maps are the same."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from topomerge.cli.command import Command, option
+from topomerge.cli.console import check_inputs, warn
+from topomerge.cli.options import CLOUD_OPTIONS, CONTEXT_STEPS, DESCRIPTOR, json_option, map_from
+
+
+def match_command(args: argparse.Namespace) -> int:
+    """`topomerge match`: print the matches of rooms with their probabilities, as tables or as JSON."""
+    from topomerge.io.listing import json_text
+    from topomerge.matching.listing import matching_to_json, matching_to_text
+    from topomerge.matching.match import check, match
+
+    check_inputs([args.a, args.b])
+    a, b = map_from(args.a, args), map_from(args.b, args)
+    check(a, b)
+    alone = [path for path, topomap in ((args.a, a), (args.b, b)) if len(topomap.rooms) == 1]
+    warn(f"{path}: has one room: only its shape and doors can be compared" for path in alone)
+    matching = match(a, b, args.descriptor, args.method, k=args.k, scale_free=args.scale_of_b == "free")
+    sys.stdout.write(json_text(matching_to_json(matching, a, b)) if args.json else matching_to_text(matching, a, b) + "\n")
+    return 0
+
+
+MATCH = Command(
+    "match",
+    match_command,
+    "find the rooms that two maps have in common",
+    "topomerge match a.tmap b.tmap --json",
+    (
+        option("a", metavar="A", help="a .tmap, or a cloud, which is extracted first"),
+        option("b", metavar="B", help="the other one"),
+        json_option(),
+        option(
+            "--method",
+            choices=("consistent", "growing", "assignment", "thesis"),
+            default="consistent",
+            help="sets of matches that one transform explains (default), or simpler ways",
+        ),
+        option("--scale", dest="scale_of_b", choices=("free", "known"), default="known", help="free: the scale of b is unknown"),
+        DESCRIPTOR,
+        CONTEXT_STEPS,
+        *CLOUD_OPTIONS,
+    ),
+    paths=("a", "b"),
+    description="Print which rooms of two maps are the same, with probabilities, and the transforms that would make them so.",
+)

@@ -1,0 +1,96 @@
+"""The command `merge`: maps in, one map out, or an honest refusal."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import topomerge
+from topomerge.cli.command import Command, option
+from topomerge.cli.console import check_inputs, check_outputs, output_folder, say, warn
+from topomerge.cli.options import CLOUD_OPTIONS, DESCRIPTOR, given, map_from, output, quiet, share
+from topomerge.errors import InputError
+
+if TYPE_CHECKING:
+    from topomerge.types import TopometricMap
+
+MERGE_OUTPUTS = ("merge.json", "report.html", "merged.ply", "map.tmap")
+
+
+def merge_command(args: argparse.Namespace) -> int:
+    """`topomerge merge`: bring two maps or more together. Status 2: the merge is not believed."""
+    if len(args.inputs) < 2:
+        raise InputError(f"{args.inputs[0]}: merge takes two maps or more, 1 given; give another one")
+    check_inputs(args.inputs)
+    with output_folder(args.output) as folder:
+        check_outputs([folder / name for name in MERGE_OUTPUTS], args.inputs)
+        try:
+            return _merge(args, folder)
+        except OSError as error:
+            raise InputError(f"{folder}: can't be written ({error.strerror or error}); give another place") from error
+
+
+def _merge(args: argparse.Namespace, folder: Path) -> int:
+    maps, read_seconds, extract_seconds = [], 0.0, 0.0
+    for path in args.inputs:
+        topomap, read, extract = _timed_map(path, args)
+        maps.append(topomap)
+        read_seconds, extract_seconds = read_seconds + read, extract_seconds + extract
+    choices = given(args, "force", "threshold")
+    result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices)
+    result = replace(result, seconds={**result.seconds, "read": read_seconds, "extract": extract_seconds})
+    warn(result.warnings)
+    result.save(folder)
+    if not args.quiet:
+        joined = f"; {len(result.matches)} matches, {len(result.map.rooms)} rooms in all" if result.map else ""
+        say(f"{result.reason}{joined} -> {folder}")
+    elif not result.merged:
+        say(f"topomerge: {result.reason}", sys.stderr)
+    return 0 if result.merged else 2
+
+
+def _timed_map(path: str, args: argparse.Namespace) -> tuple[TopometricMap, float, float]:
+    """The map that a path names, and the seconds of reading and of extracting it; of a .tmap, all is reading."""
+    began = perf_counter()
+    topomap = map_from(path, args)
+    seconds, extracting = perf_counter() - began, 0.0
+    if Path(path).suffix.lower() != ".tmap":
+        extracting = min(sum(s for step, s in topomap.seconds.items() if not step.startswith("read")), seconds)
+    return replace(topomap, source=path), seconds - extracting, extracting
+
+
+MERGE = Command(
+    "merge",
+    merge_command,
+    "bring maps together, or say why not",
+    "topomerge merge a.ply b.laz -o merged/",
+    (
+        option("inputs", nargs="+", metavar="MAP", help="clouds or .tmap, two or more, in any mix"),
+        output("DIR", "folder for merge.json, merged.ply, map.tmap, report.html"),
+        option(
+            "--scale",
+            dest="scale_of_b",
+            choices=("fixed", "free"),
+            default="fixed",
+            help="free: those of all but the first are unknown",
+        ),
+        option(
+            "--poses",
+            choices=("search", "rooms"),
+            default="search",
+            help="rooms: only of matched rooms by their surfaces, as the thesis does; two maps",
+        ),
+        option("--force", action="store_true", help="write the best merge even if it is not believed (status 2 stays)"),
+        option("--threshold", type=share, metavar="P", help="probability from which a merge is believed (default 0.8)"),
+        DESCRIPTOR,
+        *CLOUD_OPTIONS,
+        quiet("print nothing but warnings and a refusal"),
+    ),
+    paths=("inputs", "output"),
+    description="Bring maps together: status 0 and a joined map, or status 2 and the reason why it is not believed. Of more "
+    "than two, those that belong to the first are joined, and the others are named.",
+)

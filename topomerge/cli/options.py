@@ -1,0 +1,106 @@
+"""What several commands share: options, the types of their values, and the map that an input and its options stand for."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from topomerge.cli.command import Argument, option
+from topomerge.cli.console import Bars, warn
+from topomerge.errors import InputError
+
+if TYPE_CHECKING:
+    from topomerge.types import TopometricMap
+
+
+def _number(text: str, allowed: Callable[[float], bool], range_text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not allowed(value):
+        raise argparse.ArgumentTypeError(f"must be a number {range_text}, not {text!r}")
+    return value
+
+
+def above_zero(text: str) -> float:
+    """A finite number above 0, as the `type` of an argument."""
+    return _number(text, lambda value: 0 < value < float("inf"), "above 0")
+
+
+def share(text: str) -> float:
+    """A number from 0 to 1, as the `type` of an argument."""
+    return _number(text, lambda value: 0 <= value <= 1, "from 0 to 1")
+
+
+def count(text: str) -> int:
+    """A whole number from 0 on, as the `type` of an argument."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number, not {text!r}")
+    return int(text)
+
+
+def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of the options that were given: for the others, the function that takes them has its defaults."""
+    return {name: getattr(args, name) for name in names if hasattr(args, name)}
+
+
+def output(metavar: str, help: str) -> Argument:
+    """Where to write what a command is for."""
+    return option("-o", "--output", required=True, metavar=metavar, default=None, help=help)
+
+
+def quiet(help: str = "print nothing") -> Argument:
+    """That nobody watches."""
+    return option("-q", "--quiet", action="store_true", default=False, help=help)
+
+
+def json_option(help: str = "print JSON instead of tables") -> Argument:
+    """That a program reads what is printed."""
+    return option("--json", action="store_true", default=False, help=help)
+
+
+UP = option(
+    "--up",
+    choices=("z", "y", "x", "-z", "-y", "-x"),
+    help="axis of the input that points up (default z, for glTF y); -y: it points down",
+)
+UNIT = option("--unit", choices=("m", "cm", "mm", "ft", "in"), help="unit of the input (default m)")
+DESCRIPTOR = option(
+    "--descriptor",
+    default="learned",
+    metavar="NAME",
+    help="learned (default: the embedder that ships), engineered, shapedna, feather, or the folder of a trained embedder",
+)
+CONTEXT_STEPS = option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)")
+CLOUD_OPTIONS = (
+    option("--voxel-size", type=above_zero, metavar="E", help="edge length of a cell where a cloud is given, m (default 0.1)"),
+    UP,
+    UNIT,
+)
+
+
+def map_from(path: str, args: argparse.Namespace) -> TopometricMap:
+    """The map in a .tmap, or the one that is extracted from anything else with the `CLOUD_OPTIONS` that were given.
+
+    Raises:
+        InputError: it can't be read or extracted; the line names the file.
+    """
+    from topomerge.io.maps import load_map
+
+    try:
+        if Path(path).suffix.lower() == ".tmap":
+            topomap = load_map(path)
+        else:
+            from topomerge.extraction.extract import extract
+            from topomerge.io.points import read_chunks
+
+            with Bars(enabled=not getattr(args, "quiet", False)) as bars:
+                chunks = read_chunks(path, **given(args, "up", "unit"), progress=bars.task("read"))
+                topomap = extract(chunks, **given(args, "voxel_size"), name=path, progress=bars.task("extract"))
+    except InputError as error:
+        raise InputError(str(error) if path in str(error) else f"{path}: {error}") from error
+    warn(topomap.warnings)
+    return topomap
