@@ -1,0 +1,24 @@
+"""The nouns of the library: frozen dataclasses over arrays, validated when they are made.
+
+Conventions: z is up, lengths are metres, angles radians. Poses are float64, points float32 about a float64 shift. ``T_ab`` maps
+points of map b into the frame of map a. A room label of -1 means "no room".
+"""
+
+from topomerge.types.arrays import Array
+from topomerge.types.cloud import PointCloud, TrueRoom
+from topomerge.types.grid import VoxelGrid
+from topomerge.types.similarity import Sim3
+from topomerge.types.topometric_map import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, TopometricMap
+
+__all__ = [
+    "AREA_DTYPE",
+    "EDGE_DTYPE",
+    "ROOM_DTYPE",
+    "STOREY_DTYPE",
+    "Array",
+    "PointCloud",
+    "Sim3",
+    "TopometricMap",
+    "TrueRoom",
+    "VoxelGrid",
+]

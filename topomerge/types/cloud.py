@@ -1,0 +1,50 @@
+"""Points of a partial map, and the rooms that are truly there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from topomerge.types.arrays import Array, require
+from topomerge.types.grid import VoxelGrid
+
+
+@dataclass(frozen=True, eq=False)
+class TrueRoom:
+    """A room of the truth, not of an estimate: from a building model, a plan or a simulator."""
+
+    name: str
+    polygon: Array  # (k, 2) float64, outline of the floor, counter-clockwise, not closed
+    floor: float
+    ceiling: float
+    storey: int = 0
+    kind: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points of one partial map, z up, in metres.
+
+    ``points + shift`` are the coordinates of the input file: float32 alone would lose centimetres in a national grid.
+    """
+
+    points: Array  # (N, 3) float32
+    shift: Array = field(default_factory=lambda: np.zeros(3))  # (3,) float64
+    colors: Array | None = None  # (N, 3) uint8
+    labels: Array | None = None  # (N,) int32, true room of each point (index into `rooms`), -1: none
+    poses: Array | None = None  # (K, 4, 4) float64, sensor into the file's frame
+    pose_of: Array | None = None  # (N,) int32, index into `poses`, -1: unknown
+    free: VoxelGrid | None = None  # cells known to be empty
+    rooms: tuple[TrueRoom, ...] = ()
+    source: str = ""
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        require(self.points.ndim == 2 and self.points.shape[1] == 3, f"points must be (N, 3), not {self.points.shape}")
+        for name in ("colors", "labels", "pose_of"):
+            values = getattr(self, name)
+            require(values is None or len(values) == len(self.points), f"{name} must have one row a point")
+
+    def __len__(self) -> int:
+        return len(self.points)

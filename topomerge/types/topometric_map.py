@@ -1,0 +1,129 @@
+"""A grid cut into rooms with the graph of its doors (seeds 2.7), and the rows of its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from topomerge.types.arrays import Array, require
+from topomerge.types.grid import VoxelGrid
+
+ROOM_DTYPE = np.dtype(
+    [
+        ("storey", "i4"),
+        ("centroid", "f8", 3),  # of the room's navigable cells, in the input's frame
+        ("area", "f8"),  # m2 of navigable floor, seen from above
+        ("height", "f8"),  # m, floor to ceiling: median over the floor; 0 where no ceiling was seen
+        ("volume", "f8"),  # m3 between floor and ceiling (area times height)
+        ("lo", "f8", 3),  # bounding box of the room's cells, in the input's frame
+        ("hi", "f8", 3),
+        ("cells", "i8"),  # occupied cells
+        ("completeness", "f8"),  # share of the floor's outline at which a wall or another room was seen
+        ("glimpsed", "?"),  # most of the outline was not seen: looked into through a door or a window
+    ]
+)
+EDGE_DTYPE = np.dtype(
+    [
+        ("rooms", "i4", 2),
+        ("centre", "f8", 3),  # on the floor, in the input's frame
+        ("width", "f8"),  # m
+        ("height", "f8"),  # m of clear height; 0 where nothing was seen above
+        ("direction", "f8"),  # rad, of the wall's normal in the horizontal plane, in [0, pi)
+        ("kind", "U8"),  # door | opening | stairs | ramp
+        ("open", "?"),  # one could walk through; a shut door joins two rooms, too
+        ("confidence", "f8"),  # that it is one: 0..1
+        ("lower", "f8", 3),  # of stairs and ramps: where they begin and end, in the input's frame; of doors both the centre
+        ("upper", "f8", 3),
+    ]
+)
+AREA_DTYPE = np.dtype(
+    [
+        ("room", "i4"),
+        ("centroid", "f8", 3),  # of its navigable cells, in the input's frame
+        ("area", "f8"),  # m2 of navigable floor, seen from above
+    ]
+)
+STOREY_DTYPE = np.dtype([("floor", "f8"), ("ceiling", "f8"), ("area", "f8")])  # m, m (nan: not seen), m2
+
+
+@dataclass(frozen=True, eq=False)
+class TopometricMap:
+    """A voxel grid cut into rooms, with the graph of how one walks between them (seeds 2.7).
+
+    Args:
+        grid: occupied cells.
+        room: (n,) int32, room of each occupied cell, -1 none.
+        navigable: the navigable volume, a grid of the same volume; its cells need not be occupied. In maps of the default preset
+            it is the whole floor of the rooms, also under furniture, and its property `standing` says where a body fits.
+        navigable_room: (m,) int32, room of each navigable cell, -1 none.
+        rooms: (R,) ROOM_DTYPE.
+        edges: (E,) EDGE_DTYPE; two rooms that meet in two doors have two edges.
+        storeys: (S,) STOREY_DTYPE, lowest first.
+        areas: (A,) AREA_DTYPE, the parts of rooms that a narrowing or a wide opening suggests; a room without such has one.
+        navigable_area: (m,) int32, area of each navigable cell, -1 none.
+        narrows: (N,) EDGE_DTYPE whose `rooms` are two areas of one room.
+        free: cells known to be empty (rays crossed them), of the same origin but perhaps another edge length; or None.
+        provenance: (n,) uint32 bit set of the maps that saw each cell, or None for a map of one source.
+        source: the file it was made from.
+        parameters: what it was extracted with.
+        seconds: step -> s.
+        warnings: what the user should know.
+    """
+
+    grid: VoxelGrid
+    room: Array
+    navigable: VoxelGrid
+    navigable_room: Array
+    rooms: Array
+    edges: Array
+    storeys: Array
+    areas: Array = field(default_factory=lambda: np.zeros(0, AREA_DTYPE))
+    navigable_area: Array | None = None
+    narrows: Array = field(default_factory=lambda: np.zeros(0, EDGE_DTYPE))
+    free: VoxelGrid | None = None
+    provenance: Array | None = None
+    source: str = ""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        require(self.room.shape == (len(self.grid),), "room must have one label an occupied cell")
+        require(self.navigable_room.shape == (len(self.navigable),), "navigable_room must have one label a cell")
+        require(self.rooms.dtype == ROOM_DTYPE, "rooms must have ROOM_DTYPE")
+        require(self.edges.dtype == EDGE_DTYPE, "edges must have EDGE_DTYPE")
+        require(self.storeys.dtype == STOREY_DTYPE, "storeys must have STOREY_DTYPE")
+        require(self.areas.dtype == AREA_DTYPE, "areas must have AREA_DTYPE")
+        require(self.narrows.dtype == EDGE_DTYPE, "narrows must have EDGE_DTYPE")
+        if self.navigable_area is None:
+            object.__setattr__(self, "navigable_area", np.full(len(self.navigable), -1, np.int32))
+        assert self.navigable_area is not None
+        require(self.navigable_area.shape == (len(self.navigable),), "navigable_area must have one label a cell")
+        require(int(self.navigable_area.max(initial=-1)) < len(self.areas), "a cell's area does not exist")
+        require(int(self.narrows["rooms"].max(initial=-1)) < len(self.areas), "a narrowing's area does not exist")
+        owner = self.areas["room"]
+        require(not len(owner) or (owner.min() >= 0 and owner.max() < len(self.rooms)), "an area's room does not exist")
+        for labels in (self.room, self.navigable_room):
+            if len(labels):
+                require(labels.min() >= -1 and labels.max() < len(self.rooms), "a cell's room does not exist")
+        ends = self.edges["rooms"]
+        require(not len(ends) or (ends.min() >= 0 and ends.max() < len(self.rooms)), "an edge's room does not exist")
+        require(bool((ends[:, 0] != ends[:, 1]).all()), "an edge must join two rooms")
+        storey = self.rooms["storey"]
+        require(not len(storey) or (storey.min() >= 0 and storey.max() < len(self.storeys)), "a room's storey is missing")
+        require(self.provenance is None or len(self.provenance) == len(self.grid), "provenance: one value a cell")
+
+    def storey_of_cells(self) -> Array:
+        """(n,) int32 storey of each occupied cell: its room's, or for a cell without a room the last one whose floor is
+        not above it."""
+        if not len(self.storeys):
+            return np.full(len(self.grid), -1, np.int32)
+        z = self.grid.centroids()[:, 2]
+        by_height = np.searchsorted(self.storeys["floor"] - 2 * self.grid.edge, z) - 1
+        storey = np.clip(by_height, 0, None).astype(np.int32)
+        with_room = self.room >= 0
+        storey[with_room] = self.rooms["storey"][self.room[with_room]]
+        return storey
