@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 RANKS = {
     "errors": 0,
     "code_digest": 0,
+    "writers": 0,
     "kernels": 0,
     "types": 1,
     "io": 2,

@@ -12,13 +12,15 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from topomerge.writers import WRITERS
+
 if TYPE_CHECKING:
     from topomerge.embedding.learned import load_embedder as load_embedder
     from topomerge.errors import InputError as InputError
     from topomerge.extraction.extract import PRESETS as PRESETS
     from topomerge.extraction.extract import extract as extract
     from topomerge.extraction.voxels import voxelise as voxelise
-    from topomerge.fusion.atlas.solve import AtlasResult as AtlasResult
+    from topomerge.fusion.atlas.result import AtlasResult as AtlasResult
     from topomerge.fusion.atlas.solve import atlas as atlas
     from topomerge.fusion.merge import merge as merge
     from topomerge.fusion.result import MergeResult as MergeResult
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "AtlasResult": "topomerge.fusion.atlas.solve",
+    "AtlasResult": "topomerge.fusion.atlas.result",
     "InputError": "topomerge.errors",
     "MergeResult": "topomerge.fusion.result",
     "PRESETS": "topomerge.extraction.extract",
@@ -81,6 +83,13 @@ def __getattr__(name: str) -> Any:
     value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
     return value
+
+
+def _write_merge(result: Any, folder: Any) -> None:
+    __getattr__("save_merge")(result, folder)
+
+
+WRITERS["merge"] = _write_merge
 
 
 def __dir__() -> list[str]:

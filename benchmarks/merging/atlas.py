@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.merging.atlas_maps import CACHE, AtlasSet, load
-from topomerge.fusion.atlas.solve import AtlasResult, atlas
-from topomerge.fusion.average import difference
+from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.atlas.solve import atlas
+from topomerge.fusion.pose_difference import pose_difference
 
 RIGHT = (0.5, np.radians(5.0))  # m, rad
 SIZES = (2, 4, 8, 16)
@@ -43,7 +44,7 @@ def errors(made: AtlasSet, found: AtlasResult) -> dict[int, tuple[float, float] 
             true, middle = one.inverse() @ two, found.maps[k].grid.centroids().mean(axis=0)
             off = found.transforms[k].apply(middle[None])[0] - true.apply(middle[None])[0]
             flat = "laser2d" in (sensors[first], sensors[k])
-            out[k] = (float(np.linalg.norm(off[:2] if flat else off)), difference(true, found.transforms[k], middle)[1])
+            out[k] = (float(np.linalg.norm(off[:2] if flat else off)), pose_difference(true, found.transforms[k], middle)[1])
     return out
 
 
@@ -69,7 +70,7 @@ def measure(folder: Path) -> dict[str, Any]:
         "wrong": len(off) - len(right),
         "components": [list(c) for c in found.components if len(c) > 1],
         "errors": {str(k): e for k, e in off.items()},
-        "thrown": [list(link.maps) for link in found.thrown],
+        "thrown": [list(link.maps) for link in found.rejected],
         "building": made.about["building"],
         "sensors": made.about["sensors"],
     }

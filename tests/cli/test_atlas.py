@@ -70,17 +70,22 @@ def test_a_strangers_listing(run: Run, folder: Path, change: dict[str, object]) 
 
 @pytest.mark.parametrize("found", [[], {"features": []}, {"yaw": 10**400}, {"translation": 3}, {"scale": 0}, {"probability": 7}])
 def test_strange_registrations_are_made_anew(run: Run, folder: Path, found: object) -> None:
-    from topomerge.fusion.atlas.store import _pairs, read_atlas
+    from topomerge.fusion.atlas.registration_cache import read_registrations
+    from topomerge.fusion.atlas.store import read_atlas
 
     path = folder / "house" / "pairs.json"
     before = path.read_text()
+
+    def registrations() -> object:
+        return read_registrations(folder / "house", read_atlas(folder / "house").settings)
+
     told = json.loads(before)
-    assert len(_pairs(read_atlas(folder / "house"))) == len(told["pairs"]) > 0
+    assert len(registrations()) == len(told["pairs"]) > 0
     try:
         good = next(p["hypotheses"][0] for p in told["pairs"] if p["hypotheses"])
         told["pairs"][0]["hypotheses"] = [good | found if isinstance(found, dict) else found]
         path.write_text(json.dumps(told))
-        assert _pairs(read_atlas(folder / "house")) == {}
+        assert registrations() == {}
     finally:
         path.write_text(before)
 

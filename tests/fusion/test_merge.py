@@ -7,18 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import topomerge as tm
 from tests.fusion.plans_of import MOVE, off, office, part
-from tests.scenes import Scene, two_rooms
+from tests.scenes import Scene
 from topomerge.errors import InputError
-from topomerge.fusion.fuse import fuse, join, resampled, room_of_rooms, rooms_in_common
+from topomerge.fusion.fuse import room_of_rooms
 from topomerge.fusion.result import STEPS, MergeResult, merge_to_json
 from topomerge.matching.odds import match_probability
-from topomerge.types import Sim3, TopometricMap, VoxelGrid
+from topomerge.types import Sim3, TopometricMap
 
 
 def map_of(points: np.ndarray, name: str, frame: Sim3 | None = None) -> TopometricMap:
@@ -134,78 +133,12 @@ def test_a_threshold_is_kept_to(halves, merged):
             tm.merge(halves, threshold=wrong)
 
 
-def test_provenance_counts_every_cell_once():
-    """Two boxes of cells that share a part, the second one moved by whole cells."""
-    a, b = (map_of(two_rooms().points(), n) for n in "ab")
-    move = Sim3(0.0, (3.0, 0.0, 0.0))
-    found = fuse(a, b, move)
-    shifted = b.grid.locate(b.grid.centroids())  # the cells themselves
-    to = {tuple(c) for c in (shifted + np.round((b.grid.origin + (3, 0, 0)) / 0.1)).astype(int).tolist()}
-    own = {tuple(c) for c in (a.grid.cells + np.round(a.grid.origin / 0.1)).astype(int).tolist()}
-    assert np.bincount(found.provenance, minlength=4).tolist() == [0, len(own - to), len(to - own), len(own & to)]
-    assert found.provenance.dtype == np.uint32
-
-
-def test_bits_of_joined_maps_follow(halves, merged):
-    again = fuse(merged.map, halves[1], merged.transforms[1])
-    assert np.bitwise_or.reduce(again.provenance) == 0b111
-    full = replace(merged.map, provenance=np.full(len(merged.map.grid), 1 << 31, np.uint32))
-    with pytest.raises(InputError, match="at most 32"):
-        fuse(full, halves[1], merged.transforms[1])
-
-
 def test_cells_of_maps_that_were_joined_before_are_theirs(merged, halves):
     from topomerge.viz.merge_report import _seen
 
     again = tm.merge([merged.map, halves[1]])
     seen = _seen(again)
     assert np.array_equal(seen == 1, (again.map.provenance & 0b100) == 0) and np.bincount(seen)[3] > 1000
-
-
-def test_what_one_map_saw_empty_and_the_other_did_not_is_occupied(halves, merged):
-    found = fuse(*halves, merged.transforms[1])
-    assert found.free is not None and found.contested > 0
-    assert np.array_equal(found.free.origin, found.grid.origin) and found.free.edge == 2 * found.grid.edge
-    assert not found.grid.coarser(2).contains(found.free.cells).any()
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 4])
-def test_a_turned_wall_stays_whole(turn):
-    x, z = np.meshgrid(np.arange(60), np.arange(25), indexing="ij")
-    wall = VoxelGrid.from_cells(np.stack([x, 0 * x + 5, z], axis=-1).reshape(-1, 3), edge=0.1)
-    cells, rows = resampled(wall, Sim3(turn, (1.23, 4.56, 0.05)), np.zeros(3), 0.1)
-    assert 0.7 * len(wall) < len(cells) < 1.35 * len(wall) and len(np.unique(cells, axis=0)) == len(cells)
-    moved = Sim3(turn, (1.23, 4.56, 0.05)).apply(wall.centroids())
-    assert {tuple(c) for c in np.floor(moved / 0.1).astype(int).tolist()} <= {tuple(c) for c in cells.tolist()}  # none is lost
-    away = np.linalg.norm((cells + 0.5) * 0.1 - moved[rows], axis=1)
-    assert away.max() < 0.1 * np.sqrt(3) / 2 + 1e-9
-    image = np.zeros(cells.max(axis=0)[:2] + 1, bool)
-    image[tuple(cells[:, :2].T)] = True
-    assert ndimage.label(image, np.ones((3, 3)))[1] == 1  # a walk along the wall meets no gap
-
-
-@pytest.mark.parametrize("turn", [0.2, 0.6, np.pi / 4])
-def test_a_turned_floor_has_no_holes(turn):
-    x, y = np.meshgrid(np.arange(50), np.arange(40), indexing="ij")
-    floor = VoxelGrid.from_cells(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3), edge=0.1)
-    cells, _ = resampled(floor, Sim3(turn, (0.03, 0.07, 0.0)), np.array([-9.0, -9.0, 0.0]), 0.1)
-    image = np.zeros(cells.max(axis=0)[:2] + 2, bool)
-    image[tuple(cells[:, :2].T)] = True
-    assert np.array_equal(ndimage.binary_fill_holes(image), image) and (cells[:, 2] == cells[0, 2]).all()
-
-
-def test_coarse_cells_are_filled():
-    grid = VoxelGrid.from_cells(np.array([[0, 0, 0], [1, 0, 0]]), edge=0.2)
-    cells, rows = resampled(grid, Sim3(), np.zeros(3), 0.1)
-    assert len(cells) == 16 and np.bincount(rows).tolist() == [8, 8]
-
-
-def test_a_map_laid_on_itself_is_itself(halves):
-    a = halves[0]
-    found = join(a, replace(a, source="again"), Sim3())
-    assert len(found.grid) == len(a.grid) and (found.provenance == 3).all()
-    rooms, fit = rooms_in_common(a, a, Sim3())
-    assert rooms[:, 0].tolist() == rooms[:, 1].tolist() == list(range(len(a.rooms))) and (fit > 0.99).all()
 
 
 def test_json_has_the_schema(merged, refused):

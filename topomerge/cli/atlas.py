@@ -16,7 +16,7 @@ from topomerge.cli.options import CLOUD_OPTIONS, given, json_option, map_from, q
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
-    from topomerge.fusion.atlas.solve import AtlasResult
+    from topomerge.fusion.atlas.result import AtlasResult
 
 
 def atlas_command(args: argparse.Namespace) -> int:
@@ -28,22 +28,24 @@ def atlas_command(args: argparse.Namespace) -> int:
 
 def _add(args: argparse.Namespace) -> int:
     from topomerge.fusion.atlas.store import add, check_folder
+    from topomerge.viz.atlas_report import atlas_html
 
     if not args.items:
         raise InputError(f"{args.folder}: name the maps or clouds to add: topomerge atlas add {args.folder} MAP ...")
     check_folder(args.folder)
     check_inputs(args.items)
     maps = [(Path(path).stem, replace(map_from(path, args), source=path)) for path in args.items]
-    return _report(add(args.folder, maps, **given(args, "scale", "threshold", "embedder")), args)
+    return _report(add(args.folder, maps, atlas_html, **given(args, "scale", "threshold", "embedder")), args)
 
 
 def _remove(args: argparse.Namespace) -> int:
     from topomerge.fusion.atlas.store import read_atlas, remove
+    from topomerge.viz.atlas_report import atlas_html
 
     if not args.items:
         names = ", ".join(e.name for e in read_atlas(args.folder).entries)
         raise InputError(f"{args.folder}: name the maps to take out; it holds {names or 'none'}")
-    return _report(remove(args.folder, args.items), args)
+    return _report(remove(args.folder, args.items, atlas_html), args)
 
 
 def _report(result: AtlasResult, args: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ from topomerge.embedding.context import HOWS
 from topomerge.embedding.embedders import EMBEDDERS
 from topomerge.embedding.weights import read_weights
 from topomerge.errors import InputError
-from topomerge.fusion.merge import POSES
+from topomerge.fusion.inputs import POSE_SOURCES
 from topomerge.io.listing import plain
 
 METHODS = ("full", "assignment", "growing", "consistent", "mutual")
@@ -113,8 +113,8 @@ def check(settings: Evaluation) -> None:
         for value in getattr(settings, key):
             if value not in known:
                 raise InputError(f"{key}: unknown {value!r}; {', '.join(known)} are possible")
-    if settings.poses not in POSES:
-        raise InputError(f"poses: unknown {settings.poses!r}; {', '.join(POSES)} are possible")
+    if settings.poses not in POSE_SOURCES:
+        raise InputError(f"poses: unknown {settings.poses!r}; {', '.join(POSE_SOURCES)} are possible")
     if any(k < 0 for k in settings.k) or settings.limit < 0 or settings.rounds < 1 or settings.jobs < 1:
         raise InputError("k and limit must be 0 or more, rounds and jobs 1 or more")
     for name in (*settings.only, *settings.mergers):

@@ -8,21 +8,21 @@ import numpy as np
 
 from topomerge.fusion.registration import Alternative, Registration
 
-CLOSE = 1.5  # log odds: a hypothesis less far behind is as good
+RIVAL_LAG = 1.5  # log odds: a hypothesis less far behind is as good
 Row = tuple[str, str, str]  # what, how much, what it says
 
 
-def why(found: Registration, threshold: float, force: bool = False) -> str:
+def why(registration: Registration, threshold: float, force: bool = False) -> str:
     """One sentence: the verdict, what speaks for it and what against."""
-    if found.transform is None:
-        return f"not merged: {found.reason}"
-    believed = found.probability >= threshold
-    f = found.features
+    if registration.transform is None:
+        return f"not merged: {registration.reason}"
+    believed = registration.probability >= threshold
+    f = registration.features
     sign = "reaches" if believed else "is below"
-    words = [f"{'merged' if believed else 'not merged'}: probability {chance(found.probability)} {sign} {threshold:.2f}"]
+    words = [f"{'merged' if believed else 'not merged'}: probability {chance(registration.probability)} {sign} {threshold:.2f}"]
     words.append(f"{f['walls']:.0f} m2 of walls agree, {f['free']:.0f} m2 of free floor seen by both")
     words.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
-    if not believed and f["margin"] < CLOSE and len(found.alternatives) > 1:
+    if not believed and f["margin"] < RIVAL_LAG and len(registration.alternatives) > 1:
         words.append("another place explains the maps as well")
     if force and not believed:
         words.append("joined all the same, as was asked for (--force)")
@@ -34,19 +34,19 @@ def chance(probability: float) -> str:
     return "over 0.99" if probability > 0.99 else "below 0.01" if probability < 0.01 else f"{probability:.2f}"
 
 
-def evidence_rows(found: Registration) -> list[Row]:
+def evidence_rows(registration: Registration) -> list[Row]:
     """What the best hypothesis was judged by: (what, how much, what it says)."""
-    if found.transform is None:
+    if registration.transform is None:
         return []
-    f = found.features
-    whole = f"{_percent(f['conflict_share'])} of the walls that meet anything, {_percent(f['worst_conflict'])} of one map's"
-    met = f"{_percent(f['met'])} of it meets furniture of the other map; by chance {_percent(f['chance'])}"
+    f = registration.features
+    conflicts = f"{_percent(f['conflict_share'])} of the walls that meet anything, {_percent(f['worst_conflict'])} of one map's"
+    furniture = f"{_percent(f['met'])} of it meets furniture of the other map; by chance {_percent(f['chance'])}"
     rows = [
         ("walls on walls", f"{f['walls']:.1f} m²", f"{_percent(f['ratio'])} of the walls that both could have seen; speaks for"),
         ("free floor in common", f"{f['free']:.0f} m²", "seen empty by both; speaks for"),
-        ("walls on free floor", f"{f['conflict']:.1f} m²", f"{whole}; speaks against"),
+        ("walls on free floor", f"{f['conflict']:.1f} m²", f"{conflicts}; speaks against"),
         ("walls back to back", _percent(f["opposed"]), "of the walls that meet face apart, as those of neighbouring rooms do"),
-        ("furniture", f"{f['clutter']:.1f} m²", met),
+        ("furniture", f"{f['clutter']:.1f} m²", furniture),
         ("floors", f"{f['level']:.2f} m", "largest step between floors or ceilings that should be one"),
     ]
     if f.get("ceiling_area", 0) > 0:
@@ -55,7 +55,7 @@ def evidence_rows(found: Registration) -> list[Row]:
     rows += _closer_rows(f)
     if np.isfinite(f.get("rmse", np.nan)):
         rows.append(("surfaces", f"{100 * f['rmse']:.1f} cm", "root mean square distance of surfaces that are one"))
-    if len(found.alternatives) > 1:
+    if len(registration.alternatives) > 1:
         times = np.exp(min(f["margin"], 15.0))
         words = f"{times:,.0f} times as probable" if times >= 1.5 else "about as probable"
         rows.append(("next best place", words, "how far the best hypothesis is ahead of the next one, each seen by itself"))

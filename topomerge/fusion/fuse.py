@@ -1,88 +1,235 @@
-"""Two maps and where one lies in the other -> one map: cells are fused, rooms and doors found anew (seeds 3.3; method.md, 3).
+"""Maps and where they lie -> one map: cells are fused one map after the other, rooms and doors extracted once, at the end (seeds
+3.3; method.md, 3).
 
-Cells of b are resampled: a cell of the joined grid is occupied where its middle lies in a cell of b, and where the middle of a
-cell of b lies in it. So no cell of b is lost, and a turned floor or wall gets no holes.
+Cells are resampled: a cell of the joined lattice is occupied where its middle lies in a cell of a moved map, and where the middle
+of a cell of a moved map lies in it. So no cell is lost, and a turned floor or wall gets no holes.
+
+Maps whose heights were assumed (slices and drawings, extruded) add only what no other map saw: what stands on the floor of a room
+would become a wall that fills it. They still say that they saw the cells of others that lie in theirs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Protocol
 
 import numpy as np
+from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.extraction.convolution import convolve, moore
 from topomerge.extraction.extract import COARSEST, FINEST, PRESETS, extract
+from topomerge.fusion.storey_plan import extruded
+from topomerge.kernels import morton
 from topomerge.matching.consistency import matches_under, storey_map
 from topomerge.matching.door_poses import Poses
 from topomerge.matching.topdown import top_down
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
-ALIKE = 0.8  # edges of cells that differ by less keep those of a
-AT_ONCE = 200_000  # cells that are resampled at once
-MOST = 32  # maps that one bit set tells apart
+ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
+RESAMPLED_AT_ONCE = 200_000  # cells
+PROVENANCE_BITS = 32  # maps that one bit set tells apart
+ASSUMED_MARGIN = 0.3  # m around what other maps saw: there an extruded wall is one of theirs that is a little off
+CODE_OFFSET = 1 << 20  # cells are counted from there, as Morton codes hold no negative ones
 
 
-@dataclass(frozen=True, eq=False)
-class Fused:
-    """Cells of two maps in the frame of the first.
+class MapSequence(Protocol):
+    """Maps that are loaded when they are asked for."""
 
-    Args:
-        grid: occupied in either.
-        provenance: (n,) uint32 bit set of the maps that saw each cell: bit 0 for a, bit 1 for b; maps that are joined already
-            keep their bits, those of b following those of a.
-        free: cells known to be empty in one of the maps and occupied in none, of the same origin; None where neither knows any.
-        contested: how many of the free cells of one map are occupied in the other. Occupied wins: what moves (doors, chairs,
-            people) stands where it was seen, and is no evidence of empty space.
-    """
-
-    grid: VoxelGrid
-    provenance: Array
-    free: VoxelGrid | None
-    contested: int = 0
+    def __getitem__(self, k: int, /) -> TopometricMap: ...
 
 
-def fuse(a: TopometricMap, b: TopometricMap, transform: Sim3) -> Fused:
-    """Cells of both maps on the lattice of a, at the finer of the two edge lengths.
+def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]]) -> TopometricMap:
+    """The joined map in the frame of the first one, at its edge length unless another one's cells are clearly finer.
+
+    Each cell carries the bit set of the maps that saw it: bit k for the kth pose; maps that are joined already keep their bits,
+    those of the next map follow. What one map saw empty and another one occupied is occupied: what moves (doors, chairs, people)
+    stands where it was seen.
 
     Args:
-        transform: T_ab.
+        maps: loaded one at a time.
+        poses: which maps, with T_0k; the first is the identity.
 
     Raises:
-        InputError: more maps together than a bit set holds.
+        InputError: more maps than provenance can tell apart.
     """
-    edge = _edge(a, b, transform)
-    moved = [resampled(m.grid, pose, a.grid.origin, edge) for m, pose in ((a, Sim3()), (b, transform))]
-    every = np.concatenate([cells for cells, _ in moved])
-    base = 2 * (every.min(axis=0) // 2) if len(every) else np.zeros(3, np.int64)  # even: free cells are twice as long
-    origin = a.grid.origin + base * edge
-    grid = VoxelGrid.from_cells(every - base, origin, edge)
-    provenance = np.zeros(len(grid), np.uint32)
-    for (cells, rows), bits in zip(moved, _bits(a, b), strict=True):
-        provenance[grid.rows(cells - base)] |= bits[rows]
-    free, contested = _free(a, b, transform, grid)
-    return Fused(grid, provenance, free, contested)
+    parts = [_Part.of(maps[k], pose) for k, pose in poses]
+    first_bits = np.cumsum([0, *(part.bits for part in parts)])
+    if first_bits[-1] > PROVENANCE_BITS:
+        raise InputError(
+            f"{len(poses)} maps are joined of {first_bits[-1]}; at most {PROVENANCE_BITS} can be told apart in one; merge fewer"
+        )
+    cells = _JoinedCells(maps[poses[0][0]].grid.origin, _edge(parts))
+    order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
+    for n in order:
+        k, pose = poses[n]
+        cells.add_map(maps[k], pose, int(first_bits[n]), parts[n].assumed and n != order[0])
+    name = " + ".join(maps[k].source or "map" for k, _ in poses)
+    return _extracted(cells, min(part.neighbours for part in parts), name)
 
 
-def join(a: TopometricMap, b: TopometricMap, transform: Sim3) -> TopometricMap:
-    """The joined map in a's frame: cells fused, rooms and doors extracted again.
+@dataclass(frozen=True)
+class _Part:
+    """What is asked of a map before it is fused: usual number of neighbours of a cell, number of provenance bits, edge length in
+    the joined frame, m, and whether its heights were assumed."""
+
+    neighbours: float
+    bits: int
+    edge: float
+    assumed: bool
+
+    @classmethod
+    def of(cls, map: TopometricMap, pose: Sim3) -> _Part:
+        bits = 1 if map.provenance is None else max(int(np.bitwise_or.reduce(map.provenance, initial=0)).bit_length(), 1)
+        return cls(_usual_neighbours(map.grid), bits, pose.scale * map.grid.edge, extruded(map.grid))
+
+
+def _edge(parts: Sequence[_Part]) -> float:
+    """m, of the joined cells: of the first map, unless another one's are clearly finer."""
+    edge = parts[0].edge
+    for part in parts:
+        if not part.assumed and part.edge < ALIKE_EDGES * edge:
+            edge = part.edge
+    return float(np.clip(edge, FINEST, COARSEST))
+
+
+class _JoinedCells:
+    """What is joined so far: cells by their Morton codes, ascending, and which maps saw them; codes of the free ones, which are
+    twice as long.
 
     Args:
-        transform: T_ab.
+        origin: (3,) m, corner of cell (0, 0, 0).
+        edge: of the cells, m.
     """
-    fused = fuse(a, b, transform)
-    name = f"{a.source or 'a'} + {b.source or 'b'}"
-    found = extract(fused.grid, name=name, carve=fused.free is None, noise=_noise(a, b, fused.grid))
+
+    def __init__(self, origin: Array, edge: float) -> None:
+        self.origin, self.edge = origin, edge
+        self.codes = self.free_codes = np.zeros(0, np.uint64)
+        self.provenance = np.zeros(0, np.uint32)
+
+    def add_map(self, map: TopometricMap, pose: Sim3, first_bit: int, assumed: bool) -> None:
+        """Add a map; of one whose heights were assumed only what no other saw."""
+        provenance = np.ones(len(map.grid), np.uint32) if map.provenance is None else map.provenance.astype(np.uint32)
+        cells, rows = resampled(map.grid, pose, self.origin, self.edge)
+        provenance = provenance[rows] << np.uint32(first_bit)
+        if assumed and len(cells):
+            added = self._contains(cells) | ~self._surveyed(cells)
+            cells, provenance = cells[added], provenance[added]
+        self._add(cells, provenance)
+        if map.free is not None:
+            free_cells = resampled(map.free, pose, self.origin, 2 * self.edge)[0]
+            self.free_codes = np.union1d(self.free_codes, _encoded(free_cells))
+
+    def _add(self, cells: Array, provenance: Array) -> None:
+        self.codes, row = np.unique(np.concatenate([self.codes, _encoded(cells)]), return_inverse=True)
+        joined = np.zeros(len(self.codes), np.uint32)
+        np.bitwise_or.at(joined, row, np.concatenate([self.provenance, provenance]))
+        self.provenance = joined
+
+    def _contains(self, cells: Array) -> Array:
+        """(n,) bool: is a cell there already?"""
+        return np.isin(_encoded(cells), self.codes)
+
+    def _surveyed(self, cells: Array) -> Array:
+        """(n,) bool: have the columns of cells, at the heights between the lowest and the highest of them, anything near?"""
+        occupied = _decoded(self.codes)
+        low, high = cells[:, 2].min(), cells[:, 2].max()
+        occupied = occupied[(occupied[:, 2] >= low - 3) & (occupied[:, 2] <= high + 3)]
+        if not len(occupied):
+            return np.zeros(len(cells), bool)
+        corner = np.minimum(occupied.min(axis=0), cells.min(axis=0))[:2]
+        shape = np.maximum(occupied.max(axis=0), cells.max(axis=0))[:2] - corner + 1
+        mask = np.zeros(shape, bool)
+        mask[tuple((occupied[:, :2] - corner).T)] = True
+        mask = ndimage.binary_dilation(mask, iterations=max(round(ASSUMED_MARGIN / self.edge), 1))
+        surveyed: Array = mask[tuple((cells[:, :2] - corner).T)]
+        return surveyed
+
+
+def _extracted(joined: _JoinedCells, neighbours: float, name: str) -> TopometricMap:
+    """Rooms and doors of what was joined.
+
+    Args:
+        neighbours: usual number of neighbours of a cell in the sparsest map. Where several maps saw a place cells are dense, and
+            floors that only the sparsest one saw must not count as noise beside them.
+    """
+    cells = _decoded(joined.codes)
+    base = 2 * (cells.min(axis=0) // 2)  # even: free cells are twice as long
+    grid = VoxelGrid.from_cells(cells - base, joined.origin + base * joined.edge, joined.edge)
+    provenance = np.zeros(len(grid), np.uint32)
+    provenance[grid.rows(cells - base)] = joined.provenance
+    free = None
+    if len(joined.free_codes):
+        free_cells = _decoded(joined.free_codes) - base // 2
+        free_cells = free_cells[((free_cells >= 0) & (free_cells < -(-np.array(grid.shape) // 2))).all(axis=1)]
+        x, y, z = (-(-s // 2) for s in grid.shape)
+        free = VoxelGrid.from_cells(free_cells, grid.origin, 2 * grid.edge, (x, y, z))
+        free = free.subset(~grid.coarser(2).contains(free.cells))
+    noise = PRESETS["default"].noise * min(neighbours / max(_usual_neighbours(grid), 1.0), 1.0)
+    map = extract(grid, name=name, carve=free is None, noise=noise)
     # Floors that the extraction assumes under slices are cells that no map saw.
-    rows = fused.grid.rows(fused.grid.locate(found.grid.centroids()))
-    provenance = np.where(rows >= 0, fused.provenance[rows], 0).astype(np.uint32)
-    return replace(found, provenance=provenance, free=found.free if fused.free is None else fused.free)
+    rows = grid.rows(grid.locate(map.grid.centroids()))
+    seen_by = np.where(rows >= 0, provenance[rows], 0).astype(np.uint32)
+    return replace(map, provenance=seen_by, free=map.free if free is None else free)
+
+
+def _usual_neighbours(grid: VoxelGrid) -> float:
+    """Median number of occupied neighbours of a cell."""
+    return float(np.median(convolve(grid, moore()))) if len(grid) else 0.0
+
+
+def resampled(grid: VoxelGrid, pose: Sim3, origin: Array, edge: float) -> tuple[Array, Array]:
+    """Cells (n, 3) int64 of a lattice that the moved cells of a grid fill, and the row (n,) of one that does.
+
+    Args:
+        pose: of the grid in the frame of the lattice.
+        origin: (3,) m, corner of the lattice's cell (0, 0, 0); cells may be negative.
+        edge: of the lattice's cells, m.
+    """
+    offset = (grid.origin - origin) / edge
+    if pose == Sim3() and abs(grid.edge - edge) < 1e-9 and np.allclose(offset, np.round(offset), atol=1e-6):
+        return grid.cells + np.round(offset).astype(np.int64), np.arange(len(grid))
+    blocks = list(_resampled_blocks(grid, pose, origin, edge))
+    if not blocks:
+        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
+    cells = np.concatenate([c for c, _ in blocks])
+    rows = np.concatenate([r for _, r in blocks])
+    _, first = np.unique(_encoded(cells), return_index=True)
+    return cells[first], rows[first]
+
+
+def _resampled_blocks(grid: VoxelGrid, pose: Sim3, origin: Array, edge: float) -> Iterator[tuple[Array, Array]]:
+    """`resampled` of some cells at a time; cells may come twice."""
+    ratio = pose.scale * grid.edge / edge
+    wide, tall = int(ratio * np.sqrt(0.5) + 0.5), int(ratio / 2 + 0.5)  # how far a cell reaches from the one its middle is in
+    flat = range(-wide, wide + 1)
+    around = np.array(list(product(flat, flat, range(-tall, tall + 1))))
+    back = pose.inverse()
+    for start in range(0, len(grid), RESAMPLED_AT_ONCE):
+        middles = pose.apply(grid.centroids(grid.cells[start : start + RESAMPLED_AT_ONCE]))
+        holding = np.floor((middles - origin) / edge).astype(np.int64)  # the cells that the middles lie in
+        cells = (holding[:, None] + around).reshape(-1, 3)
+        cells = cells[np.unique(_encoded(cells), return_index=True)[1]]
+        rows = grid.rows(grid.locate(back.apply(origin + (cells + 0.5) * edge)))
+        yield cells[rows >= 0], rows[rows >= 0]
+        yield holding, np.arange(start, start + len(holding))
+
+
+def _encoded(cells: Array) -> Array:
+    """(n,) uint64, one code for each cell within a million of the origin."""
+    return morton.encode((cells + CODE_OFFSET).astype(np.int32))
+
+
+def _decoded(codes: Array) -> Array:
+    """(n, 3) int64, the cells of `_encoded`."""
+    cells: Array = morton.decode(codes).astype(np.int64) - CODE_OFFSET
+    return cells
 
 
 def rooms_in_common(a: TopometricMap, b: TopometricMap, transform: Sim3) -> tuple[Array, Array]:
-    """(M, 2) rooms of a and of b that are one room under a transform, and (M,) 0..1 how much of their floor they share.
+    """(M, 2) rooms of a and of b that are one room under T_ab, and (M,) 0..1 how much of their floor they share.
 
     A room that is cut in two in the other map is in two rows.
     """
@@ -99,101 +246,18 @@ def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3) -> Arr
     Args:
         pose: of the part in the joined map.
     """
-    found = np.full(len(part.rooms), -1, np.int64)
+    rooms = np.full(len(part.rooms), -1, np.int64)
     inside = part.navigable_room >= 0
     cells = joined.navigable.locate(pose.apply(part.navigable.centroids(part.navigable.cells[inside])))
-    room = np.full(len(cells), -1, np.int64)
+    joined_room = np.full(len(cells), -1, np.int64)
     for up in (0, 1, -1, 2, -2):  # floors of two maps are seldom at one height to a cell
         rows = joined.navigable.rows(cells + (0, 0, up))
-        unknown = (room < 0) & (rows >= 0)
-        room[unknown] = joined.navigable_room[rows[unknown]]
-    for i, own in enumerate(np.split(*_by_room(part.navigable_room[inside], room, len(part.rooms)))[: len(part.rooms)]):
-        own = own[own >= 0]
-        if len(own):
-            found[i] = np.bincount(own).argmax()
-    return found
-
-
-def _by_room(owner: Array, values: Array, count: int) -> tuple[Array, Array]:
-    """Values sorted by their owner, and where each next owner begins."""
-    order = np.argsort(owner, kind="stable")
-    return values[order], np.cumsum(np.bincount(owner, minlength=count))
-
-
-def resampled(grid: VoxelGrid, pose: Sim3, origin: Array, edge: float) -> tuple[Array, Array]:
-    """Cells (n, 3) int64 of a lattice that the moved cells of a grid fill, and the row (n,) of one that does.
-
-    Args:
-        pose: of the grid in the frame of the lattice.
-        origin: (3,) m, corner of the lattice's cell (0, 0, 0); cells may be negative.
-        edge: of the lattice's cells, m.
-    """
-    offset = (grid.origin - origin) / edge
-    if pose == Sim3() and abs(grid.edge - edge) < 1e-9 and np.allclose(offset, np.round(offset), atol=1e-6):
-        return grid.cells + np.round(offset).astype(np.int64), np.arange(len(grid))
-    parts = list(_resampled(grid, pose, origin, edge))
-    if not parts:
-        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
-    cells = np.concatenate([c for c, _ in parts])
-    rows = np.concatenate([r for _, r in parts])
-    _, first = np.unique(_codes(cells), return_index=True)
-    return cells[first], rows[first]
-
-
-def _resampled(grid: VoxelGrid, pose: Sim3, origin: Array, edge: float) -> Iterator[tuple[Array, Array]]:
-    ratio = pose.scale * grid.edge / edge
-    wide, tall = int(ratio * np.sqrt(0.5) + 0.5), int(ratio / 2 + 0.5)  # how far a cell reaches from the one its middle is in
-    flat = range(-wide, wide + 1)
-    around = np.array(list(product(flat, flat, range(-tall, tall + 1))))
-    back = pose.inverse()
-    for start in range(0, len(grid), AT_ONCE):
-        at = pose.apply(grid.centroids(grid.cells[start : start + AT_ONCE]))
-        own = np.floor((at - origin) / edge).astype(np.int64)
-        cells = (own[:, None] + around).reshape(-1, 3)
-        cells = cells[np.unique(_codes(cells), return_index=True)[1]]
-        rows = grid.rows(grid.locate(back.apply(origin + (cells + 0.5) * edge)))
-        yield cells[rows >= 0], rows[rows >= 0]
-        yield own, np.arange(start, start + len(own))
-
-
-def _codes(cells: Array) -> Array:
-    """(n,) int64, one number for each cell within a million of the origin."""
-    x, y, z = (cells + (1 << 20)).T
-    codes: Array = (x << 42) | (y << 21) | z
-    return codes
-
-
-def _edge(a: TopometricMap, b: TopometricMap, transform: Sim3) -> float:
-    """m, of the joined cells."""
-    other = transform.scale * b.grid.edge
-    return float(np.clip(a.grid.edge if other >= ALIKE * a.grid.edge else other, FINEST, COARSEST))
-
-
-def _noise(a: TopometricMap, b: TopometricMap, joined: VoxelGrid) -> float:
-    """The preset's share of the usual number of neighbours below which a cell is noise, for the joined cells: where both maps saw
-    a place cells are dense, and floors that only the sparser one saw must not count as noise beside them."""
-    usual = [float(np.median(convolve(grid, moore()))) if len(grid) else 0.0 for grid in (a.grid, b.grid, joined)]
-    return PRESETS["default"].noise * min(min(usual[:2]) / max(usual[2], 1.0), 1.0)
-
-
-def _bits(a: TopometricMap, b: TopometricMap) -> tuple[Array, Array]:
-    """(n,) uint32 bit sets of the cells of both maps, so that no map of one has the bit of a map of the other."""
-    own = [np.ones(len(m.grid), np.uint32) if m.provenance is None else m.provenance.astype(np.uint32) for m in (a, b)]
-    count = [max(int(np.bitwise_or.reduce(bits, initial=0)).bit_length(), 1) for bits in own]
-    if sum(count) > MOST:
-        raise InputError(f"{a.source} and {b.source}: are joined of {sum(count)} maps; at most {MOST} can be told apart in one")
-    return own[0], own[1] << np.uint32(count[0])
-
-
-def _free(a: TopometricMap, b: TopometricMap, transform: Sim3, grid: VoxelGrid) -> tuple[VoxelGrid | None, int]:
-    """Free cells of both, twice as long as the occupied ones, and how many of them are occupied in the other map."""
-    edge = 2 * grid.edge
-    parts = [resampled(m.free, pose, grid.origin, edge)[0] for m, pose in ((a, Sim3()), (b, transform)) if m.free is not None]
-    if not parts:
-        return None, 0
-    every = np.concatenate(parts)
-    shape = tuple(-(-s // 2) for s in grid.shape)
-    every = every[((every >= 0) & (every < shape)).all(axis=1)]
-    free = VoxelGrid.from_cells(every, grid.origin, edge, (shape[0], shape[1], shape[2]))
-    taken = grid.coarser(2).contains(free.cells)
-    return free.subset(~taken), int(taken.sum())
+        missing = (joined_room < 0) & (rows >= 0)
+        joined_room[missing] = joined.navigable_room[rows[missing]]
+    part_room = part.navigable_room[inside]
+    for i in range(len(part.rooms)):
+        votes = joined_room[part_room == i]
+        votes = votes[votes >= 0]
+        if len(votes):
+            rooms[i] = np.bincount(votes).argmax()
+    return rooms

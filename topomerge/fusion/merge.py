@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,21 +13,17 @@ from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.join import join_many
+from topomerge.fusion.atlas.solve import AtlasResult, AtlasSettings, RegistrationsByPair, solve
 from topomerge.fusion.explanation import why
-from topomerge.fusion.fuse import rooms_in_common
-from topomerge.fusion.registration import Registration, _order, register
+from topomerge.fusion.fuse import fuse, rooms_in_common
+from topomerge.fusion.inputs import check_pair, check_poses, check_scale, checked_threshold, pair_warnings
+from topomerge.fusion.registration import _order, register
 from topomerge.fusion.result import STEPS, MergeResult, RoomMatch
 from topomerge.fusion.thesis.room_poses import room_poses
-from topomerge.fusion.verify import model
 from topomerge.matching.match import match
 from topomerge.matching.odds import match_probability
 from topomerge.matching.result import Matching
 from topomerge.types import Array, Sim3, TopometricMap
-
-POSES = ("search", "rooms")
-TOO_WIDE, WIDER = 300.0, 30.0  # m, and times the other map: a map that spans this is in another unit
-HIGHER = 2.2  # times the height of the other's storeys: the same, or a hall
 
 
 def merge(
@@ -55,37 +51,98 @@ def merge(
         InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale
             or the poses.
     """
-    if poses not in POSES:
-        raise InputError(f"poses must be {' or '.join(POSES)}, not {poses!r}")
-    if poses == "rooms" and (len(maps) > 2 or scale != "fixed"):
-        raise InputError("poses of rooms alone are for two maps of one scale; leave them out (--poses search)")
-    if len(maps) > 2:
-        from topomerge.fusion.atlas.merge import merge_many  # it stands above this file
+    check_poses(poses, len(maps), scale)
+    if len(maps) < 2:
+        raise InputError(f"merge takes two maps or more, {len(maps)} given; give another one")
+    check_scale(scale)
+    settings = _Settings(scale, force, threshold, embedder, poses)
+    return _merge_two(maps[0], maps[1], settings) if len(maps) == 2 else _merge_several(maps, settings)
 
-        return merge_many(maps, scale=scale, force=force, threshold=threshold, embedder=embedder)
-    a, b = _checked(maps, scale)
-    limit = float(model()["threshold"]) if threshold is None else float(threshold)
-    if not 0 <= limit <= 1:
-        raise InputError(f"threshold must be a probability between 0 and 1, not {threshold}")
+
+@dataclass(frozen=True)
+class _Settings:
+    """The keywords of `merge`."""
+
+    scale: str
+    force: bool
+    threshold: float | None
+    embedder: str | Descriptor
+    poses: str
+
+
+def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> MergeResult:
+    check_pair(a, b, settings.scale)
+    threshold = checked_threshold(settings.threshold)
     clock = _Clock()
-    known = _hypotheses(a, b, embedder, scale, poses, clock)
-    found = register(a, b, scale=scale, hypotheses=known, searched=poses == "search")
-    believed = found.transform is not None and found.probability >= limit
+    hypotheses = _room_hypotheses(a, b, settings, clock)
+    registration = register(a, b, scale=settings.scale, hypotheses=hypotheses, searched=settings.poses == "search")
+    believed = registration.transform is not None and registration.probability >= threshold
     result = MergeResult(
         "merged" if believed else "abstained",
-        found.probability,
-        why(found, limit, force),
+        registration.probability,
+        why(registration, threshold, settings.force),
         maps=(a, b),
-        registration=found,
-        warnings=tuple(_warnings(a, b, scale)),
-        descriptor=descriptor_name(embedder),
+        registration=registration,
+        warnings=tuple(pair_warnings(a, b, settings.scale)),
+        descriptor=descriptor_name(settings.embedder),
     )
-    pose = found.transform
-    if pose is None or not (believed or force):
+    pose = registration.transform
+    if pose is None or not (believed or settings.force):
         return replace(result, seconds=clock.all())
-    joined = join_many((a, b), [(0, Sim3()), (1, pose)])
-    matches = tuple(_matches(a, b, found))
+    joined = fuse((a, b), [(0, Sim3()), (1, pose)])
+    matches = tuple(_room_matches((a, b), (0, 1), pose, registration.probability))
     return replace(result, transforms={1: pose}, matches=matches, map=joined, seconds=clock.all())
+
+
+def _merge_several(maps: Sequence[TopometricMap], settings: _Settings) -> MergeResult:
+    """What an atlas brings together with the first map is joined; the reason names the maps that stand apart."""
+    began = time.perf_counter()
+    registrations: RegistrationsByPair = {}
+    descriptor = None if settings.embedder == DEFAULT else settings.embedder  # the default only says which pairs to try first
+    atlas_settings = AtlasSettings(settings.scale, settings.threshold, descriptor)
+    atlas = solve(maps, atlas_settings, registrations)
+    reason, status = atlas.words(), "merged" if _with_first(atlas)[1:] else "abstained"
+    if status == "abstained" and atlas.status != "abstained":
+        reason = f"not merged: {atlas.names[0]} stands apart; {reason}"
+    if settings.force and atlas.status != "merged":
+        reason += "; joined all the same, as was asked for (--force)"
+        atlas = solve(maps, replace(atlas_settings, threshold=0.0), registrations)
+    members, component = _with_first(atlas), atlas.component_of(0)
+    matches: list[RoomMatch] = []
+    for n, k in enumerate(members):
+        for m in members[n + 1 :]:
+            pose = atlas.transforms[k].inverse() @ atlas.transforms[m]
+            matches += _room_matches(maps, (k, m), pose, atlas.probability(component))
+    joined = atlas.joined(component) if len(members) > 1 else None
+    return MergeResult(
+        status,
+        atlas.probability(component),
+        reason,
+        transforms={k: atlas.transforms[k] for k in members[1:]},
+        matches=tuple(matches),
+        seconds={**dict.fromkeys(STEPS, 0.0), "fuse": time.perf_counter() - began},
+        map=joined,
+        maps=tuple(maps),
+        atlas=atlas,
+        warnings=atlas.warnings,
+        descriptor=descriptor_name(settings.embedder),
+    )
+
+
+def _with_first(atlas: AtlasResult) -> tuple[int, ...]:
+    """The maps that lie in the frame of the first one, itself included."""
+    return atlas.components[atlas.component_of(0)]
+
+
+def _room_matches(
+    maps: Sequence[TopometricMap], pair: tuple[int, int], pose: Sim3, merge_probability: float
+) -> Iterator[RoomMatch]:
+    """Rooms of two maps that lie in each other; a match is as probable as the merge times `match_probability`."""
+    a, b = maps[pair[0]], maps[pair[1]]
+    rooms, shared_floor = rooms_in_common(a, b, pose)
+    probabilities = merge_probability * match_probability(a, b, rooms, shared_floor)
+    for (i, j), p in zip(rooms.tolist(), probabilities.tolist(), strict=True):
+        yield RoomMatch(pair, (i, j), p)
 
 
 class _Clock:
@@ -109,78 +166,27 @@ class _Clock:
         return s
 
 
-def _checked(maps: Sequence[TopometricMap], scale: str) -> tuple[TopometricMap, TopometricMap]:
-    if len(maps) != 2:
-        raise InputError(f"merge takes two maps or more, {len(maps)} given; give another one")
-    if scale not in ("fixed", "free"):
-        raise InputError(f"scale must be fixed or free, not {scale!r}")
-    a, b = maps
-    for which, m in (("the first map", a), ("the second map", b)):
-        if not len(m.grid):
-            raise InputError(f"{m.source or which}: has no occupied cells, nothing can be merged")
-    same = len(a.grid) == len(b.grid) and np.array_equal(a.grid.cells, b.grid.cells)
-    if a is b or (same and np.allclose(a.grid.origin, b.grid.origin) and a.grid.edge == b.grid.edge):
-        name = b.source or "the second map"
-        raise InputError(f"{name}: is the same map as {a.source or 'the first'}; give two different maps")
-    if scale == "fixed":
-        _check_units(a, b)
-    return a, b
-
-
-def _check_units(a: TopometricMap, b: TopometricMap) -> None:
-    """A map that is far larger than any neighbour of the other is in centimetres or millimetres."""
-    wide = [float(np.hypot(*np.ptp(m.grid.cells[:, :2], axis=0))) * m.grid.edge for m in (a, b)]
-    big, small = (a, b) if wide[0] >= wide[1] else (b, a)
-    ratio = max(wide) / max(min(wide), small.grid.edge)
-    if max(wide) > TOO_WIDE and ratio > WIDER:
-        unit = "mm" if ratio > 300 else "cm"
-        spans = f"{big.source or 'one map'}: spans {max(wide):,.0f} m, {small.source or 'the other'} {min(wide):,.0f} m"
-        raise InputError(f"{spans}: the units seem to differ; extract it with --unit {unit}")
-
-
-def _warnings(a: TopometricMap, b: TopometricMap, scale: str) -> Iterator[str]:
-    for which, m in (("the first map", a), ("the second map", b)):
-        if len(m.rooms) == 0:
-            yield f"{m.source or which}: has no rooms: only walls and empty space can be compared"
-        elif len(m.rooms) == 1:
-            yield f"{m.source or which}: has one room: little can be compared"
-    high = [_storey_height(m) for m in (a, b)]
-    if scale == "fixed" and min(high) > 0 and max(high) > HIGHER * min(high):
-        tall, low = (a, b) if high[0] >= high[1] else (b, a)
-        names = tall.source or "one map", low.source or "the other"
-        yield f"{names[0]}: storeys are {max(high):.1f} m high, in {names[1]} {min(high):.1f} m: the units may differ"
-
-
-def _storey_height(m: TopometricMap) -> float:
-    """m, median floor to ceiling; 0 where none was seen."""
-    height = m.storeys["ceiling"] - m.storeys["floor"]
-    height = height[np.isfinite(height)]
-    return float(np.median(height)) if len(height) else 0.0
-
-
-def _hypotheses(
-    a: TopometricMap, b: TopometricMap, embedder: str | Descriptor, scale: str, poses: str, clock: _Clock
-) -> list[Sim3]:
+def _room_hypotheses(a: TopometricMap, b: TopometricMap, settings: _Settings, clock: _Clock) -> list[Sim3]:
     """Poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "rooms") of each by its surfaces."""
     if not len(a.rooms) or not len(b.rooms):
         return []
     if _order(b) < _order(a):  # as registration: nothing may depend on which comes first
-        return [h.inverse() for h in _hypotheses(b, a, embedder, scale, poses, clock)]
-    describe = _timed(embedder, clock)
+        return [h.inverse() for h in _room_hypotheses(b, a, settings, clock)]
+    describe = _timed(settings.embedder, clock)
     with clock("match"):
-        if poses == "rooms":
-            return _of_rooms(a, b, match(a, b, describe, "growing"))
-        return [h.transform for h in match(a, b, describe, scale_free=scale == "free").alternatives]
+        if settings.poses == "rooms":
+            return _surface_hypotheses(a, b, match(a, b, describe, "growing"))
+        return [h.transform for h in match(a, b, describe, scale_free=settings.scale == "free").alternatives]
 
 
-def _of_rooms(a: TopometricMap, b: TopometricMap, found: Matching) -> list[Sim3]:
-    """Poses of the pairs of rooms that any hypothesis holds, each pair by its surfaces."""
-    likely: dict[tuple[int, ...], float] = {}
-    for h in found.alternatives:
+def _surface_hypotheses(a: TopometricMap, b: TopometricMap, matching: Matching) -> list[Sim3]:
+    """Poses T_ab of the pairs of rooms that any hypothesis holds, each pair by its surfaces."""
+    probabilities: dict[tuple[int, ...], float] = {}
+    for h in matching.alternatives:
         for pair in h.rooms.tolist():
-            likely[tuple(pair)] = likely.get(tuple(pair), 0.0) + h.probability
-    rooms = np.array(sorted(likely), np.int64).reshape(-1, 2)
-    weights = np.array([likely[i, j] for i, j in rooms.tolist()])
+            probabilities[tuple(pair)] = probabilities.get(tuple(pair), 0.0) + h.probability
+    rooms = np.array(sorted(probabilities), np.int64).reshape(-1, 2)
+    weights = np.array([probabilities[i, j] for i, j in rooms.tolist()])
     return [pose for pose, _ in room_poses(a, b, rooms, weights)]
 
 
@@ -192,12 +198,3 @@ def _timed(embedder: str | Descriptor, clock: _Clock) -> Descriptor:
             return describe(m)
 
     return timed
-
-
-def _matches(a: TopometricMap, b: TopometricMap, found: Registration) -> Iterator[RoomMatch]:
-    """Rooms that lie in each other; a match is as probable as the merge times `match_probability`."""
-    assert found.transform is not None
-    rooms, fit = rooms_in_common(a, b, found.transform)
-    chance = found.probability * match_probability(a, b, rooms, fit)
-    for (i, j), p in zip(rooms.tolist(), chance.tolist(), strict=True):
-        yield RoomMatch((0, 1), (i, j), p)

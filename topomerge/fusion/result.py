@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 from topomerge.fusion.registration import Registration
 from topomerge.io.listing import plain
 from topomerge.types import Sim3, TopometricMap
+from topomerge.writers import WRITERS
 
 if TYPE_CHECKING:
-    from topomerge.fusion.atlas.solve import AtlasResult
+    from topomerge.fusion.atlas.result import AtlasResult
 
-FORMAT = 1
+MERGE_FORMAT = 1
 STEPS = ("read", "extract", "embed", "match", "fuse")
 
 
@@ -35,7 +36,7 @@ class RoomMatch:
 
 @dataclass(frozen=True, eq=False)
 class MergeResult:
-    """What `merge` found.
+    """What `merge` gives.
 
     Args:
         status: "merged" or "abstained".
@@ -83,19 +84,17 @@ class MergeResult:
         Raises:
             InputError: the folder can't be made or written.
         """
-        from topomerge import save_merge  # by the package's face: the report stands above fusion
-
-        save_merge(self, folder)
+        WRITERS["merge"](self, folder)
 
 
 def merge_to_json(result: MergeResult) -> dict[str, Any]:
     """`merge.json` as plain values: see docs/outputs.md. Numbers are not rounded: national grids need all digits."""
     registration = result.registration
     rmse = registration.features.get("rmse", float("nan")) if registration else float("nan")
-    off = result.atlas.residuals if result.atlas else {1: rmse}
-    transforms = {str(k): transform_to_json(pose, off[k]) for k, pose in result.transforms.items()}
+    residuals = result.atlas.residuals if result.atlas else {1: rmse}
+    transforms = {str(k): transform_to_json(pose, residuals[k]) for k, pose in result.transforms.items()}
     listing = {
-        "format": FORMAT,
+        "format": MERGE_FORMAT,
         "status": result.status,
         "probability": min(max(float(result.probability), 0.0), 1.0),
         "reason": result.reason,
@@ -105,8 +104,8 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
         "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],
         "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in STEPS},
     }
-    out: dict[str, Any] = plain(listing)
-    return out
+    plain_listing: dict[str, Any] = plain(listing)
+    return plain_listing
 
 
 def transform_to_json(pose: Sim3, rmse: float, into: int = 0) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.fusion.atlas.solve import AtlasResult
+from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.explanation import chance
 from topomerge.types import Array, Sim3, TopometricMap
 from topomerge.viz.markup import Markup, element, join
@@ -74,10 +74,10 @@ def _links(found: AtlasResult) -> Markup:
         rows = [(*_pair(found, x.maps), chance(x.hypothesis.probability), chance(x.probability)) for x in found.links]
         words = "Every other two maps that a link brings over each other say what they think of it."
         parts += [element("p", words, class_="note"), _texts(("map", "map", "by itself", "with all that is said"), rows)]
-    if found.thrown:
+    if found.rejected:
         out = [
             (*_pair(found, x.maps), chance(x.hypothesis.probability), _names(found, x.against) if x.against else "other maps")
-            for x in found.thrown
+            for x in found.rejected
         ]
         parts += [element("h3", "Thrown out"), _texts(("map", "map", "by itself", "contradicted by"), out)]
     tried = f"{found.registered[0]} of {found.registered[1]} pairs were searched in each other, in {found.seconds:.1f} s."

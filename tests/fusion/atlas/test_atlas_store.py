@@ -25,7 +25,7 @@ def named(*numbers: int) -> list[tuple[str, tm.TopometricMap]]:
 def built(tmp_path_factory) -> Path:
     """West, east and a stranger, added at once."""
     folder = tmp_path_factory.mktemp("atlas") / "built"
-    add(folder, named(0, 2, 4))
+    add(folder, named(0, 2, 4), tm.atlas_html)
     return folder
 
 
@@ -66,10 +66,10 @@ def test_what_is_written(built):
 
 def test_adding_later_is_building_at_once(built, tmp_path):
     later = tmp_path / "later"
-    add(later, named(0))
+    add(later, named(0), tm.atlas_html)
     assert told(later)["reason"].startswith("one map") and not (later / "map_0.tmap").exists()
-    add(later, named(2))
-    add(later, named(4))
+    add(later, named(2), tm.atlas_html)
+    add(later, named(4), tm.atlas_html)
     assert told(later) == told(built) and names(later) == WHOLE
     a, b = tm.load_map(later / "map_0.tmap"), tm.load_map(built / "map_0.tmap")
     assert np.array_equal(a.grid.cells, b.grid.cells) and np.array_equal(a.provenance, b.provenance)
@@ -79,14 +79,14 @@ def test_adding_later_is_building_at_once(built, tmp_path):
 def test_taking_out_takes_back(folder, built):
     before = told(built)
     registered = (folder / "pairs.json").read_bytes()
-    remove(folder, ["east"])
+    remove(folder, ["east"], tm.atlas_html)
     assert names(folder) == ["atlas.json", "maps/stranger.tmap", "maps/west.tmap", "pairs.json", "report.html"]
     assert told(folder)["status"] == "abstained" and not told(folder)["transforms"]
     assert len((folder / "pairs.json").read_bytes()) < len(registered)
-    add(folder, named(2))
+    add(folder, named(2), tm.atlas_html)
     assert [c["names"] for c in told(folder)["components"]] == [["west", "east"], ["stranger"]]
     assert told(folder)["components"][0]["made_of"] == before["components"][0]["made_of"]
-    remove(folder, ["west", "east", "stranger"])
+    remove(folder, ["west", "east", "stranger"], tm.atlas_html)
     assert names(folder) == ["atlas.json", "pairs.json", "report.html"] and told(folder)["reason"] == "no map"
 
 
@@ -95,14 +95,14 @@ def test_registrations_are_made_once(folder, monkeypatch):
         raise AssertionError("registered again")
 
     monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", fail)
-    monkeypatch.setattr("topomerge.fusion.atlas.join.extract", fail)
-    remove(folder, ["stranger"])  # the joined map of the others stays what it was
+    monkeypatch.setattr("topomerge.fusion.fuse.extract", fail)
+    remove(folder, ["stranger"], tm.atlas_html)  # the joined map of the others stays what it was
     assert told(folder)["status"] == "merged" and tm.load_map(folder / "map_0.tmap").source == "west + east"
 
 
 def test_maps_of_one_name_and_maps_twice(folder):
     with pytest.raises(InputError, match="west: is in the atlas already, as west"):
-        add(folder, named(0))
+        add(folder, named(0), tm.atlas_html)
     assert names(folder) == WHOLE
     entries = read_atlas(folder).entries
     assert [_free_name(n, entries) for n in ("West", "attic", "../..", ".")] == ["West-2", "attic", "_", "map"]
@@ -110,16 +110,16 @@ def test_maps_of_one_name_and_maps_twice(folder):
 
 def test_damage_is_told_in_one_line(folder):
     with pytest.raises(InputError, match="attic: is no map of .*; it holds west, east, stranger"):
-        remove(folder, ["attic"])
+        remove(folder, ["attic"], tm.atlas_html)
     with pytest.raises(InputError, match="no such folder"):
         read_atlas(folder / "none")
     (folder / "pairs.json").write_text("{")  # it is remembered anew
     shutil.copy(folder / "maps" / "west.tmap", folder / "maps" / "east.tmap")
     with pytest.raises(InputError, match="east.tmap: "):
-        remove(folder, ["stranger"])
+        remove(folder, ["stranger"], tm.atlas_html)
     (folder / "maps" / "east.tmap").unlink()
     with pytest.raises(InputError, match="east.tmap: no such file"):
-        remove(folder, ["stranger"])
+        remove(folder, ["stranger"], tm.atlas_html)
     text = (folder / "atlas.json").read_text()
     for wrong, words in (
         (text[:-40], "damaged"),
@@ -134,10 +134,10 @@ def test_damage_is_told_in_one_line(folder):
         assert "\n" not in str(error.value)
     (folder / "atlas.json").unlink()
     with pytest.raises(InputError, match="atlas.json is missing"):
-        add(folder, named(1))
+        add(folder, named(1), tm.atlas_html)
     (folder / "file").write_text("")
     with pytest.raises(InputError, match="is a file"):
-        add(folder / "file", named(1))
+        add(folder / "file", named(1), tm.atlas_html)
 
 
 def test_a_failure_changes_nothing(folder, monkeypatch, tmp_path):
@@ -147,11 +147,11 @@ def test_a_failure_changes_nothing(folder, monkeypatch, tmp_path):
     before = told(folder)
     monkeypatch.setattr("topomerge.fusion.atlas.store.link_or_copy", fail)
     with pytest.raises(InputError, match="disk full"):
-        remove(folder, ["stranger"])
+        remove(folder, ["stranger"], tm.atlas_html)
     assert told(folder) == before and names(folder) == WHOLE
     monkeypatch.setattr("topomerge.fusion.atlas.store.save_map", fail)
     with pytest.raises(InputError):
-        add(tmp_path / "new", named(0, 2))
+        add(tmp_path / "new", named(0, 2), tm.atlas_html)
     assert not (tmp_path / "new").exists()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from topomerge.fusion.atlas.pose_graph import Measured, optimise, residual
-from topomerge.fusion.average import difference
+from topomerge.fusion.pose_difference import pose_difference
 from topomerge.types import Sim3
 
 PLACE = np.array([[4.0, 3.0, 0.5], [8.0, 3.0, 0.5], [0.0, 3.0, 0.5], [4.0, 6.0, 0.5], [4.0, 0.0, 0.5]])
@@ -42,7 +42,7 @@ def started(poses: dict[int, Sim3], rng: np.random.Generator) -> dict[int, Sim3]
 
 
 def worst(found: dict[int, Sim3], true: dict[int, Sim3]) -> tuple[float, float, float]:
-    gaps = np.array([difference(found[k], true[k], PLACE[0]) for k in true])
+    gaps = np.array([pose_difference(found[k], true[k], PLACE[0]) for k in true])
     return tuple(gaps.max(axis=0).tolist())  # type: ignore[return-value]
 
 

@@ -2,7 +2,7 @@
 
 Links are taken in the order of their probability, as in a maximum spanning tree, but each is heard before: every two maps that it
 would bring over each other say what they think of that, its own two if they contradict it. What contradicts better evidence is
-thrown out, and named.
+rejected, and named.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ from topomerge.fusion.atlas.pose_graph import Measured, optimise
 from topomerge.types import Sim3
 
 BACKING = 1.5  # log odds that other maps may add: look-alikes of a place are alike to all maps of it
-VOICE, LOUD = 3.0, -2.0  # log odds of one of them at most, and below which nothing makes up for it
-FOUND = 4.0  # log odds that an independent registration which finds the same place adds to its own
-DOUBT = 0.3  # a hypothesis more probable than that contradicts another place
-BELIEVED = 0.5
-BETTER = 0.5  # log odds by which another link must be better to take a link's place
-HEAVY = 20.0  # m2 of walls in common, above which a measurement counts no more
+VOICE_MOST = 3.0  # log odds that one of them adds at most
+VOICE_VETO = -2.0  # log odds of one of them, below which nothing makes up for it
+SAME_PLACE = 4.0  # log odds that an independent registration which gives the same place adds to its own
+DOUBT = 0.3  # probability: a hypothesis above it contradicts another place
+BELIEVED = 0.5  # probability
+EXCHANGE_GAIN = 0.5  # log odds by which another link must be better to take a link's place
+HEAVIEST_WALLS = 20.0  # m2 of walls in common, above which a measurement counts no more
 Hypotheses = Mapping[tuple[int, int], tuple[Hypothesis, ...]]
 Poses = Mapping[int, Sim3]
 
 
 @dataclass(frozen=True)
 class Link:
-    """A hypothesis that was taken, or thrown out.
+    """A hypothesis that was taken, or rejected.
 
     Args:
         maps: i and j; `hypothesis` is the pose T_ij.
@@ -54,7 +55,7 @@ class Assembly:
 
     components: list[dict[int, Sim3]]
     links: list[Link] = field(default_factory=list)
-    thrown: list[Link] = field(default_factory=list)
+    rejected: list[Link] = field(default_factory=list)
 
     def of(self, k: int) -> dict[int, Sim3]:
         """The component of a map."""
@@ -62,65 +63,67 @@ class Assembly:
 
 
 class Assembler:
-    """Builds assemblies of `count` maps from the hypotheses that are known.
+    """Builds assemblies of `count` maps from the hypotheses of their pairs.
 
     Args:
+        hypotheses: by pair, most probable first; pairs may be added between two assemblies.
         limit: log odds from which a link is believed.
+        scaled: are the scales free, too?
     """
 
-    def __init__(self, count: int, known: Hypotheses, checks: Checks, limit: float, scaled: bool = False) -> None:
-        self.count, self.known, self.checks, self.limit, self.scaled = count, known, checks, limit, scaled
+    def __init__(self, count: int, hypotheses: Hypotheses, checks: Checks, limit: float, scaled: bool = False) -> None:
+        self.count, self.hypotheses, self.checks, self.limit, self.scaled = count, hypotheses, checks, limit, scaled
 
     def build(self) -> Assembly:
         """The most probable assembly without contradictions."""
         banned: set[tuple[int, int]] = set()
         while True:  # ends: each time one more pair is banned
-            found = self._grown(banned)
-            self._exchange(found)
-            links = self._heard(found)
+            assembly = self._grown(banned)
+            self._exchange(assembly)
+            links = self._heard(assembly)
             weak = [link for link in links if link.log_odds < self.limit]
             if not weak:
                 break
             banned.add(min(weak, key=lambda link: link.log_odds).maps)
-        found.links = links
-        found.thrown = self._thrown(found)
-        return found
+        assembly.links = links
+        assembly.rejected = self._rejected(assembly)
+        return assembly
 
     def _candidates(self, banned: set[tuple[int, int]]) -> list[tuple[tuple[int, int], Hypothesis]]:
         """Hypotheses that could be believed with all backing, most probable first."""
-        every = [(pair, h) for pair, hs in self.known.items() if pair not in banned for h in hs]
-        every = [(pair, h) for pair, h in every if h.log_odds + self._most(pair, h) >= self.limit]
-        return sorted(every, key=lambda e: (-e[1].log_odds, e[0]))
+        candidates = [(pair, h) for pair, hs in self.hypotheses.items() if pair not in banned for h in hs]
+        candidates = [(pair, h) for pair, h in candidates if h.log_odds + self._backing(pair, h) >= self.limit]
+        return sorted(candidates, key=lambda e: (-e[1].log_odds, e[0]))
 
-    def _most(self, pair: tuple[int, int], h: Hypothesis) -> float:
+    def _backing(self, pair: tuple[int, int], h: Hypothesis) -> float:
         """Log odds that backing may add: it may tell a hypothesis from its rivals, and speak for it."""
-        every = min(sum(other.probability for other in self.known[pair]), 0.999)
-        return max(Hypothesis(h.pose, every).log_odds - h.log_odds, 0.0) + BACKING
+        any_of_them = min(sum(other.probability for other in self.hypotheses[pair]), 0.999)
+        return max(Hypothesis(h.pose, any_of_them).log_odds - h.log_odds, 0.0) + BACKING
 
     def _grown(self, banned: set[tuple[int, int]]) -> Assembly:
-        found = Assembly([{k: Sim3()} for k in range(self.count)])
+        assembly = Assembly([{k: Sim3()} for k in range(self.count)])
         candidates = self._candidates(banned)
         again = True
         while again:
             again = False
             for pair, h in candidates:
-                a, b = found.of(pair[0]), found.of(pair[1])
+                a, b = assembly.of(pair[0]), assembly.of(pair[1])
                 if a is b:
                     continue
                 link = self.heard(a, b, pair, h)
                 if link.log_odds >= self.limit:
-                    self._join(found, a, b, link)
+                    self._join(assembly, a, b, link)
                     again = True
                     break
-        return found
+        return assembly
 
-    def _join(self, found: Assembly, a: dict[int, Sim3], b: dict[int, Sim3], link: Link) -> None:
+    def _join(self, assembly: Assembly, a: dict[int, Sim3], b: dict[int, Sim3], link: Link) -> None:
         """Bring component b into a's frame, and settle all poses."""
         move = across(a, b, link.maps, link.hypothesis.pose)
         joined = {**a, **{k: move @ pose for k, pose in b.items()}}
-        found.components = [c for c in found.components if c is not a and c is not b]
-        found.links.append(link)
-        found.components.append(self.settled(joined, found.links)[0])
+        assembly.components = [c for c in assembly.components if c is not a and c is not b]
+        assembly.links.append(link)
+        assembly.components.append(self.settled(joined, assembly.links)[0])
 
     def heard(self, a: Poses, b: Poses, pair: tuple[int, int], h: Hypothesis, rival_of: tuple[int, int] | None = None) -> Link:
         """A link between two components with what all their maps say to it.
@@ -130,8 +133,8 @@ class Assembler:
         """
         move = across(a, b, pair, h.pose)
         place = {**a, **{j: move @ pose for j, pose in b.items()}}
-        own = self.checks(*pair, place[pair[0]].inverse() @ place[pair[1]])
-        backing, against, loudest, worst = 0.0, own.log_odds if own.log_odds < LOUD else 0.0, None, 0.0
+        pair_check = self.checks(*pair, place[pair[0]].inverse() @ place[pair[1]])
+        backing, against, loudest, worst = 0.0, pair_check.log_odds if pair_check.log_odds < VOICE_VETO else 0.0, None, 0.0
         for one, two in ((min(i, j), max(i, j)) for i in a for j in b):
             if (one, two) in (pair, rival_of):
                 continue
@@ -141,96 +144,96 @@ class Assembler:
                 said = min(said, -max(other_odds + 1.0, 0.0))
             elif other is not None:
                 said = min(said, -other.log_odds - 1.0)
-            if said > LOUD:
+            if said > VOICE_VETO:
                 backing += said
             else:
                 against += said
             if said < worst:
                 loudest, worst = (one, two), said
-        return Link(pair, h, h.log_odds + min(backing, self._most(pair, h)) + against, loudest)
+        return Link(pair, h, h.log_odds + min(backing, self._backing(pair, h)) + against, loudest)
 
     def _voice(self, i: int, j: int, pose: Sim3) -> tuple[float, Hypothesis | None]:
         """What maps i < j say to a pose T_ij that other maps propose, log odds; and their own claim, if it is another one."""
         check = self.checks(i, j, pose)
-        best = next(iter(self.known.get((i, j), ())), None)
+        best = next(iter(self.hypotheses.get((i, j), ())), None)
         if best is None:
             return check.log_odds, None
         if self.agrees(i, j, best.pose, pose):
-            return max(check.log_odds, float(np.clip(best.log_odds + FOUND, 0.0, VOICE))), None
+            return max(check.log_odds, float(np.clip(best.log_odds + SAME_PLACE, 0.0, VOICE_MOST))), None
         return check.log_odds, best if best.probability > DOUBT else None
 
     def agrees(self, i: int, j: int, p: Sim3, q: Sim3) -> bool:
         """Are two poses T_ij one, where the maps overlap?"""
         return alike(p, q, self.checks.place(i, j, p).mean(axis=0))
 
-    def _heard(self, found: Assembly) -> list[Link]:
+    def _heard(self, assembly: Assembly) -> list[Link]:
         """The links as they are seen now that everything is in its place."""
-        out = []
-        for link in found.links:
-            a, b = self._parted(found, link)
+        links = []
+        for link in assembly.links:
+            a, b = self._parted(assembly, link)
             i, j = link.maps
             seen = self.heard(a, b, link.maps, replace(link.hypothesis, pose=a[i].inverse() @ b[j]))
-            out.append(replace(seen, hypothesis=link.hypothesis))
-        return out
+            links.append(replace(seen, hypothesis=link.hypothesis))
+        return links
 
-    def _parted(self, found: Assembly, link: Link) -> tuple[dict[int, Sim3], dict[int, Sim3]]:
+    def _parted(self, assembly: Assembly, link: Link) -> tuple[dict[int, Sim3], dict[int, Sim3]]:
         """The two components that a link holds together: that of its first map, and the other one."""
-        whole = found.of(link.maps[0])
-        side, left = {link.maps[0]}, [other.maps for other in found.links if other is not link]
+        component = assembly.of(link.maps[0])
+        side, left = {link.maps[0]}, [other.maps for other in assembly.links if other is not link]
         grown = True
         while grown:
             new = {k for pair in left if side & set(pair) for k in pair} - side
             side |= new
             grown = bool(new)
-        return {k: p for k, p in whole.items() if k in side}, {k: p for k, p in whole.items() if k not in side}
+        return {k: p for k, p in component.items() if k in side}, {k: p for k, p in component.items() if k not in side}
 
-    def _contradicted(self, found: Assembly) -> Iterator[tuple[tuple[int, int], Hypothesis]]:
+    def _contradicted(self, assembly: Assembly) -> Iterator[tuple[tuple[int, int], Hypothesis]]:
         """Best hypotheses of pairs that lie elsewhere in their component."""
-        for (i, j), hypotheses in sorted(self.known.items()):
-            own = found.of(i)
-            if not hypotheses or j not in own or hypotheses[0].probability < BELIEVED:
+        for (i, j), hypotheses in sorted(self.hypotheses.items()):
+            poses = assembly.of(i)
+            if not hypotheses or j not in poses or hypotheses[0].probability < BELIEVED:
                 continue
-            if not self.agrees(i, j, hypotheses[0].pose, own[i].inverse() @ own[j]):
+            if not self.agrees(i, j, hypotheses[0].pose, poses[i].inverse() @ poses[j]):
                 yield (i, j), hypotheses[0]
 
-    def _exchange(self, found: Assembly) -> None:
+    def _exchange(self, assembly: Assembly) -> None:
         """Put contradicted hypotheses in the place of links, where everything agrees better then."""
         for _ in range(2 * self.count):
-            change = next(self._better(found), None)
+            change = next(self._better(assembly), None)
             if change is None:
                 return
             old, new, (a, b) = change
-            found.components = [c for c in found.components if old.maps[0] not in c] + [a, b]
-            found.links = [link for link in found.links if link is not old]
+            assembly.components = [c for c in assembly.components if old.maps[0] not in c] + [a, b]
+            assembly.links = [link for link in assembly.links if link is not old]
             first, second = (a, b) if new.maps[0] in a else (b, a)
-            self._join(found, first, second, new)
+            self._join(assembly, first, second, new)
 
-    def _better(self, found: Assembly) -> Iterator[tuple[Link, Link, tuple[dict[int, Sim3], dict[int, Sim3]]]]:
-        for pair, h in self._contradicted(found):
-            for link in found.links:
-                a, b = self._parted(found, link) if link.maps[0] in found.of(pair[0]) else ({}, {})
+    def _better(self, assembly: Assembly) -> Iterator[tuple[Link, Link, tuple[dict[int, Sim3], dict[int, Sim3]]]]:
+        for pair, h in self._contradicted(assembly):
+            for link in assembly.links:
+                a, b = self._parted(assembly, link) if link.maps[0] in assembly.of(pair[0]) else ({}, {})
                 first, second = (a, b) if pair[0] in a else (b, a)
                 if pair[0] not in first or pair[1] not in second:
                     continue
                 i, j = link.maps
                 now = self.heard(a, b, link.maps, replace(link.hypothesis, pose=a[i].inverse() @ b[j]))
                 then = self.heard(first, second, pair, h)
-                if then.log_odds >= max(now.log_odds + BETTER, self.limit):
+                if then.log_odds >= max(now.log_odds + EXCHANGE_GAIN, self.limit):
                     yield link, then, (a, b)
 
-    def _thrown(self, found: Assembly) -> list[Link]:
+    def _rejected(self, assembly: Assembly) -> list[Link]:
         """Hypotheses that were believed by themselves and contradict the rest."""
-        out = [Link(pair, h, -h.log_odds, self._weakest(found, pair)) for pair, h in self._contradicted(found)]
-        for (i, j), hypotheses in sorted(self.known.items()):
-            a, b = found.of(i), found.of(j)
+        rejected = [Link(pair, h, -h.log_odds, self._weakest(assembly, pair)) for pair, h in self._contradicted(assembly)]
+        for (i, j), hypotheses in sorted(self.hypotheses.items()):
+            a, b = assembly.of(i), assembly.of(j)
             if a is not b and hypotheses and hypotheses[0].log_odds >= self.limit:
-                out.append(self.heard(a, b, (i, j), hypotheses[0]))
-        return out
+                rejected.append(self.heard(a, b, (i, j), hypotheses[0]))
+        return rejected
 
-    def _weakest(self, found: Assembly, pair: tuple[int, int]) -> tuple[int, int] | None:
+    def _weakest(self, assembly: Assembly, pair: tuple[int, int]) -> tuple[int, int] | None:
         """The link on the way between two maps that says most against their hypothesis."""
-        held = [link for link in found.links if link.maps[0] in found.of(pair[0])]
-        between = [link for link in held if len(set(pair) & set(self._parted(found, link)[0])) == 1]
+        links = [link for link in assembly.links if link.maps[0] in assembly.of(pair[0])]
+        between = [link for link in links if len(set(pair) & set(self._parted(assembly, link)[0])) == 1]
         return min(between, key=lambda link: link.log_odds).maps if between else None
 
     def settled(self, poses: Poses, links: Sequence[Link], fine: bool = False) -> tuple[dict[int, Sim3], list[Measured]]:
@@ -239,16 +242,16 @@ class Assembler:
         return optimise(poses, edges, self.scaled, min(poses)), edges
 
     def _measured(self, poses: Poses, links: Sequence[Link], fine: bool) -> Iterator[Measured]:
-        held = {link.maps: link.hypothesis.pose for link in links}
+        link_poses = {link.maps: link.hypothesis.pose for link in links}
         names = sorted(poses)
         for i in names:
             for j in (k for k in names if k > i):
                 check = self.checks(i, j, poses[i].inverse() @ poses[j])
-                if (i, j) in held and not check.overlap:
-                    check = Check(held[i, j], 0.0, True, {"walls": 1.0})
-                if check.overlap and ((i, j) in held or self._voice(i, j, poses[i].inverse() @ poses[j])[0] > 0):
+                if (i, j) in link_poses and not check.overlap:
+                    check = Check(link_poses[i, j], 0.0, True, {"walls": 1.0})
+                if check.overlap and ((i, j) in link_poses or self._voice(i, j, poses[i].inverse() @ poses[j])[0] > 0):
                     pose = self.checks.fine(i, j, check.pose) if fine else check.pose
-                    weight = float(np.clip(check.features["walls"], 0.5, HEAVY))
+                    weight = float(np.clip(check.features["walls"], 0.5, HEAVIEST_WALLS))
                     yield Measured((i, j), pose, self.checks.place(i, j, pose), weight)
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from topomerge.errors import InputError
 
 NEW, NEXT, LOCK, GONE = ".new", ".next", ".lock", "gone.json"
-OWN = {NEW, NEXT, LOCK}
 
 
 @contextmanager
@@ -24,13 +23,13 @@ def changing(folder: Path, gone: list[str]) -> Iterator[Path]:
     """Yield an empty folder for files that replace those of the same names if all goes well; on any error nothing changes.
 
     Args:
-        folder: made if it is not there.
+        folder: created if it is not there.
         gone: names of files that shall be deleted; read at the end.
 
     Raises:
         InputError: the folder can't be written, or another change is under way.
     """
-    made = not folder.exists()
+    created = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder):
@@ -48,7 +47,7 @@ def changing(folder: Path, gone: list[str]) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"{folder}: can't be written ({error.strerror or error}); give the name of a folder") from error
     finally:
-        if made and folder.is_dir() and {p.name for p in folder.iterdir()} <= OWN - {NEXT}:
+        if created and folder.is_dir() and {p.name for p in folder.iterdir()} <= {NEW, LOCK}:
             shutil.rmtree(folder, ignore_errors=True)
 
 

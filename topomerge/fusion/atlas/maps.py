@@ -1,4 +1,4 @@
-"""The maps of an atlas: plans of all are kept, the cells of those that are files only while they are needed."""
+"""The maps of an atlas: plans of all stay in memory, the cells of those that are files only while they are needed."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from topomerge.fusion.registration import Prepared, prepare
 from topomerge.io.maps import load_map
 from topomerge.types import Array, TopometricMap
 
-AT_ONCE = 3  # maps in memory, of those that are files
-SURFACES = 8  # of maps that are kept for the fine registration
+LOADED_AT_ONCE = 3  # maps in memory, of those that are files
+SURFACES_AT_ONCE = 8  # surfaces in memory, for the fine registration
 T = TypeVar("T")
 
 
@@ -36,7 +36,7 @@ class Maps:
         self._maps = list(maps)
         self.matched = embedder is not None
         self._describe = make_embedder(embedder or DEFAULT)
-        self._recent: OrderedDict[int, TopometricMap] = OrderedDict()
+        self._loaded: OrderedDict[int, TopometricMap] = OrderedDict()
         self._surfaces: OrderedDict[int, Surface] = OrderedDict()
         self._rows: dict[int, Array] = {}
         self._prepared: dict[int, Prepared] = {}
@@ -45,8 +45,10 @@ class Maps:
         return len(self._maps)
 
     def __getitem__(self, k: int) -> TopometricMap:
-        known = self._maps[k]
-        return known if isinstance(known, TopometricMap) else _recent(self._recent, k, AT_ONCE, lambda: load_map(known))
+        source = self._maps[k]
+        if isinstance(source, TopometricMap):
+            return source
+        return _recent(self._loaded, k, LOADED_AT_ONCE, lambda: load_map(source))
 
     def prepared(self, k: int) -> Prepared:
         """Plans, for registration."""
@@ -56,7 +58,7 @@ class Maps:
 
     def surface(self, k: int) -> Surface:
         """Points and normals, for the fine registration."""
-        return _recent(self._surfaces, k, SURFACES, lambda: surface(self[k].grid))
+        return _recent(self._surfaces, k, SURFACES_AT_ONCE, lambda: surface(self[k].grid))
 
     def area(self, k: int) -> float:
         """Floor area, m2, of what is known from above."""
@@ -69,14 +71,14 @@ class Maps:
         return self._rows[k]
 
 
-def _recent(kept: OrderedDict[int, T], k: int, most: int, make: Callable[[], T]) -> T:
-    """The kth thing, from those that were used last."""
-    if k not in kept:
-        kept[k] = make()
-        while len(kept) > most:
-            kept.popitem(last=False)
-    kept.move_to_end(k)
-    return kept[k]
+def _recent(memory: OrderedDict[int, T], k: int, capacity: int, make: Callable[[], T]) -> T:
+    """What was made of the kth map, from the memory of those that were used last."""
+    if k not in memory:
+        memory[k] = make()
+        while len(memory) > capacity:
+            memory.popitem(last=False)
+    memory.move_to_end(k)
+    return memory[k]
 
 
 def map_key(map: TopometricMap) -> str:

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.average import difference
+from topomerge.fusion.pose_difference import pose_difference
 from topomerge.fusion.registration import fine, register
 from topomerge.fusion.search import Candidate, View, pairs_at, refined
 from topomerge.fusion.verify import Judge, plausibility
@@ -17,17 +17,18 @@ from topomerge.matching.costs import descriptor_costs, similarities
 from topomerge.matching.match import match
 from topomerge.types import Array, Sim3
 
-KEPT = 6  # hypotheses of a pair
-UNLIKELY = 0.01  # hypotheses below are not kept, but for the best
-DRIFT = (1.0, np.radians(4.0), 0.05)  # m, rad, log scale: poses of a pair that are as near are one; drift bends maps
-SAME = (0.08, np.radians(0.4), 0.005)  # poses that are as near are judged once
-OVERLAP = (2.0, 0.3)  # m2 of free floor or of walls in common, below which two maps do not overlap
-CONFLICT = 0.3  # m2 of walls on free floor, below which it may be noise
-USUAL, STEEP = 0.12, 30.0  # share of the walls on free floor that true poses seldom exceed; log odds against, of each 1 above
-SPAN = 1.0  # m, least half width of the place by which a pose is measured
-LIMIT = 7.0  # log odds
+PAIR_HYPOTHESES = 6  # of a pair at most
+LEAST_PROBABILITY = 0.01  # hypotheses below are left out, but for the best
+DRIFT_LIMITS = (1.0, np.radians(4.0), 0.05)  # m, rad, log scale: poses of a pair that are as near are one; drift bends maps
+CHECKED_ONCE = (0.08, np.radians(0.4), 0.005)  # m, rad, log scale: poses that are as near are judged once
+OVERLAP_FLOOR, OVERLAP_WALLS = 2.0, 0.3  # m2 in common, below both of which two maps do not overlap
+NOISE_CONFLICT = 0.3  # m2 of walls on free floor, below which it may be noise
+USUAL_CONFLICT = 0.12  # share of the walls on free floor that true poses seldom exceed
+CONFLICT_ODDS = 30.0  # log odds against a pose, of each share of 1 above that
+LEAST_HALF_WIDTH = 1.0  # m, of the place by which a pose is measured
+MOST_LOG_ODDS = 7.0
+SAMPLED_COLUMNS = 4000
 T = TypeVar("T")
-SAMPLE = 4000  # columns
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Hypothesis:
     def log_odds(self) -> float:
         """Of its probability, between -7 and 7."""
         p = float(np.clip(self.probability, 1e-6, 1 - 1e-6))
-        return float(np.clip(np.log(p / (1 - p)), -LIMIT, LIMIT))
+        return float(np.clip(np.log(p / (1 - p)), -MOST_LOG_ODDS, MOST_LOG_ODDS))
 
 
 @dataclass(frozen=True)
@@ -64,28 +65,28 @@ class Check:
 
 def hypotheses(maps: Maps, i: int, j: int, scale: str = "fixed") -> tuple[Hypothesis, ...]:
     """Where map j may lie in map i, most probable first; each with its share of the probability that one of them is right."""
-    poses = _of_rooms(maps, i, j, scale) if maps.matched else []
-    found = register(maps.prepared(i), maps.prepared(j), scale=scale, hypotheses=poses, refined=False)
-    if found.transform is None or not found.alternatives:
+    poses = _room_poses(maps, i, j, scale) if maps.matched else []
+    registration = register(maps.prepared(i), maps.prepared(j), scale=scale, hypotheses=poses, refined=False)
+    if registration.transform is None or not registration.alternatives:
         return ()
-    best = found.alternatives[0].plausibility
-    out = [Hypothesis(found.transform, found.probability, found.features)]
-    for other in found.alternatives[1:KEPT]:
-        share = found.probability * float(np.exp(other.plausibility - best))
-        if share >= UNLIKELY:
-            out.append(Hypothesis(other.transform, min(share, 1 - found.probability), other.features))
-    return tuple(out)
+    best, probability = registration.alternatives[0].plausibility, registration.probability
+    ranked = [Hypothesis(registration.transform, probability, registration.features)]
+    for other in registration.alternatives[1:PAIR_HYPOTHESES]:
+        share = probability * float(np.exp(other.plausibility - best))
+        if share >= LEAST_PROBABILITY:
+            ranked.append(Hypothesis(other.transform, min(share, 1 - probability), other.features))
+    return tuple(ranked)
 
 
-def _of_rooms(maps: Maps, i: int, j: int, scale: str) -> list[Sim3]:
+def _room_poses(maps: Maps, i: int, j: int, scale: str) -> list[Sim3]:
     """Poses T_ij of matched rooms."""
     if maps.prepared(j).order < maps.prepared(i).order:
-        return [pose.inverse() for pose in _of_rooms(maps, j, i, scale)]
+        return [pose.inverse() for pose in _room_poses(maps, j, i, scale)]
     a, b = maps[i], maps[j]
     if not len(a.rooms) or not len(b.rooms):
         return []
-    known = {id(a): maps.rows(i), id(b): maps.rows(j)}
-    return [h.transform for h in match(a, b, lambda m: known[id(m)], scale_free=scale == "free").alternatives]
+    descriptors = {id(a): maps.rows(i), id(b): maps.rows(j)}
+    return [h.transform for h in match(a, b, lambda m: descriptors[id(m)], scale_free=scale == "free").alternatives]
 
 
 def promise(maps: Maps, i: int, j: int) -> float:
@@ -103,7 +104,7 @@ class Checks:
 
     def __init__(self, maps: Maps, scaled: bool = False) -> None:
         self.maps, self.scaled = maps, scaled
-        self._known: dict[tuple[int, int], list[tuple[Sim3, Check]]] = {}
+        self._checks: dict[tuple[int, int], list[tuple[Sim3, Check]]] = {}
         self._fine: dict[tuple[int, int], list[tuple[Sim3, Sim3]]] = {}
         self._places: dict[tuple[int, int], list[tuple[Sim3, Array]]] = {}
 
@@ -124,7 +125,7 @@ class Checks:
         if j < i:
             turned = self(j, i, pose.inverse())
             return Check(turned.pose.inverse(), turned.log_odds, turned.overlap, turned.features)
-        return _once(self._known, (i, j), pose, self.maps.prepared(j).middle, lambda: self._judged(i, j, pose))
+        return _once(self._checks, (i, j), pose, self.maps.prepared(j).middle, lambda: self._judged(i, j, pose))
 
     def _judged(self, i: int, j: int, pose: Sim3) -> Check:
         a, b = self.maps.prepared(i).views, self.maps.prepared(j).views
@@ -136,7 +137,7 @@ class Checks:
             again = judge(candidate.pose)
             if alike(candidate.pose, pose, place(a, b, pose).mean(axis=0)) and speaks(again) > speaks(features):
                 moved, features = candidate.pose, again
-        overlap = features["free"] >= OVERLAP[0] or features["walls"] >= OVERLAP[1]
+        overlap = features["free"] >= OVERLAP_FLOOR or features["walls"] >= OVERLAP_WALLS
         return Check(moved, speaks(features) if overlap else 0.0, overlap, features)
 
 
@@ -144,41 +145,41 @@ def _once(
     memory: dict[tuple[int, int], list[tuple[Sim3, T]]], pair: tuple[int, int], pose: Sim3, at: Array, make: Callable[[], T]
 ) -> T:
     """What was made for a pair under a pose that is the same, or what is made now."""
-    known = memory.setdefault(pair, [])
-    for other, found in known:
-        if alike(pose, other, at, SAME):
-            return found
-    known.append((pose, make()))
-    return known[-1][1]
+    entries = memory.setdefault(pair, [])
+    for other, value in entries:
+        if alike(pose, other, at, CHECKED_ONCE):
+            return value
+    entries.append((pose, make()))
+    return entries[-1][1]
 
 
 def speaks(f: Mapping[str, float]) -> float:
     """Log odds for a pose that other maps propose. Little in common says little: only walls on free floor speak against it.
 
     Of hypotheses of simulated training pairs, nine in ten of the right ones have a plausibility above -4, one in twenty of the
-    wrong ones; walls on free floor are more than `USUAL` of the walls in one of twenty right ones, in three of four wrong ones.
+    wrong ones; walls on free floor are more than `USUAL_CONFLICT` of the walls in one of twenty right ones, in three of four
+    wrong ones.
     """
-    against = STEEP * max(f["conflict_share"] - USUAL, 0.0) if f["conflict"] > CONFLICT else 0.0
-    return float(np.clip(plausibility(f) + 3.0, 0.0, 3.0)) - min(against, 6.0)
+    excess = max(f["conflict_share"] - USUAL_CONFLICT, 0.0) if f["conflict"] > NOISE_CONFLICT else 0.0
+    return float(np.clip(plausibility(f) + 3.0, 0.0, 3.0)) - min(CONFLICT_ODDS * excess, 6.0)
 
 
-def alike(p: Sim3, q: Sim3, at: Array, limits: tuple[float, float, float] = DRIFT) -> bool:
+def alike(p: Sim3, q: Sim3, at: Array, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:
     """Are two poses of a map one, near a point (3,) of it?"""
-    return all(d <= limit for d, limit in zip(difference(p, q, at), limits, strict=True))
+    return all(d <= limit for d, limit in zip(pose_difference(p, q, at), limits, strict=True))
 
 
 def common_points(a: Sequence[View], b: Sequence[View], pose: Sim3) -> Array:
     """(n, 3) points of b's floors, a sample, where both maps know something under T_ab."""
-    found = [np.zeros((0, 3))]
+    samples = [np.zeros((0, 3))]
     for v, w in pairs_at(a, b, pose.translation[2], pose.scale):
         rows = np.argwhere(w.plan.known)
-        rows = rows[:: max(len(rows) // SAMPLE, 1)]
+        rows = rows[:: max(len(rows) // SAMPLED_COLUMNS, 1)]
         at = np.column_stack([w.plan.origin + (rows + 0.5) * w.plan.cell, np.full(len(rows), w.plan.guess)])
         there = np.floor((pose.apply(at)[:, :2] - v.plan.origin) / v.plan.cell).astype(np.int64)
         inside = ((there >= 0) & (there < v.plan.wall.shape)).all(axis=1)
-        known = v.plan.known[tuple(there[inside].T)]
-        found.append(at[inside][known])
-    return np.concatenate(found)
+        samples.append(at[inside][v.plan.known[tuple(there[inside].T)]])
+    return np.concatenate(samples)
 
 
 def place(a: Sequence[View], b: Sequence[View], pose: Sim3) -> Array:
@@ -186,6 +187,6 @@ def place(a: Sequence[View], b: Sequence[View], pose: Sim3) -> Array:
     points = common_points(a, b, pose)
     if not len(points):
         points = np.append(b[0].middle, 0.0)[None]
-    middle, (x, y, _) = points.mean(axis=0), np.maximum(points.std(axis=0), SPAN)
+    middle, (x, y, _) = points.mean(axis=0), np.maximum(points.std(axis=0), LEAST_HALF_WIDTH)
     spread: Array = middle + np.array([[0, 0, 0], [x, 0, 0], [-x, 0, 0], [0, y, 0], [0, -y, 0]])
     return spread

@@ -13,10 +13,10 @@ import numpy as np
 
 from topomerge.types import Array, Sim3
 
-ROUNDS = 30
-ROBUST = 0.15  # m: a measurement that is off by this counts half (Cauchy)
-STILL = 1e-7  # m and rad: a smaller step ends the search
-FIXED = np.array([True, True, True, True, False])  # x, y, z, yaw; not the logarithm of the scale
+POSE_GRAPH_ROUNDS = 30
+HALF_WEIGHT_GAP = 0.15  # m: a measurement that is off by this counts half (Cauchy)
+LEAST_STEP = 1e-7  # m and rad: a smaller step ends the search
+FREE_AT_FIXED_SCALE = np.array([True, True, True, True, False])  # x, y, z, yaw; not the logarithm of the scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,18 +57,18 @@ def optimise(
     names = list(start)
     anchor = names[0] if anchor is None else anchor
     moving = [name for name in names if name != anchor]
-    free = np.array(FIXED if not scaled else [True] * 5)
+    free = np.array(FREE_AT_FIXED_SCALE if not scaled else [True] * 5)
     width = int(free.sum())
     place = {name: width * k for k, name in enumerate(moving)}
     poses = dict(start)
-    for _ in range(ROUNDS if edges and moving else 0):
+    for _ in range(POSE_GRAPH_ROUNDS if edges and moving else 0):
         h, g = 1e-9 * np.eye(width * len(moving)), np.zeros(width * len(moving))
         for edge in edges:
             _gather(edge, poses, place, free, h, g)
         step = np.linalg.solve(h, -g)
         for name, at in place.items():
             poses[name] = _moved(poses[name], step[at : at + width])
-        if np.abs(step).max() < STILL:
+        if np.abs(step).max() < LEAST_STEP:
             break
     return poses
 
@@ -76,12 +76,12 @@ def optimise(
 def _gather(edge: Measured, poses: Mapping[int, Sim3], place: Mapping[int, int], free: Array, h: Array, g: Array) -> None:
     """Add a measurement to the normal equations."""
     i, j = edge.maps
-    there, here = edge.pose.apply(edge.points), edge.points
-    gap = poses[i].apply(there) - poses[j].apply(here)
+    points_i, points_j = edge.pose.apply(edge.points), edge.points
+    gap = poses[i].apply(points_i) - poses[j].apply(points_j)
     off = float(np.sqrt((gap**2).sum(axis=1).mean()))
-    weight = edge.weight / (1 + (off / ROBUST) ** 2) / len(here)
+    weight = edge.weight / (1 + (off / HALF_WEIGHT_GAP) ** 2) / len(points_j)
     parts = []
-    for name, points, sign in ((i, there, 1.0), (j, here, -1.0)):
+    for name, points, sign in ((i, points_i, 1.0), (j, points_j, -1.0)):
         if name in place:
             parts.append((place[name], sign * _jacobian(poses[name], points)[:, :, free].reshape(-1, int(free.sum()))))
     flat = gap.reshape(-1)
@@ -95,11 +95,11 @@ def _gather(edge: Measured, poses: Mapping[int, Sim3], place: Mapping[int, int],
 def _jacobian(pose: Sim3, points: Array) -> Array:
     """(k, 3, 5) of the placed points by x, y, z, yaw and the logarithm of the scale."""
     turned = pose.apply(points) - np.array(pose.translation)
-    out = np.zeros((len(points), 3, 5))
-    out[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    out[:, 0, 3], out[:, 1, 3] = -turned[:, 1], turned[:, 0]
-    out[:, :, 4] = turned
-    return out
+    jacobian = np.zeros((len(points), 3, 5))
+    jacobian[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    jacobian[:, 0, 3], jacobian[:, 1, 3] = -turned[:, 1], turned[:, 0]
+    jacobian[:, :, 4] = turned
+    return jacobian
 
 
 def _moved(pose: Sim3, step: Array) -> Sim3:

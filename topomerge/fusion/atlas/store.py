@@ -1,4 +1,4 @@
-"""An atlas that is kept: a folder of maps to which maps are added and from which they are taken away.
+"""An atlas in a folder: maps to which maps are added and from which they are taken away.
 
 | file | content |
 |---|---|
@@ -15,25 +15,27 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from topomerge import __version__
 from topomerge.errors import InputError
+from topomerge.fusion.atlas.assembly import Link
 from topomerge.fusion.atlas.folder import changing, finished, link_or_copy
 from topomerge.fusion.atlas.maps import Maps, map_key
-from topomerge.fusion.atlas.pairs import Hypothesis
-from topomerge.fusion.atlas.solve import AtlasResult, Known, solve
-from topomerge.fusion.verify import model
+from topomerge.fusion.atlas.registration_cache import PAIRS_FILE, read_registrations, registrations_to_json
+from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.atlas.solve import AtlasSettings, solve
+from topomerge.fusion.result import transform_to_json
 from topomerge.io.listing import json_text, plain
 from topomerge.io.maps import load_map, save_map
 from topomerge.io.rooms_ply import save_rooms_ply
-from topomerge.types import Sim3, TopometricMap
+from topomerge.types import TopometricMap
 
-FORMAT = 1
-SETTINGS: dict[str, Any] = {"scale": "fixed", "threshold": None, "embedder": None}
+ATLAS_FORMAT = 1
+Report = Callable[[AtlasResult, Mapping[int, TopometricMap], str], str]  # atlas, joined map of each component, title -> HTML
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class Stored:
 
     folder: Path
     entries: tuple[Entry, ...] = ()
-    settings: Mapping[str, Any] = field(default_factory=lambda: dict(SETTINGS))
+    settings: Mapping[str, Any] = field(default_factory=lambda: asdict(AtlasSettings()))
     listing: Mapping[str, Any] | None = None
 
     def files(self) -> list[str]:
@@ -81,14 +83,15 @@ def read_atlas(folder: str | Path) -> Stored:
     if not path.exists():
         raise InputError(f"{folder}: is no atlas (atlas.json is missing); `topomerge atlas add` makes one in a new folder")
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        if told["format"] != FORMAT:
-            raise InputError(f"{path}: is of format {told['format']!r}, this topomerge reads format {FORMAT}; update topomerge")
-        entries = tuple(Entry(m["name"], m["key"], m["source"], int(m["rooms"]), int(m["storeys"])) for m in told["maps"])
-        settings = {name: told["settings"][name] for name in SETTINGS}
+        listing = json.loads(path.read_text(encoding="utf-8"))
+        if listing["format"] != ATLAS_FORMAT:
+            written = f"is of format {listing['format']!r}, this topomerge reads format {ATLAS_FORMAT}"
+            raise InputError(f"{path}: {written}; update topomerge")
+        entries = tuple(Entry(m["name"], m["key"], m["source"], int(m["rooms"]), int(m["storeys"])) for m in listing["maps"])
+        settings = {name: listing["settings"][name] for name in asdict(AtlasSettings())}
         if any(Path(e.file).parent != Path("maps") or not isinstance(e.key, str) for e in entries):
             raise ValueError("a map lies elsewhere")
-        stored = Stored(folder, entries, settings, told)
+        stored = Stored(folder, entries, settings, listing)
         if any(Path(name).is_absolute() or ".." in Path(name).parts for name in stored.files()):
             raise ValueError("a file lies elsewhere")
     except InputError:
@@ -99,12 +102,13 @@ def read_atlas(folder: str | Path) -> Stored:
     return stored
 
 
-def add(folder: str | Path, maps: Sequence[tuple[str, TopometricMap]], **settings: Any) -> AtlasResult:
+def add(folder: str | Path, maps: Sequence[tuple[str, TopometricMap]], report: Report, **settings: Any) -> AtlasResult:
     """Add maps to an atlas; a new one where there is none.
 
     Args:
         folder: of the atlas.
         maps: name, map; where a name is taken already, a number is put behind it.
+        report: makes report.html (`topomerge.atlas_html`).
         settings: ``scale``, ``threshold``, ``embedder`` of `atlas`; they stay those of the atlas.
 
     Raises:
@@ -121,22 +125,25 @@ def add(folder: str | Path, maps: Sequence[tuple[str, TopometricMap]], **setting
         entry = Entry(_free_name(name, entries), key, m.source or name, len(m.rooms), len(m.storeys))
         entries.append(entry)
         new[entry.name] = m
-    return _written(replace(stored, entries=tuple(entries)), new, stored)
+    return _written(replace(stored, entries=tuple(entries)), new, stored, report)
 
 
-def remove(folder: str | Path, names: Sequence[str]) -> AtlasResult:
+def remove(folder: str | Path, names: Sequence[str], report: Report) -> AtlasResult:
     """Take maps back out, and what they brought with them.
+
+    Args:
+        report: as of `add`.
 
     Raises:
         InputError: the folder is no atlas, or it has no such map.
     """
     stored = read_atlas(folder)
-    known = [e.name for e in stored.entries]
+    held = [e.name for e in stored.entries]
     for name in names:
-        if name not in known:
-            raise InputError(f"{name}: is no map of {folder}; it holds {', '.join(known) or 'none'}")
-    kept = tuple(e for e in stored.entries if e.name not in names)
-    return _written(replace(stored, entries=kept), {}, stored)
+        if name not in held:
+            raise InputError(f"{name}: is no map of {folder}; it holds {', '.join(held) or 'none'}")
+    remaining = tuple(e for e in stored.entries if e.name not in names)
+    return _written(replace(stored, entries=remaining), {}, stored, report)
 
 
 def check_folder(folder: str | Path) -> Stored:
@@ -161,12 +168,10 @@ def _free_name(name: str, entries: Iterable[Entry]) -> str:
     return next(n for n in numbered if n.lower() not in taken)
 
 
-def _written(stored: Stored, new: Mapping[str, TopometricMap], before: Stored) -> AtlasResult:
+def _written(stored: Stored, new: Mapping[str, TopometricMap], before: Stored, report: Report) -> AtlasResult:
     """Put everything together and write it, all or nothing."""
-    from topomerge import atlas_html  # by the package's face: the report stands above fusion
-
     folder, gone = stored.folder, list[str]()
-    known = _pairs(stored)
+    registrations = read_registrations(folder, stored.settings)
     with changing(folder, gone) as place:
         (place / "maps").mkdir()
         for entry in stored.entries:
@@ -174,127 +179,77 @@ def _written(stored: Stored, new: Mapping[str, TopometricMap], before: Stored) -
                 save_map(new[entry.name], place / entry.file)
         files = [place / e.file if e.name in new else folder / e.file for e in stored.entries]
         names, keys = [e.name for e in stored.entries], [e.key for e in stored.entries]
-        found = solve(files, names, keys, known=known, **stored.settings)
+        atlas = solve(files, AtlasSettings(**stored.settings), registrations, names, keys)
         joined, components = {}, []
-        for n, members in enumerate(found.components):
-            told = _component(found, stored, n)
+        for n, members in enumerate(atlas.components):
+            component = _component(atlas, stored, n)
             if len(members) > 1:
-                told |= {"map": f"map_{n}.tmap", "ply": f"merged_{n}.ply"}
-                joined[n] = _joined(found, n, told, before, place)
-            components.append(told)
-        listing = _listing(found, stored, components)
-        _write(place / "report.html", atlas_html(found, joined, folder.resolve().name))
-        _write(place / "pairs.json", json.dumps(_pairs_json(known, stored)))
+                component |= {"map": f"map_{n}.tmap", "ply": f"merged_{n}.ply"}
+                joined[n] = _joined(atlas, n, component, before, place)
+            components.append(component)
+        listing = _listing(atlas, stored, components)
+        _write(place / "report.html", report(atlas, joined, folder.resolve().name))
+        _write(place / PAIRS_FILE, json.dumps(registrations_to_json(registrations, keys, stored.settings)))
         _write(place / "atlas.json", json_text(listing))
         gone += sorted(set(before.files()) - set(replace(stored, listing=listing).files()))
-    return replace(found, maps=Maps([folder / e.file for e in stored.entries]))
+    return replace(atlas, maps=Maps([folder / e.file for e in stored.entries]))
 
 
 def _write(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8", errors="replace", newline="\n")
 
 
-def _joined(found: AtlasResult, n: int, told: dict[str, Any], before: Stored, place: Path) -> TopometricMap:
+def _joined(atlas: AtlasResult, n: int, component: dict[str, Any], before: Stored, place: Path) -> TopometricMap:
     """The joined map of a component, written; copied where the atlas had the same before."""
     for old in (before.listing or {}).get("components", []):
         there = all((before.folder / old.get(kind, "?")).is_file() for kind in ("map", "ply"))
-        if there and old.get("made_of") == told["made_of"]:
+        if there and old.get("made_of") == component["made_of"]:
             for kind in ("map", "ply"):
-                link_or_copy(before.folder / old[kind], place / told[kind])
-            return load_map(place / told["map"])
-    joined = found.joined(n)
-    save_map(joined, place / told["map"])
-    save_rooms_ply(joined, place / told["ply"])
+                link_or_copy(before.folder / old[kind], place / component[kind])
+            return load_map(place / component["map"])
+    joined = atlas.joined(n)
+    save_map(joined, place / component["map"])
+    save_rooms_ply(joined, place / component["ply"])
     return joined
 
 
-def _component(found: AtlasResult, stored: Stored, n: int) -> dict[str, Any]:
-    members = found.components[n]
+def _component(atlas: AtlasResult, stored: Stored, n: int) -> dict[str, Any]:
+    members = atlas.components[n]
     digest = hashlib.sha256(__version__.encode())
     for k in members:
-        digest.update(stored.entries[k].key.encode() + found.transforms[k].matrix.tobytes())
+        digest.update(stored.entries[k].key.encode() + atlas.transforms[k].matrix.tobytes())
     return {
         "maps": list(members),
         "names": [stored.entries[k].name for k in members],
-        "probability": round(found.probability(n), 4),
+        "probability": round(atlas.probability(n), 4),
         "made_of": digest.hexdigest()[:16],
     }
 
 
-def _listing(found: AtlasResult, stored: Stored, components: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _listing(atlas: AtlasResult, stored: Stored, components: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """atlas.json, see docs/outputs.md."""
-    from topomerge.fusion.result import transform_to_json
-
-    into = {k: members[0] for members in found.components for k in members[1:]}
-    poses = {str(k): transform_to_json(found.transforms[k], found.residuals[k], into[k]) for k in sorted(into)}
+    into = {k: members[0] for members in atlas.components for k in members[1:]}
+    poses = {str(k): transform_to_json(atlas.transforms[k], atlas.residuals[k], into[k]) for k in sorted(into)}
     maps = [
         {"name": e.name, "file": e.file, "key": e.key, "source": e.source, "rooms": e.rooms, "storeys": e.storeys}
         for e in stored.entries
     ]
     listing = {
-        "format": FORMAT,
-        "status": found.status,
-        "reason": found.words(),
+        "format": ATLAS_FORMAT,
+        "status": atlas.status,
+        "reason": atlas.words(),
         "settings": dict(stored.settings),
         "maps": maps,
         "components": components,
         "transforms": poses,
-        "links": [_link(link) | {"probability": round(link.probability, 4)} for link in found.links],
-        "thrown_out": [_link(link) | {"against": link.against} for link in found.thrown],
-        "registered": {"pairs": found.registered[0], "of": found.registered[1]},
-        "seconds": round(found.seconds, 3),
+        "links": [_link(link) | {"probability": round(link.probability, 4)} for link in atlas.links],
+        "thrown_out": [_link(link) | {"against": link.against} for link in atlas.rejected],
+        "registered": {"pairs": atlas.registered[0], "of": atlas.registered[1]},
+        "seconds": round(atlas.seconds, 3),
     }
-    out: dict[str, Any] = plain(listing)
-    return out
+    plain_listing: dict[str, Any] = plain(listing)
+    return plain_listing
 
 
-def _link(link: Any) -> dict[str, Any]:
+def _link(link: Link) -> dict[str, Any]:
     return {"maps": link.maps, "by_itself": round(link.hypothesis.probability, 4)}
-
-
-def _stamp(stored: Stored) -> str:
-    """What registrations depend on beside the maps."""
-    inputs = [__version__, model(), stored.settings["scale"], str(stored.settings["embedder"])]
-    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _pairs(stored: Stored) -> Known:
-    """Registrations that are remembered; none where the file is missing, damaged or of another version."""
-    try:
-        told = json.loads((stored.folder / "pairs.json").read_text(encoding="utf-8"))
-        if told["format"] != FORMAT or told["stamp"] != _stamp(stored):
-            return {}
-        return {(p["maps"][0], p["maps"][1]): tuple(_hypothesis(h) for h in p["hypotheses"]) for p in told["pairs"]}
-    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError):
-        return {}
-
-
-def _hypothesis(told: Mapping[str, Any]) -> Hypothesis:
-    x, y, z = map(float, told["translation"])
-    p = float(told["probability"])
-    if not 0 <= p <= 1:
-        raise ValueError(f"probability {p}")
-    pose = Sim3(float(told["yaw"]), (x, y, z), float(told["scale"]))
-    return Hypothesis(pose, p, {str(k): float(v) for k, v in told["features"].items()})
-
-
-def _pairs_json(known: Known, stored: Stored) -> dict[str, Any]:
-    keys = {e.key for e in stored.entries}
-    pairs = [
-        {
-            "maps": list(pair),
-            "hypotheses": [
-                {
-                    "yaw": h.pose.yaw,
-                    "translation": list(h.pose.translation),
-                    "scale": h.pose.scale,
-                    "probability": h.probability,
-                    "features": plain(dict(h.features)),
-                }
-                for h in hypotheses
-            ],
-        }
-        for pair, hypotheses in sorted(known.items())
-        if set(pair) <= keys
-    ]
-    return {"format": FORMAT, "stamp": _stamp(stored), "pairs": pairs}

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.fusion.average import consensus
 from topomerge.fusion.refine import Surface, refine_pose, surface
 from topomerge.fusion.thesis.fpfh import fpfh
+from topomerge.fusion.thesis.pose_clusters import pose_clusters
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
 RADIUS = 1.0  # m, of the features
@@ -41,7 +41,7 @@ def room_poses(a: TopometricMap, b: TopometricMap, rooms: Array, weights: Array)
             poses.append(pose)
             heavy.append(float(min(a.rooms["area"][i], b.rooms["area"][j])))
     middle = b.grid.centroids().mean(axis=0) if len(b.grid) else np.zeros(3)
-    return [(pose, weight) for pose, weight, _ in consensus(poses, np.array(heavy), middle)]
+    return [(pose, weight) for pose, weight, _ in pose_clusters(poses, np.array(heavy), middle)]
 
 
 class _Room:

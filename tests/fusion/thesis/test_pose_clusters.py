@@ -1,4 +1,4 @@
-"""Rotations are averaged as rotations."""
+"""Rotations are averaged as rotations, and poses that agree are one cluster."""
 
 from __future__ import annotations
 
@@ -7,27 +7,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from topomerge.fusion.average import average_sim3, average_yaw, consensus, difference
+from topomerge.fusion.pose_difference import pose_difference
+from topomerge.fusion.thesis.pose_clusters import mean_pose, mean_yaw, pose_clusters
 from topomerge.types import Sim3
 
 
 def test_yaws_across_half_a_turn():
-    assert abs(average_yaw(np.radians([179, -179]))) == pytest.approx(np.pi)
-    assert average_yaw(np.radians([170, -170, -170])) == pytest.approx(np.radians(-176.7), abs=0.01)
-    assert average_yaw(np.radians([10, 20]), [1, 3]) == pytest.approx(np.radians(17.5), abs=1e-3)
+    assert abs(mean_yaw(np.radians([179, -179]))) == pytest.approx(np.pi)
+    assert mean_yaw(np.radians([170, -170, -170])) == pytest.approx(np.radians(-176.7), abs=0.01)
+    assert mean_yaw(np.radians([10, 20]), [1, 3]) == pytest.approx(np.radians(17.5), abs=1e-3)
 
 
 def test_yaws_that_cancel_have_no_mean():
     with pytest.raises(ValueError, match="cancel"):
-        average_yaw([0.0, np.pi])
+        mean_yaw([0.0, np.pi])
     with pytest.raises(ValueError, match="no yaw"):
-        average_yaw([])
+        mean_yaw([])
 
 
 @given(st.floats(-3.14, 3.14), st.floats(-50, 50), st.floats(0.5, 2.0))
 def test_the_mean_of_one_pose_is_that_pose(yaw, x, scale):
     pose = Sim3(yaw, (x, -x, 1.0), scale)
-    mean = average_sim3([pose, pose], [1, 2], np.array([3.0, 4.0, 5.0]))
+    mean = mean_pose([pose, pose], [1, 2], np.array([3.0, 4.0, 5.0]))
     assert np.allclose(mean.matrix, pose.matrix, atol=1e-9)
 
 
@@ -35,16 +36,16 @@ def test_translations_are_averaged_where_the_map_lies():
     anchor = np.array([100.0, 0.0, 0.0])  # far from the origin: 2 degrees move it by 3.5 m
     poses = [Sim3(np.radians(y)) for y in (-1.0, 1.0)]
     poses = [Sim3(p.yaw, tuple((anchor - p.apply(anchor[None])[0]).tolist())) for p in poses]  # both leave it in place
-    assert np.allclose(average_sim3(poses, anchor=anchor).apply(anchor[None]), anchor)
+    assert np.allclose(mean_pose(poses, anchor=anchor).apply(anchor[None]), anchor)
 
 
-def test_consensus_finds_the_cluster_with_most_weight():
+def test_clusters_begin_with_the_cluster_with_most_weight():
     rng = np.random.default_rng(0)
     true = Sim3(np.pi - 0.01, (3.0, 4.0, 0.0))
     near = [Sim3(true.yaw + d, (3 + d, 4 - d, 0.0)) for d in rng.normal(0, 0.02, 8)]
     wrong = [Sim3(float(y), (float(x), 0.0, 0.0)) for y, x in rng.uniform(-3, 3, (12, 2))]
-    clusters = consensus([*wrong, *near], [1.0] * 20)
+    clusters = pose_clusters([*wrong, *near], [1.0] * 20)
     mean, weight, members = clusters[0]
-    moved, turned, _ = difference(mean, true, np.zeros(3))
+    moved, turned, _ = pose_difference(mean, true, np.zeros(3))
     assert weight >= 8 and set(range(12, 20)) <= set(members) and moved < 0.05 and turned < 0.02
     assert sorted(i for _, _, m in clusters for i in m) == list(range(20))

@@ -1,0 +1,120 @@
+"""Maps are fused: no cell is lost, each knows who saw it, rooms and doors are extracted once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+import topomerge as tm
+from tests.fusion.atlas.atlas_scenes import office_map, truth
+from tests.scenes import two_rooms
+from topomerge.errors import InputError
+from topomerge.fusion.fuse import fuse, resampled, rooms_in_common
+from topomerge.fusion.storey_plan import extruded
+from topomerge.types import Sim3, TopometricMap, VoxelGrid
+
+
+def fused(a: TopometricMap, b: TopometricMap, pose: Sim3) -> TopometricMap:
+    """Two maps, of which the second lies at T_ab."""
+    return fuse((a, b), [(0, Sim3()), (1, pose)])
+
+
+@pytest.fixture(scope="module")
+def halves() -> tuple[TopometricMap, TopometricMap]:
+    """The west and the east of the office, in two frames."""
+    return office_map(0), office_map(2)
+
+
+@pytest.fixture(scope="module")
+def joined(halves) -> TopometricMap:
+    return fused(*halves, truth(0, 2))
+
+
+def test_provenance_tells_who_saw_each_cell():
+    """Two boxes of cells that share a part, the second one moved by whole cells."""
+    a, b = (tm.extract(two_rooms().points().astype(np.float32), name=name) for name in "ab")
+    joined = fused(a, b, Sim3(0.0, (3.0, 0.0, 0.0)))
+
+    def lattice(map: TopometricMap, metres: float = 0.0) -> set[tuple[int, ...]]:
+        offset = np.round((map.grid.origin + (metres, 0, 0)) / 0.1)
+        return {tuple(cell) for cell in (map.grid.cells + offset).astype(int).tolist()}
+
+    of_a, of_b, both = lattice(a), lattice(b, 3.0), lattice(joined)
+    assert joined.provenance.dtype == np.uint32 and len(both) == len(joined.grid)
+    offset = np.round(joined.grid.origin / 0.1)
+    for cell, bits in zip((joined.grid.cells + offset).astype(int).tolist(), joined.provenance.tolist(), strict=True):
+        assert bits == (tuple(cell) in of_a) + 2 * (tuple(cell) in of_b)
+    assert len((of_a | of_b) - both) < 0.01 * len(both)  # cells that the extraction takes for noise
+
+
+def test_bits_of_joined_maps_follow(halves, joined):
+    again = fused(joined, halves[1], truth(0, 2))
+    assert np.bitwise_or.reduce(again.provenance) == 0b111
+    full = replace(joined, provenance=np.full(len(joined.grid), 1 << 31, np.uint32))
+    with pytest.raises(InputError, match="at most 32"):
+        fused(full, halves[1], truth(0, 2))
+
+
+def test_what_one_map_saw_empty_and_the_other_did_not_is_occupied(halves, joined):
+    west, east = halves
+    place = truth(0, 2).inverse().apply(joined.grid.centroids()[joined.provenance == 1])
+    assert east.free.rows(east.free.locate(place)).max() >= 0  # cells of the one stand in empty space of the other
+    assert np.array_equal(joined.free.origin, joined.grid.origin) and joined.free.edge == 2 * joined.grid.edge
+    assert not joined.grid.coarser(2).contains(joined.free.cells).any()
+    assert len(joined.free) > max(len(west.free), len(east.free))
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 4])
+def test_a_turned_wall_stays_whole(turn):
+    x, z = np.meshgrid(np.arange(60), np.arange(25), indexing="ij")
+    wall = VoxelGrid.from_cells(np.stack([x, 0 * x + 5, z], axis=-1).reshape(-1, 3), edge=0.1)
+    cells, rows = resampled(wall, Sim3(turn, (1.23, 4.56, 0.05)), np.zeros(3), 0.1)
+    assert 0.7 * len(wall) < len(cells) < 1.35 * len(wall) and len(np.unique(cells, axis=0)) == len(cells)
+    moved = Sim3(turn, (1.23, 4.56, 0.05)).apply(wall.centroids())
+    assert {tuple(c) for c in np.floor(moved / 0.1).astype(int).tolist()} <= {tuple(c) for c in cells.tolist()}  # none is lost
+    away = np.linalg.norm((cells + 0.5) * 0.1 - moved[rows], axis=1)
+    assert away.max() < 0.1 * np.sqrt(3) / 2 + 1e-9
+    image = np.zeros(cells.max(axis=0)[:2] + 1, bool)
+    image[tuple(cells[:, :2].T)] = True
+    assert ndimage.label(image, np.ones((3, 3)))[1] == 1  # a walk along the wall meets no gap
+
+
+@pytest.mark.parametrize("turn", [0.2, 0.6, np.pi / 4])
+def test_a_turned_floor_has_no_holes(turn):
+    x, y = np.meshgrid(np.arange(50), np.arange(40), indexing="ij")
+    floor = VoxelGrid.from_cells(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3), edge=0.1)
+    cells, _ = resampled(floor, Sim3(turn, (0.03, 0.07, 0.0)), np.array([-9.0, -9.0, 0.0]), 0.1)
+    image = np.zeros(cells.max(axis=0)[:2] + 2, bool)
+    image[tuple(cells[:, :2].T)] = True
+    assert np.array_equal(ndimage.binary_fill_holes(image), image) and (cells[:, 2] == cells[0, 2]).all()
+
+
+def test_coarse_cells_are_filled():
+    grid = VoxelGrid.from_cells(np.array([[0, 0, 0], [1, 0, 0]]), edge=0.2)
+    cells, rows = resampled(grid, Sim3(), np.zeros(3), 0.1)
+    assert len(cells) == 16 and np.bincount(rows).tolist() == [8, 8]
+
+
+def test_a_map_laid_on_itself_is_itself(halves):
+    a = halves[0]
+    twice = fused(a, replace(a, source="again"), Sim3())
+    assert len(twice.grid) == len(a.grid) and (twice.provenance == 3).all() and twice.source == "west + again"
+    rooms, shared = rooms_in_common(a, a, Sim3())
+    assert rooms[:, 0].tolist() == rooms[:, 1].tolist() == list(range(len(a.rooms))) and (shared > 0.99).all()
+
+
+def test_a_slice_fills_no_room_with_what_stands_in_it(halves):
+    """Its furniture becomes walls as high as the room; where another map saw the floor, it only says that it saw something."""
+    west = halves[0].grid.cell_bounds(halves[0].grid.cells)[0] + 0.05
+    cut = west[(west[:, 2] > 0.5) & (west[:, 2] < 0.65)]
+    flat = tm.extract(cut.astype(np.float32), name="slice")
+    assert extruded(flat.grid) and not any(extruded(m.grid) for m in halves)
+    lower = Sim3(0.0, (0.0, 0.0, float(halves[0].storeys["floor"][0] - flat.storeys["floor"][0])))
+    joined = fuse([halves[0], flat], [(0, Sim3()), (1, lower)])
+    assert len(joined.rooms) == len(halves[0].rooms) and abs(len(joined.grid) - len(halves[0].grid)) < 0.02 * len(joined.grid)
+    assert ((joined.provenance & 2) > 0).sum() > 0.5 * len(flat.grid) and (joined.provenance == 2).sum() < 0.02 * len(joined.grid)
+    first = fuse([flat, halves[0]], [(0, Sim3()), (1, lower.inverse())])
+    assert len(first.rooms) == len(joined.rooms) and np.bitwise_or.reduce(first.provenance) == 0b11

@@ -1,0 +1,95 @@
+"""What an atlas gives: which maps belong together, where they lie, and the links that hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from topomerge.fusion.atlas.assembly import Link
+from topomerge.fusion.atlas.maps import Maps
+from topomerge.fusion.fuse import fuse
+from topomerge.types import Sim3, TopometricMap
+
+
+@dataclass(frozen=True, eq=False)
+class AtlasResult:
+    """Maps brought together as far as they can be believed to belong together.
+
+    Args:
+        maps: what was put in.
+        names: of the maps, for messages.
+        components: maps that lie in one frame, by their place in `maps`, each ascending; those with more than one map first. The
+            frame is that of the first map.
+        transforms: k -> T_0k into the first map of its component; of all maps, the first ones' is the identity.
+        links: hypotheses that hold the components together.
+        rejected: hypotheses that were believed by themselves and thrown out, as others contradict them.
+        residuals: k -> root mean square, m, by which the measured poses of map k miss the solution.
+        registered: pairs that were searched in each other, of all.
+        seconds: of the whole.
+        warnings: what the user should know.
+    """
+
+    maps: Maps
+    names: tuple[str, ...]
+    components: tuple[tuple[int, ...], ...]
+    transforms: dict[int, Sim3]
+    links: tuple[Link, ...] = ()
+    rejected: tuple[Link, ...] = ()
+    residuals: dict[int, float] = field(default_factory=dict)
+    registered: tuple[int, int] = (0, 0)
+    seconds: float = 0.0
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def alone(self) -> tuple[int, ...]:
+        """Maps that nothing connects."""
+        return tuple(c[0] for c in self.components if len(c) == 1)
+
+    @property
+    def status(self) -> str:
+        """merged (all in one), parted (several components), or abstained (nothing could be connected)."""
+        if len(self.components) < 2:
+            return "merged"
+        return "parted" if len(self.components[0]) > 1 else "abstained"
+
+    def component_of(self, k: int) -> int:
+        """The component of a map."""
+        return next(n for n, members in enumerate(self.components) if k in members)
+
+    def probability(self, component: int) -> float:
+        """Of the weakest link of a component; 0 for a map alone."""
+        probabilities = [link.probability for link in self.links if link.maps[0] in self.components[component]]
+        return min(probabilities, default=0.0)
+
+    def joined(self, component: int) -> TopometricMap:
+        """The joined map of a component in the frame of its first map; made anew at each call.
+
+        Raises:
+            InputError: more maps together than provenance can tell apart.
+        """
+        return fuse(self.maps, [(k, self.transforms[k]) for k in self.components[component]])
+
+    def words(self) -> str:
+        """What came out, in a sentence or two."""
+        return "; ".join(_words(self))
+
+
+def _words(atlas: AtlasResult) -> Iterator[str]:
+    def names(members: Iterable[int]) -> str:
+        return ", ".join(Path(atlas.names[k]).name for k in members)
+
+    joined = [c for c in atlas.components if len(c) > 1]
+    if len(atlas.names) < 2:
+        yield "one map, nothing to connect it with yet" if atlas.names else "no map"
+    elif not joined:
+        yield f"nothing could be connected: all {len(atlas.names)} maps stand apart"
+    for n, members in enumerate(joined):
+        yield f"{len(members)} maps belong together ({names(members)}), weakest link {atlas.probability(n):.2f}"
+    if joined and atlas.alone:
+        several = len(atlas.alone) > 1
+        yield f"{names(atlas.alone)} {'stand' if several else 'stands'} apart: nothing connects {'them' if several else 'it'}"
+    for link in atlas.rejected:
+        who = "other maps contradict" if link.against is None else f"{names(link.against)} contradict"
+        match = f"{names(link.maps)}: a match of probability {link.hypothesis.probability:.2f} by itself"
+        yield f"{match} was thrown out, {who} it"

@@ -1,0 +1,108 @@
+"""What two maps or many must be to be merged, and what a user should know of them before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.fusion.verify import model
+from topomerge.types import TopometricMap
+
+SCALES = ("fixed", "free")
+POSE_SOURCES = ("search", "rooms")
+UNIT_SPAN = 300.0  # m, and
+UNIT_RATIO = 30.0  # times the other map: a map that spans this is in another unit
+UNIT_RATIO_MM = 300.0  # times the other map: in millimetres rather than centimetres
+TALL_RATIO = 2.2  # times the height of the other's storeys: another unit, or a hall
+
+
+def check_scale(scale: str) -> None:
+    """Raise InputError for another word than those of `SCALES`."""
+    if scale not in SCALES:
+        raise InputError(f"scale must be {' or '.join(SCALES)}, not {scale!r}")
+
+
+def checked_threshold(threshold: float | None) -> float:
+    """The probability from which a merge is believed; that of the calibration if None.
+
+    Raises:
+        InputError: not between 0 and 1.
+    """
+    share = float(model()["threshold"]) if threshold is None else float(threshold)
+    if not 0 <= share <= 1:
+        raise InputError(f"threshold must be a probability between 0 and 1, not {threshold}")
+    return share
+
+
+def check_poses(poses: str, count: int, scale: str) -> None:
+    """Raise InputError for another word than those of `POSE_SOURCES`; rooms alone give the poses of two maps of one scale."""
+    if poses not in POSE_SOURCES:
+        raise InputError(f"poses must be {' or '.join(POSE_SOURCES)}, not {poses!r}")
+    if poses == "rooms" and (count > 2 or scale != "fixed"):
+        raise InputError("poses of rooms alone are for two maps of one scale; leave them out (--poses search)")
+
+
+def check_cells(map: TopometricMap, name: str) -> None:
+    """Raise InputError for a map without cells."""
+    if not len(map.grid):
+        raise InputError(f"{name}: has no occupied cells, nothing can be merged; extract it from another scan")
+
+
+def check_different(a: TopometricMap, b: TopometricMap) -> None:
+    """Raise InputError where two maps are one."""
+    same = len(a.grid) == len(b.grid) and np.array_equal(a.grid.cells, b.grid.cells)
+    if a is b or (same and np.allclose(a.grid.origin, b.grid.origin) and a.grid.edge == b.grid.edge):
+        name = b.source or "the second map"
+        raise InputError(f"{name}: is the same map as {a.source or 'the first'}; give two different maps")
+
+
+def check_units(a: TopometricMap, b: TopometricMap) -> None:
+    """Raise InputError where a map is far larger than any neighbour of the other: it is in centimetres or millimetres."""
+    spans = [float(np.hypot(*np.ptp(m.grid.cells[:, :2], axis=0))) * m.grid.edge for m in (a, b)]
+    large, small = (a, b) if spans[0] >= spans[1] else (b, a)
+    ratio = max(spans) / max(min(spans), small.grid.edge)
+    if max(spans) > UNIT_SPAN and ratio > UNIT_RATIO:
+        unit = "mm" if ratio > UNIT_RATIO_MM else "cm"
+        wide = f"{large.source or 'one map'}: spans {max(spans):,.0f} m, {small.source or 'the other'} {min(spans):,.0f} m"
+        raise InputError(f"{wide}: the units seem to differ; extract it with --unit {unit}")
+
+
+def check_pair(a: TopometricMap, b: TopometricMap, scale: str) -> None:
+    """All that is asked of two maps.
+
+    Raises:
+        InputError: a map without cells, one map twice, maps in different units.
+    """
+    for map, name in ((a, "the first map"), (b, "the second map")):
+        check_cells(map, map.source or name)
+    check_different(a, b)
+    if scale == "fixed":
+        check_units(a, b)
+
+
+def pair_warnings(a: TopometricMap, b: TopometricMap, scale: str) -> Iterator[str]:
+    """What may be wrong with two maps."""
+    for map, name in ((a, "the first map"), (b, "the second map")):
+        if len(map.rooms) == 0:
+            yield without_rooms(map.source or name)
+        elif len(map.rooms) == 1:
+            yield f"{map.source or name}: has one room: little can be compared"
+    heights = [_storey_height(m) for m in (a, b)]
+    if scale == "fixed" and min(heights) > 0 and max(heights) > TALL_RATIO * min(heights):
+        tall, low = (a, b) if heights[0] >= heights[1] else (b, a)
+        names = tall.source or "one map", low.source or "the other"
+        yield f"{names[0]}: storeys are {max(heights):.1f} m high, in {names[1]} {min(heights):.1f} m: the units may differ"
+
+
+def without_rooms(name: str) -> str:
+    """The warning about a map without rooms."""
+    return f"{name}: has no rooms: only walls and empty space can be compared"
+
+
+def _storey_height(map: TopometricMap) -> float:
+    """m, median floor to ceiling; 0 where none was seen."""
+    heights = map.storeys["ceiling"] - map.storeys["floor"]
+    heights = heights[np.isfinite(heights)]
+    return float(np.median(heights)) if len(heights) else 0.0
