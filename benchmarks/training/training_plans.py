@@ -24,9 +24,10 @@ from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.plans import splits
 from topomerge.datasets.plans.floorplans import Refusal, iter_plans
+from topomerge.datasets.simulation.floors import fill
 from topomerge.datasets.simulation.scanner import moved, scan
 from topomerge.datasets.simulation.sensors import get_sensor
-from topomerge.datasets.simulation.walk import fill, part
+from topomerge.datasets.simulation.walk import part
 
 from benchmarks.extraction.sources import _drift_of, _exact, _spoilt
 from topomerge.errors import InputError

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
 from topomerge.datasets.buildings.furnish import Floor, furnish
 from topomerge.datasets.buildings.furniture import Item, footprints
+from topomerge.datasets.buildings.openings import Hole
+from topomerge.datasets.buildings.spaces import Space
 from topomerge.datasets.core.building import SURFACES, THING_DTYPE
 from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.core.solids import Soup, boxes, column, flat, rotation
 
 from topomerge.types import Array
-
-if TYPE_CHECKING:
-    from topomerge.datasets.buildings.erect import Hole, Space
 
 LEAF = 0.04  # m, thickness
 SWING = {"shut": (0.0, 0.0), "half": (0.5, 1.1), "open": (1.4, 1.9)}  # rad

@@ -10,7 +10,7 @@ from topomerge.datasets.core.building import Building
 from topomerge.datasets.pairs.flat import Flat, from_masks, raise_flat
 from topomerge.datasets.pairs.pairs import Pair, seen_by_both
 from topomerge.datasets.pairs.parts import share
-from topomerge.datasets.simulation.walk import draw_floors
+from topomerge.datasets.simulation.floors import draw_floors
 
 from topomerge.errors import InputError
 from topomerge.types import Array

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 from topomerge.datasets.pairs.pairs import Pair, draw_frames, seen_by_both
-from topomerge.datasets.simulation.walk import fill
+from topomerge.datasets.simulation.floors import fill
 
 from topomerge.errors import InputError
 from topomerge.io import grid

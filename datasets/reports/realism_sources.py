@@ -14,7 +14,7 @@ from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.plans import splits
 from topomerge.datasets.plans.floorplans import Refusal, iter_plans
-from topomerge.datasets.reports import realism
+from topomerge.datasets.reports import realism_measures
 from topomerge.datasets.simulation.scanner import scan
 from topomerge.datasets.simulation.sensors import SENSORS
 from topomerge.datasets.simulation.session import session
@@ -61,14 +61,14 @@ def _of_buildings(buildings: list[Building]) -> dict[str, float]:
         for k in range(len(b.storeys)):
             storeys.append([_area(r.polygon) for r in b.rooms if r.storey == k and r.kind not in SKIPPED])
         widths += b.doors["width"][(b.doors["rooms"] >= 0).all(axis=1)].tolist()
-    return realism.rooms_and_doors(storeys, widths)
+    return realism_measures.rooms_and_doors(storeys, widths)
 
 
 def _of_plans(results: list[Plan | Refusal]) -> dict[str, float]:
     plans = [p for p in results if isinstance(p, Plan)]
     storeys = [[_area(r.polygon) for r in p.rooms if r.kind not in SKIPPED] for p in plans]
     widths = [float(np.hypot(*np.subtract(o.start, o.end))) for p in plans for o in p.openings if o.kind in ("door", "opening")]
-    return realism.rooms_and_doors([s for s in storeys if s], widths)
+    return realism_measures.rooms_and_doors([s for s in storeys if s], widths)
 
 
 def _area(polygon: Array) -> float:
@@ -111,15 +111,15 @@ def simulated(building: Building, sensor: str, seed: int = 0) -> dict[str, float
     place, visited = session(building, rng=rng), part(building, VISITED, rng)
     straight = scan(place, replace(SENSORS[sensor], drift=0.0, tilt=0.0), visited, seed)
     bent = scan(place, sensor, visited, seed)
-    return of_rooms(straight, visited) | realism.thickness(bent.points)
+    return of_rooms(straight, visited) | realism_measures.thickness(bent.points)
 
 
 def of_rooms(cloud: PointCloud, rooms: Array | list[int]) -> dict[str, float]:
     """Surfaces of some of a cloud's true rooms, by the points that carry their label."""
     points, labels = cloud.points.astype(float) + cloud.shift, cloud.labels
     assert labels is not None
-    rows = [realism.surfaces(points[labels == i], realism.space_of(cloud.rooms[i])) for i in rooms]
-    return realism.together(rows)
+    rows = [realism_measures.surfaces(points[labels == i], realism_measures.space_of(cloud.rooms[i])) for i in rooms]
+    return realism_measures.together(rows)
 
 
 def mean(rows: list[Mapping[str, float]]) -> dict[str, float]:
@@ -134,10 +134,10 @@ def real_maps(folder: Path, fast: bool = False) -> Iterator[Row]:
     for title, cloud, floor, ceiling in real_clouds(folder):
         points = cloud.points.astype(float)
         drawn = DRAWN.get(title.split()[-1])
-        space = realism.outline_of(points, floor, ceiling)
+        space = realism_measures.outline_of(points, floor, ceiling)
         if drawn is not None:
-            space = realism.space_of(TrueRoom(title, np.array(drawn), floor, ceiling))
-        yield title, realism.together([realism.surfaces(points, space)]) | realism.thickness(points)
+            space = realism_measures.space_of(TrueRoom(title, np.array(drawn), floor, ceiling))
+        yield title, realism_measures.together([realism_measures.surfaces(points, space)]) | realism_measures.thickness(points)
     yield from _grids(folder)
     if not fast:
         yield from _models(folder)
@@ -188,21 +188,21 @@ def read_vtk(path: Path) -> PointCloud:
 
 def _grids(folder: Path) -> Iterator[Row]:
     """Robot grids: what is free or occupied within the true rooms is seen; there are no heights."""
-    from topomerge.datasets.real import utexas as real_utexas
+    from topomerge.datasets.real import utexas
 
-    for name, make in real_utexas.pairs(folder / real_utexas.FOLDER) if (folder / real_utexas.FOLDER).is_dir() else ():
+    for name, make in utexas.pairs(folder / utexas.FOLDER) if (folder / utexas.FOLDER).is_dir() else ():
         if not name.endswith("-lines"):
             continue
-        pair = make()
-        cloud = pair.a
+        cloud = make().a
         row = of_rooms(cloud, list(range(len(cloud.rooms))))
         yield f"GDC {name.removesuffix('-lines')}", {k: row[k] for k in ("seen", "floor") if k in row}
 
 
 def _models(folder: Path) -> Iterator[Row]:
     """Building models, scanned from inside."""
-    from topomerge.datasets.real import ifc as real_ifc
+    from topomerge.datasets.real import ifc
 
-    for name, make in real_ifc.pairs(folder / real_ifc.FOLDER) if (folder / real_ifc.FOLDER).is_dir() else ():
+    for name, make in ifc.pairs(folder / ifc.FOLDER) if (folder / ifc.FOLDER).is_dir() else ():
         pair = make()
-        yield f"IFC {name}, {pair.sensors[1]}", of_rooms(pair.b, list(pair.visited[1])) | realism.thickness(pair.b.points)
+        row = of_rooms(pair.b, list(pair.visited[1]))
+        yield f"IFC {name}, {pair.sensors[1]}", row | realism_measures.thickness(pair.b.points)

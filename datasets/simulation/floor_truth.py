@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from topomerge.datasets.core.building import Building
-from topomerge.datasets.simulation.walk import fill
+from topomerge.datasets.simulation.floors import fill
 
 from topomerge.metrics import SAME, RoomScores, Scores, score_doors, score_edges, score_rooms, storeys_right
 from topomerge.types import Array, Sim3, TopometricMap, TrueRoom

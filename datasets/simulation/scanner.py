@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 from topomerge.datasets.core.building import SURFACES, Building
+from topomerge.datasets.simulation.floors import draw_floors
+from topomerge.datasets.simulation.rays import Hits, cast, placed
 from topomerge.datasets.simulation.sensors import Sensor, get_sensor
-from topomerge.datasets.simulation.walk import Walk, draw_floors, plan_walk
+from topomerge.datasets.simulation.trajectory import drifted, sensor_poses
+from topomerge.datasets.simulation.walk import plan_walk
 
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3, TrueRoom
@@ -19,7 +20,6 @@ from topomerge.types import Array, PointCloud, Sim3, TrueRoom
 LABEL_CELL = 0.05  # m
 OVERLAP = 1.4  # rays for each point that is kept
 LINE = 540  # rays of a pose of a sensor that sees a line only
-CHUNK = 2_000_000  # rays at a time
 PLAIN = [SURFACES.index(s) for s in ("wall", "floor", "ceiling", "facade")]
 
 
@@ -56,14 +56,14 @@ def scan(
     spacing = spacing or kind.spacing
     visited = [i for i, r in enumerate(building.rooms) if r.kind != "lift"] if rooms is None else [int(r) for r in rooms]
     walk = plan_walk(building, visited, rng, unfinished)
-    poses, along = _poses(walk, kind, visited, rng)
+    poses, along = sensor_poses(walk, kind, visited, rng)
     number = budget or (LINE * len(poses) if kind.beams == 1 else _rays_for(building, visited, spacing))
-    hits = _cast(building, kind, poses, max(number // len(poses), 8), rng)
+    hits = cast(building, kind, poses, max(number // len(poses), 8), rng)
     hits = _degrade(building, poses, hits, kind, rng)
     if not len(hits.pose):
         raise InputError(f"{building.name}: the {kind.name} sensor saw nothing; is its reach of {kind.reach} m right?")
-    estimated = _drift(poses, walk, along, kind, rng)
-    points = _placed(estimated, hits, hits.ranges)
+    estimated = drifted(poses, walk, along, kind, rng)
+    points = placed(estimated, hits, hits.ranges)
     if not budget:
         kept = _thin(points, spacing)
         points, hits = points[kept], hits.take(kept)
@@ -90,42 +90,6 @@ def moved(cloud: PointCloud, frame: Sim3) -> PointCloud:
     return replace(cloud, points=points, shift=np.zeros(3), poses=poses, rooms=rooms)
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
-    """What rays met, row by row.
-
-    Args:
-        pose: (n,) int64 from where.
-        rays: (n, 3) float32 directions in the sensor's frame.
-        ranges: (n,) float32, m.
-        triangle: (n,) int64, of the building.
-        cosine: (n,) float32, |cosine| of the angle of incidence.
-        ghost: (n,) bool, seen in a pane as in a mirror.
-    """
-
-    pose: Array
-    rays: Array
-    ranges: Array
-    triangle: Array
-    cosine: Array
-    ghost: Array
-
-    def take(self, rows: Array) -> Hits:
-        """Some of the rows."""
-        return Hits(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-
-def _placed(poses: Array, hits: Hits, ranges: Array) -> Array:
-    """(n, 3) float64 points at the given ranges; hits stand in the order of their poses."""
-    points = np.empty((len(ranges), 3))
-    stops = np.searchsorted(hits.pose, np.arange(len(poses) + 1))
-    seen = hits.rays * ranges[:, None].astype(np.float32)
-    for k, pose in enumerate(poses):
-        rows = slice(stops[k], stops[k + 1])
-        points[rows] = seen[rows] @ pose[:3, :3].T + pose[:3, 3]
-    return points
-
-
 def _moved(room: TrueRoom, frame: Sim3) -> TrueRoom:
     corners = frame.apply(np.column_stack([room.polygon, np.full(len(room.polygon), room.floor)]))
     top = frame.scale * room.ceiling + frame.translation[2]
@@ -143,125 +107,6 @@ def _rays_for(building: Building, visited: Sequence[int], spacing: float) -> int
     return int(OVERLAP * surface / spacing**2)
 
 
-def _poses(walk: Walk, sensor: Sensor, visited: Sequence[int], rng: np.random.Generator) -> tuple[Array, Array]:
-    """(K, 4, 4) true poses of the sensor, in the order of the walk, and metres walked to each; only in the rooms asked for."""
-    along = walk.along
-    at = list(walk.stops) * sensor.turns
-    turn = [k * 2 * np.pi * sensor.look / sensor.turns for k in range(sensor.turns) for _ in walk.stops]
-    turn = [t + o for t, o in zip(turn, np.tile(rng.uniform(0, 2 * np.pi, len(walk.stops)), sensor.turns), strict=True)]
-    heading = _heading(walk.points)
-    if sensor.step:
-        marks = np.searchsorted(along, np.arange(0, along[-1], sensor.step))
-        marks = marks[walk.free[marks] & (np.isin(walk.room[marks], list(visited)) | (walk.room[marks] < 0))]
-        at += marks.tolist()
-        sway = np.radians(sensor.swing) * 2 * np.sin(np.arange(len(marks)) * 0.9 + rng.uniform(0, 6))
-        turn += (heading[marks] + sway).tolist()
-    order = np.argsort(along[at], kind="stable")
-    index, yaw = np.array(at)[order], np.array(turn)[order]
-    count = len(index)
-    pitch = -np.radians(sensor.pitch + sensor.swing * np.sin(np.arange(count) * 2.4 + rng.uniform(0, 6)))
-    pitch = pitch if sensor.beams != 1 else np.zeros(count)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    c, s, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
-    poses[:, :3, :3] = np.moveaxis(np.array([[c * cp, -s, c * sp], [s * cp, c, s * sp], [-sp, 0 * s, cp]]), 2, 0)
-    poses[:, :3, 3] = walk.points[index] + [0, 0, sensor.height]
-    if sensor.step and sensor.beams != 1:
-        poses[:, 2, 3] += rng.normal(0, 0.03, count)
-    return poses, along[index]
-
-
-def _heading(points: Array) -> Array:
-    """rad, the way the walk goes at each point, looking 0.5 m ahead."""
-    ahead = np.roll(points, -5, axis=0)[:, :2] - points[:, :2]
-    ahead[-5:] = ahead[-6] if len(points) > 5 else (1.0, 0.0)
-    return np.arctan2(ahead[:, 1], ahead[:, 0])
-
-
-def _scene(vertices: Array, triangles: Array) -> Any:
-    """Embree's search tree over some of the triangles."""
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
-    scene = EmbreeScene()
-    TriangleMesh(scene, np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(triangles, np.int32))
-    return scene
-
-
-def _cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np.random.Generator) -> Hits:
-    """Cast the rays of all poses; mixed pixels are made here, while the rays still stand in images."""
-    rays, (rows, columns) = sensor.rays(number)
-    rays = rays.astype(np.float32)
-    reach = sensor.reach[1]
-    low, high = poses[:, 2, 3].min() - reach, poses[:, 2, 3].max() + reach
-    z = building.vertices[building.triangles, 2]
-    near = np.flatnonzero((z.max(axis=1) > low) & (z.min(axis=1) < high))
-    scene, clear = _scene(building.vertices, building.triangles[near]), None
-    glass = building.labels[near] == SURFACES.index("glass")
-    out = []
-    step = max(CHUNK // len(rays), 1)
-    for first in range(0, len(poses), step):
-        these = poses[first : first + step]
-        spun = rays
-        if sensor.azimuth == 360:  # the raster of a spinning sensor starts anywhere
-            turn = rng.uniform(0, 2 * np.pi / columns)
-            spun = rays @ Sim3(turn).matrix[:3, :3].T.astype(np.float32)
-        packed = np.empty((len(these), len(rays), 6), np.float32)
-        packed[..., :3] = these[:, None, :3, 3]
-        packed[..., 3:] = np.matmul(spun, these[:, :3, :3].astype(np.float32).transpose(0, 2, 1))
-        flat = packed.reshape(-1, 6)
-        ranges, triangle, cosine, normal = _shoot(scene, flat)
-        chance = rng.random(len(triangle))
-        pane = (triangle >= 0) & glass[triangle] & (chance >= sensor.glass)
-        ghost = pane & (chance >= 1 - sensor.ghost)
-        through = pane & ~ghost
-        if through.any():
-            clear = clear or _scene(building.vertices, building.triangles[near[~glass]])
-            beyond = _shoot(clear, flat[through])
-            ranges[through], cosine[through] = beyond[0], beyond[2]
-            triangle[through] = np.where(beyond[1] >= 0, np.flatnonzero(~glass)[beyond[1]], -1)
-        if ghost.any():
-            mirrored = _mirrored(flat[ghost], ranges[ghost], normal[ghost])
-            beyond = _shoot(scene, mirrored)
-            ranges[ghost], triangle[ghost], cosine[ghost] = ranges[ghost] + beyond[0], beyond[1], beyond[2]
-        image = ranges.reshape(-1, rows, columns)
-        ranges = _mix(image, sensor.mixed, rng).ravel()
-        kept = np.flatnonzero((triangle >= 0) & (ranges > sensor.reach[0]) & (ranges < reach))
-        pose = first + kept // len(rays)
-        out.append((pose, spun[kept % len(rays)], ranges[kept], near[triangle[kept]], cosine[kept], ghost[kept]))
-    return Hits(*(np.concatenate(column) for column in zip(*out, strict=True)))
-
-
-def _mirrored(rays: Array, ranges: Array, normal: Array) -> Array:
-    """Rays (n, 6) as panes with these normals throw them back."""
-    way = rays[:, 3:]
-    back = way - 2 * np.einsum("ni,ni->n", way, normal)[:, None] * normal
-    return np.hstack([rays[:, :3] + way * (ranges[:, None] - 0.001), back]).astype(np.float32)
-
-
-def _shoot(scene: Any, rays: Array) -> tuple[Array, Array, Array, Array]:
-    """Range (inf: none), triangle (-1: none), |cosine| of incidence and unit normals (n, 3) of rays (n, 6) of unit length."""
-    answer = scene.run(np.ascontiguousarray(rays[:, :3]), np.ascontiguousarray(rays[:, 3:]), output=True)
-    triangle = answer["primID"].astype(np.int64)
-    ranges = np.where(triangle >= 0, answer["tfar"], np.float32(np.inf)).astype(np.float32)
-    normal = answer["Ng"] / np.maximum(np.linalg.norm(answer["Ng"], axis=1), 1e-12)[:, None]
-    return ranges, triangle, np.abs(np.einsum("ni,ni->n", normal, rays[:, 3:])), normal
-
-
-def _mix(image: Array, share: float, rng: np.random.Generator) -> Array:
-    """Ranges between the two surfaces at some of the depth edges along a row."""
-    out = image.copy()
-    if image.shape[2] < 2 or not share:
-        return out
-    finite = np.where(np.isfinite(image), image, 1e6)
-    step = finite[:, :, 1:] - finite[:, :, :-1]
-    edge = (np.abs(step) > 0.15) & (np.abs(step) < 1e5)
-    where = np.nonzero(edge)
-    chosen = rng.random(len(where[0])) < share
-    k, i, j = (w[chosen] for w in where)
-    out[k, i, j] += step[k, i, j] * rng.beta(0.5, 0.5, len(k)) * 0.9
-    return out
-
-
 def _degrade(building: Building, poses: Array, hits: Hits, sensor: Sensor, rng: np.random.Generator) -> Hits:
     """Lose what returns badly, and add noise to the ranges."""
     count = len(hits.ranges)
@@ -273,7 +118,7 @@ def _degrade(building: Building, poses: Array, hits: Hits, sensor: Sensor, rng: 
     chance[np.isin(building.labels[hits.triangle], PLAIN)] *= sensor.plain
     kept = rng.random(count) < chance
     if sensor.lowest > 0:
-        kept &= _placed(poses, hits, hits.ranges)[:, 2] - poses[hits.pose, 2, 3] + sensor.height > sensor.lowest
+        kept &= placed(poses, hits, hits.ranges)[:, 2] - poses[hits.pose, 2, 3] + sensor.height > sensor.lowest
     sigma = sensor.noise[0] + sensor.noise[1] * hits.ranges + sensor.quadratic * hits.ranges**2
     ranges = np.clip(hits.ranges + rng.normal(size=count) * sigma, 0.01, sensor.reach[1])
     return replace(hits, ranges=ranges.astype(np.float32)).take(kept)
@@ -284,47 +129,10 @@ def _rooms_of(building: Building, poses: Array, hits: Hits) -> Array:
     floors = draw_floors(building, LABEL_CELL)
     near = [ndimage.distance_transform_edt(r < 0, return_distances=True, return_indices=True) for r in floors.room]
     filled = np.stack([np.where(d * LABEL_CELL < 0.3, r[i[0], i[1]], -1) for r, (d, i) in zip(floors.room, near, strict=True)])
-    points = _placed(poses, hits, hits.ranges - 0.08)
+    points = placed(poses, hits, hits.ranges - 0.08)
     storey = np.clip(np.searchsorted(building.storeys["floor"], points[:, 2] + 0.02, side="right") - 1, 0, None)
     ij = floors.cells(points)
     return np.where(hits.ghost, -1, filled[storey, ij[:, 0], ij[:, 1]]).astype(np.int32)
-
-
-def _drift(poses: Array, walk: Walk, along: Array, sensor: Sensor, rng: np.random.Generator) -> Array:
-    """The poses as odometry has them: the heading wanders, and the way bends with it; gravity is a little off."""
-    out = _jittered(poses, sensor, rng)
-    if sensor.drift:
-        total = walk.along[-1]
-        knots = np.arange(0, total + 30.0, 15.0)
-        error = np.interp(walk.along, knots, np.radians(sensor.drift) * rng.normal(size=len(knots)))
-        climb = np.interp(walk.along, knots, 0.002 * sensor.drift * rng.normal(size=len(knots)))
-        step = np.diff(walk.points, axis=0)
-        c, s = np.cos(error[1:]), np.sin(error[1:])
-        flat = np.hypot(step[:, 0], step[:, 1])
-        bent = np.stack([c * step[:, 0] - s * step[:, 1], s * step[:, 0] + c * step[:, 1], step[:, 2] + climb[1:] * flat], axis=1)
-        moved = np.concatenate([[walk.points[0]], walk.points[0] + np.cumsum(bent, axis=0)]) - walk.points
-        at = np.searchsorted(walk.along, along)
-        for k, i in enumerate(np.clip(at, 0, len(moved) - 1)):
-            out[k, :3, :3] = Sim3(float(error[i])).matrix[:3, :3] @ out[k, :3, :3]
-            out[k, :3, 3] += moved[i]
-    if sensor.tilt:
-        a, b = np.radians(sensor.tilt) * rng.normal(size=2)
-        lean = np.array([[1, 0, b], [0, 1, -a], [-b, a, 1]])
-        lean = np.linalg.qr(lean)[0] * np.sign(np.diag(np.linalg.qr(lean)[1]))
-        centre = out[:, :3, 3].mean(axis=0)
-        out[:, :3, 3] = (out[:, :3, 3] - centre) @ lean.T + centre
-        out[:, :3, :3] = lean @ out[:, :3, :3]
-    return out
-
-
-def _jittered(poses: Array, sensor: Sensor, rng: np.random.Generator) -> Array:
-    """The poses, each off by itself: what is left of the errors when a map has been put together."""
-    out = poses.copy()
-    shift, turn = rng.normal(0, sensor.jitter[0], (len(poses), 3)), np.radians(rng.normal(0, sensor.jitter[1], (len(poses), 3)))
-    flat = sensor.beams == 1
-    out[:, :3, 3] += shift * [1, 1, 0 if flat else 1]
-    out[:, :3, :3] = Rotation.from_rotvec(turn * [not flat, not flat, 1]).as_matrix() @ out[:, :3, :3]
-    return out
 
 
 def _thin(points: Array, spacing: float) -> Array:

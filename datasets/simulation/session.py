@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import shapely
-from topomerge.datasets.buildings.erect import draw_state
 from topomerge.datasets.buildings.fittings import SWING, keep_clear, leaf_yaw
 from topomerge.datasets.buildings.furniture import footprints, make_item
+from topomerge.datasets.buildings.openings import draw_state
 from topomerge.datasets.core.building import SURFACES, Building
 from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.core.solids import boxes, rotation

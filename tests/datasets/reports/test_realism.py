@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from topomerge.datasets.buildings.erect import erect
-from topomerge.datasets.reports import realism, realism_sources
+from topomerge.datasets.reports import realism, realism_measures, realism_sources
 
 from tests.datasets.boxes import BARE, one_room
 from topomerge.errors import InputError
@@ -30,7 +30,7 @@ def box(floor: float = 4.0, low: float = 0.0) -> Array:
 
 def test_a_whole_box_lacks_nothing() -> None:
     points = box()
-    row = realism.surfaces(points, realism.space_of(ROOM))
+    row = realism_measures.surfaces(points, realism_measures.space_of(ROOM))
     assert row is not None
     assert row["area"] == pytest.approx(20.0)
     assert row["points"] == pytest.approx(len(points) / 20)
@@ -39,7 +39,7 @@ def test_a_whole_box_lacks_nothing() -> None:
 
 
 def test_missing_floor_and_walls_are_shares_of_what_is_there() -> None:
-    row = realism.surfaces(box(floor=3.0, low=1.5), realism.space_of(ROOM))
+    row = realism_measures.surfaces(box(floor=3.0, low=1.5), realism_measures.space_of(ROOM))
     assert row is not None
     assert row["floor"] == pytest.approx(0.25 - 0.04, abs=0.03)  # the foot of the walls counts as floor
     side = (5 - 4 * 0.1) / 18  # of the outline; the ends are within 0.2 m of the other walls
@@ -50,22 +50,22 @@ def test_missing_floor_and_walls_are_shares_of_what_is_there() -> None:
 
 def test_clutter_is_what_is_neither_floor_nor_ceiling_nor_wall() -> None:
     points, table = box(), plane((1, 3), (1, 2), 2, 0.72)
-    row = realism.surfaces(np.concatenate([points, table]), realism.space_of(ROOM))
+    row = realism_measures.surfaces(np.concatenate([points, table]), realism_measures.space_of(ROOM))
     assert row is not None
     cells = len(np.unique(np.floor(points / 0.1 + 1e-6).astype(int), axis=0))
     assert row["clutter"] == pytest.approx(200 / (cells + 200), rel=0.1)
 
 
 def test_a_room_that_the_map_does_not_show_is_none() -> None:
-    assert realism.surfaces(box() + [30, 0, 0], realism.space_of(ROOM)) is None
-    assert realism.surfaces(np.zeros((0, 3)), realism.space_of(ROOM)) is None
-    assert realism.together([None]) == {"seen": 0.0}
+    assert realism_measures.surfaces(box() + [30, 0, 0], realism_measures.space_of(ROOM)) is None
+    assert realism_measures.surfaces(np.zeros((0, 3)), realism_measures.space_of(ROOM)) is None
+    assert realism_measures.together([None]) == {"seen": 0.0}
 
 
 def test_the_outline_of_a_cloud_is_that_of_its_largest_piece() -> None:
     away = plane((8, 9), (0, 1), 2, 0.0)
-    space = realism.outline_of(np.concatenate([box(floor=1.0), away]), 0.0, 2.7)
-    assert space.mask.sum() * realism.CELL**2 == pytest.approx(20, rel=0.06)
+    space = realism_measures.outline_of(np.concatenate([box(floor=1.0), away]), 0.0, 2.7)
+    assert space.mask.sum() * realism_measures.CELL**2 == pytest.approx(20, rel=0.06)
 
 
 def test_thickness_is_the_spread_across_planes() -> None:
@@ -73,23 +73,23 @@ def test_thickness_is_the_spread_across_planes() -> None:
     flat, wall = plane((0, 6), (0, 6), 2, 0.0), plane((0, 6), (1, 4), 0, 0.0)
     flat[:, 2] += rng.normal(0, 0.01, len(flat))
     wall[:, 0] += rng.normal(0, 0.03, len(wall))
-    found = realism.thickness(np.concatenate([flat, wall]))
+    found = realism_measures.thickness(np.concatenate([flat, wall]))
     assert found["flat"] == pytest.approx(10, rel=0.1) and found["upright"] == pytest.approx(30, rel=0.1)
     assert found["loose"] < 0.05
-    cloud = realism.thickness(rng.uniform(0, 2, (20_000, 3)))
+    cloud = realism_measures.thickness(rng.uniform(0, 2, (20_000, 3)))
     assert cloud["loose"] > 0.95
 
 
 def test_rooms_and_doors_are_counted() -> None:
-    row = realism.rooms_and_doors([[4.0, 10.0, 20.0], [150.0]], [0.9, 0.9, 0.9, 1.2])
+    row = realism_measures.rooms_and_doors([[4.0, 10.0, 20.0], [150.0]], [0.9, 0.9, 0.9, 1.2])
     assert row["rooms"] == 2 and row["area"] == 15 and row["small"] == row["large"] == 0.25
     assert row["door"] == 0.9 and row["equal"] == 0.75
-    assert np.isnan(realism.rooms_and_doors([[4.0]], [])["door"])
+    assert np.isnan(realism_measures.rooms_and_doors([[4.0]], [])["door"])
 
 
 def test_maps_are_weighed_by_the_area_of_their_rooms() -> None:
     rows = [{"area": 30.0, "floor": 0.1}, {"area": 10.0, "floor": 0.5}, None]
-    assert realism.together(rows)["floor"] == pytest.approx(0.2)
+    assert realism_measures.together(rows)["floor"] == pytest.approx(0.2)
 
 
 def test_a_table_leaves_out_what_is_not_known() -> None:
