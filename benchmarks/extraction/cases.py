@@ -39,8 +39,8 @@ LOOK = (
 )
 
 
-def _words(known: dict[str, float]) -> tuple[tuple[str, float], ...]:
-    return tuple(sorted(known.items()))
+def _words(difficulty: dict[str, float]) -> tuple[tuple[str, float], ...]:
+    return tuple(sorted(difficulty.items()))
 
 
 def dev() -> list[Case]:

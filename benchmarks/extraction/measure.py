@@ -54,30 +54,30 @@ def _measured(scan: Scan, preset: str, case: Case, out: Path, picture: bool, key
 
     began = process_time()
     try:
-        found = extract(scan.cloud, preset=preset, voxel_size=case.voxel)
+        extracted = extract(scan.cloud, preset=preset, voxel_size=case.voxel)
     except Exception as error:  # a map that fails altogether counts as nothing found
         row = {"error": f"{type(error).__name__}: {error}", "seconds": process_time() - began}
         return row if scan.truth is None else {**NOTHING, **row}
-    row = {"seconds": process_time() - began, "found": int((~found.rooms["glimpsed"]).sum()), "doors_found": len(found.edges)}
-    row |= {"levels_found": len(found.storeys)}
+    row = {"seconds": process_time() - began, "found": int((~extracted.rooms["glimpsed"]).sum())}
+    row |= {"doors_found": len(extracted.edges), "levels_found": len(extracted.storeys)}
     path = out / "pictures" / f"{case.name}-{preset}.png"
     if scan.truth is None:
         if picture:
             from topomerge.viz.figures import save_figure
 
             path.parent.mkdir(parents=True, exist_ok=True)
-            save_figure(found, path)
+            save_figure(extracted, path)
         return row
-    return {**row, **_judged(scan, found, f"{case.name}  {preset}", path if picture else None, out / "said" / f"{key}.npz")}
+    return {**row, **_judged(scan, extracted, f"{case.name}  {preset}", path if picture else None, out / "said" / f"{key}.npz")}
 
 
-def _judged(scan: Scan, found: Any, name: str, picture: Path | None, said_to: Path) -> Row:
+def _judged(scan: Scan, extracted: Any, name: str, picture: Path | None, said_to: Path) -> Row:
     from topomerge.datasets.simulation.floor_truth import judge, said
 
     assert scan.truth is not None
-    columns = said(found, scan.truth)
+    columns = said(extracted, scan.truth)
     keep(said_to, columns, scan.truth)
-    verdict = judge(found, scan.truth, columns)
+    verdict = judge(extracted, scan.truth, columns)
     rooms, doors, edges = verdict.rooms, verdict.doors, verdict.edges
     row: Row = {"iou": rooms.iou, "mcc": rooms.mcc, "precision": rooms.precision, "recall": rooms.recall}
     row |= {"door_precision": doors.precision, "door_recall": doors.recall}
@@ -89,7 +89,7 @@ def _judged(scan: Scan, found: Any, name: str, picture: Path | None, said_to: Pa
         from benchmarks.extraction.picture import save
 
         title = f"{name}: IoU {rooms.iou:.2f}, MCC {rooms.mcc:.2f}, doors {doors.precision:.2f}/{doors.recall:.2f}"
-        save(scan, found, columns, verdict, f"{title}, rooms {verdict.found_rooms}/{verdict.true_rooms}", picture)
+        save(scan, extracted, columns, verdict, f"{title}, rooms {verdict.found_rooms}/{verdict.true_rooms}", picture)
     return row
 
 

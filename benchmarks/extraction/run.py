@@ -56,7 +56,7 @@ def _numbered(number: int, *task: Any) -> tuple[int, Row]:
     return number, measure(*task)
 
 
-def known_rows(path: Path) -> dict[str, Row]:
+def cached_rows(path: Path) -> dict[str, Row]:
     """Lines of earlier runs by their keys."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     return {row["key"]: row for row in map(json.loads, lines)}
@@ -66,29 +66,29 @@ def results(cases: list[Case], presets: list[str], settings: argparse.Namespace)
     """A row for each case and preset; those that are missing are made now."""
     out, scans, code = Path(settings.out), Path(settings.scans), code_digest(*MAKERS)
     out.mkdir(parents=True, exist_ok=True)
-    known = known_rows(out / "results.jsonl")
+    rows_by_key = cached_rows(out / "results.jsonl")
     if settings.fresh:
-        known = {}
+        rows_by_key = {}
         for key in {case.key for case in cases}:
             (scans / f"{key}.npz").unlink(missing_ok=True)
     data = Path(os.environ["TOPOMERGE_DATA"]) if os.environ.get("TOPOMERGE_DATA") else None
     wanted = [(case, preset, key_of(case, preset, code)) for case in cases for preset in presets]
-    missing = [w for w in wanted if w[2] not in known or (settings.pictures and not known[w[2]].get("picture"))]
+    missing = [w for w in wanted if w[2] not in rows_by_key or (settings.pictures and not rows_by_key[w[2]].get("picture"))]
     missing = list({w[2]: w for w in missing}.values())
     with (out / "results.jsonl").open("a", encoding="utf-8") as file:
         for done, (n, row) in enumerate(run([(*w, scans, data, out, settings.pictures) for w in missing], settings.jobs), 1):
             case, preset, key = missing[n]
             print(f"# {done}/{len(missing)} {case.name} {preset} {_short(row)}", file=sys.stderr, flush=True)
-            known[key] = row
+            rows_by_key[key] = row
             if row["key"]:
                 file.write(json.dumps(row) + "\n")
                 file.flush()
-    told = {"set": "", "case": "", "place": "", "sensor": "", "kind": "", "scan": "", "day": 0}
+    empty_about = {"set": "", "case": "", "place": "", "sensor": "", "kind": "", "scan": "", "day": 0}
     about = [
-        told | {"set": c.set, "case": c.name, "place": c.place, "kind": c.building, "scan": c.key, "day": c.day}
+        empty_about | {"set": c.set, "case": c.name, "place": c.place, "kind": c.building, "scan": c.key, "day": c.day}
         for c, _, _ in wanted
     ]
-    return with_agreement([{**known[w[2]], **a, "key": w[2]} for w, a in zip(wanted, about, strict=True)], out)
+    return with_agreement([{**rows_by_key[w[2]], **a, "key": w[2]} for w, a in zip(wanted, about, strict=True)], out)
 
 
 def _short(row: Row) -> str:

@@ -150,6 +150,6 @@ def _scan(arrays: dict[str, Array]) -> Scan:
         free=free,
         source=str(arrays["source"]),
     )
-    known = {k.removeprefix("truth."): v for k, v in arrays.items() if k.startswith("truth.")}
+    truth = {k.removeprefix("truth."): v for k, v in arrays.items() if k.startswith("truth.")}
     rooms = tuple(TrueRoom(**{**r, "polygon": np.array(r["polygon"])}) for r in json.loads(str(arrays["rooms"])))
-    return Scan(cloud, Truth(**known) if known else None, rooms)
+    return Scan(cloud, Truth(**truth) if truth else None, rooms)

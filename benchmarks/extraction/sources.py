@@ -154,14 +154,14 @@ def _drift_of(cloud: PointCloud, straight: PointCloud) -> tuple[Array, Array]:
 
 def _spoilt(cloud: PointCloud, building: Building, spoil: str, rng: np.random.Generator) -> PointCloud:
     """The cloud after what is done to its points."""
-    points, kept = cloud.points, np.ones(len(cloud), bool)
+    points, visible = cloud.points, np.ones(len(cloud), bool)
     if spoil == "sparse":
-        kept = rng.random(len(points)) < 0.05
+        visible = rng.random(len(points)) < 0.05
     elif spoil == "below2":
         floor = building.storeys["floor"]
         storey = np.clip(np.searchsorted(floor - 0.3, points[:, 2]) - 1, 0, None)
-        kept = points[:, 2] < floor[storey] + 2.0
+        visible = points[:, 2] < floor[storey] + 2.0
     elif spoil == "noise":
         points = points + rng.normal(0, 0.04, points.shape).astype(np.float32)
-    pose_of = None if cloud.pose_of is None else cloud.pose_of[kept]
-    return replace(cloud, points=points[kept], labels=None, pose_of=pose_of)
+    pose_of = None if cloud.pose_of is None else cloud.pose_of[visible]
+    return replace(cloud, points=points[visible], labels=None, pose_of=pose_of)

@@ -121,8 +121,8 @@ def _storeys(rows: list[Row]) -> str:
     wrong = [r for r in rows if r["preset"] == "default" and not r["storeys"] and not r["error"]]
     if not wrong:
         return ""
-    told = [f"{r['case']} ({r['levels_found']} instead of {r['levels']})" for r in wrong]
-    return "Storeys wrong: " + "; ".join(told) + "."
+    storey_counts = [f"{r['case']} ({r['levels_found']} instead of {r['levels']})" for r in wrong]
+    return "Storeys wrong: " + "; ".join(storey_counts) + "."
 
 
 def write(path: Path, rows: list[Row], command: str, mark: str = MARK) -> None:

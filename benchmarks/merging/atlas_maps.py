@@ -54,8 +54,8 @@ def draw(split: str, maps: int, number: int) -> tuple[Atlas, Atlas | None]:
         rooms = int(rng.integers(ROOMS[0], ROOMS[1] + 1))
         other = number % 2 == 1 and maps >= 4
         try:
-            found = make_atlas(make_building(kind, seed), sensors, rng, rooms)
-            return found, make_atlas(make_building(kind, seed + 1), sensors[-2:], rng, rooms) if other else None
+            atlas = make_atlas(make_building(kind, seed), sensors, rng, rooms)
+            return atlas, make_atlas(make_building(kind, seed + 1), sensors[-2:], rng, rooms) if other else None
         except InputError:
             continue
     raise InputError(f"no set of {maps} maps number {number} can be made")
@@ -69,31 +69,31 @@ def make(split: str, maps: int, number: int) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     with one_thread():
-        found, other = draw(split, maps, number)
-        clouds = list(found.maps)
-        truth: list[Array | None] = [t.matrix for t in found.truth]
+        atlas, other = draw(split, maps, number)
+        clouds = list(atlas.maps)
+        truth: list[Array | None] = [t.matrix for t in atlas.truth]
         if other is not None:
             clouds[-1], truth[-1] = other.maps[1], None
         for k, cloud in enumerate(clouds):
-            name = f"map_{k:02d}_{found.sensors[k]}"
+            name = f"map_{k:02d}_{atlas.sensors[k]}"
             save_map(replace(extract(cloud), source=name), folder / f"{name}.tmap")
-    rooms = [[k, m, len(shared)] for (k, m), shared in sorted(found.shared.items())]
-    told = {
-        "building": found.building,
-        "sensors": found.sensors,
+    rooms = [[k, m, len(shared)] for (k, m), shared in sorted(atlas.shared.items())]
+    about = {
+        "building": atlas.building,
+        "sensors": atlas.sensors,
         "shared": rooms,
         "truth": [None if t is None else t.tolist() for t in truth],
     }
-    (folder / "truth.json").write_text(json.dumps(told))
-    print(f"{folder} {found.building} {time.perf_counter() - began:.0f} s", flush=True)
+    (folder / "truth.json").write_text(json.dumps(about))
+    print(f"{folder} {atlas.building} {time.perf_counter() - began:.0f} s", flush=True)
     return folder
 
 
 def load(folder: Path) -> AtlasSet:
     """A set that was made."""
-    told = json.loads((folder / "truth.json").read_text())
-    truth = tuple(None if t is None else sim3_of(np.array(t)) for t in told.pop("truth"))
-    return AtlasSet(folder.name, tuple(sorted(folder.glob("map_*.tmap"))), truth, told)
+    about = json.loads((folder / "truth.json").read_text())
+    truth = tuple(None if t is None else sim3_of(np.array(t)) for t in about.pop("truth"))
+    return AtlasSet(folder.name, tuple(sorted(folder.glob("map_*.tmap"))), truth, about)
 
 
 def sim3_of(matrix: Array) -> Sim3:

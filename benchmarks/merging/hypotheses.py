@@ -30,15 +30,15 @@ PARTNERS = (1, 2, 3, CANDIDATES)  # of a room
 MOST = 1000  # poses that are looked through
 
 
-def right(pose: Sim3, kept: KeptPair, limits: tuple[float, float]) -> bool:
+def right(pose: Sim3, pair: KeptPair, limits: tuple[float, float]) -> bool:
     """Is a pose near the true one, in the middle of what both maps saw?"""
-    assert kept.transform is not None
-    flat = any(sensor in FLAT for sensor in kept.about["sensors"])
-    return within(pose_error(pose, kept.transform, kept.anchor), flat, limits)
+    assert pair.transform is not None
+    flat = any(sensor in FLAT for sensor in pair.about["sensors"])
+    return within(pose_error(pose, pair.transform, pair.anchor), flat, limits)
 
 
 def proposed(
-    a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], cost: Array, partners: int, kept: KeptPair
+    a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], cost: Array, partners: int, pair: KeptPair
 ) -> tuple[int, float]:
     """Number of poses, and the place of the first right one in the order of how many rooms speak for each; inf without one."""
     pairs = best_partners(cost, partners)
@@ -46,27 +46,27 @@ def proposed(
     poses = candidate_poses(a, b, plans, pairs, weight, False)
     order = distinct(poses, votes(poses), MOST) if len(poses.yaw) else []
     for place, h in enumerate(order, 1):
-        if right(Sim3(float(poses.yaw[h]), tuple(poses.shift[h].tolist())), kept, NEAR):  # type: ignore[arg-type]
+        if right(Sim3(float(poses.yaw[h]), tuple(poses.shift[h].tolist())), pair, NEAR):  # type: ignore[arg-type]
             return len(poses.yaw), float(place)
     return len(poses.yaw), np.inf
 
 
-def measured(kept: KeptPair, name: str, merged: bool) -> dict[str, Any]:
+def measured(pair: KeptPair, name: str, merged: bool) -> dict[str, Any]:
     """A row of a pair and a descriptor."""
-    (a, b), describe = kept.maps(), embedder(name)
+    (a, b), describe = pair.maps(), embedder(name)
     began = time.process_time()
     rows = describe(a), describe(b)
     out: dict[str, Any] = {"embed": time.process_time() - began}
-    known = {id(a): rows[0], id(b): rows[1]}
+    rows_of_map = {id(a): rows[0], id(b): rows[1]}
     plans, cost = (top_down(a), top_down(b)), descriptor_costs(*rows)
-    out["proposed"] = {n: proposed(a, b, plans, cost, n, kept) for n in PARTNERS}
-    found = match(a, b, lambda m: known[id(m)]).alternatives
-    out["matched"] = bool(found) and right(found[0].transform, kept, RIGHT)
+    out["proposed"] = {n: proposed(a, b, plans, cost, n, pair) for n in PARTNERS}
+    hypotheses = match(a, b, lambda m: rows_of_map[id(m)]).alternatives
+    out["matched"] = bool(hypotheses) and right(hypotheses[0].transform, pair, RIGHT)
     if merged:
         began = time.process_time()
         result = merge([a, b], embedder=name)
         best = result.registration.transform if result.registration else None
-        good = best is not None and right(best, kept, RIGHT)
+        good = best is not None and right(best, pair, RIGHT)
         out |= {"merge": time.process_time() - began, "best": good, "said": result.merged}
     return out
 
@@ -82,10 +82,10 @@ def main() -> None:
     pairs = [k for k in load_set(args.manifest) if k.transform and len(k.matches) and not k.about["scale_free"]][: args.limit]
     embedder("engineered")(pairs[0].maps()[0])  # compiles
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in args.descriptors}
-    for number, kept in enumerate(pairs):
+    for number, pair in enumerate(pairs):
         for name in args.descriptors:
-            rows[name].append(measured(kept, name, number < args.merges))
-            print(kept.name[:8], name, rows[name][-1], flush=True)
+            rows[name].append(measured(pair, name, number < args.merges))
+            print(pair.name[:8], name, rows[name][-1], flush=True)
     heads = "pairs | s to describe | partners a room | poses | until right: median / 90 % | right in 10 | in 60 | matching right"
     print(f"| descriptor | {heads} |\n|{'---|' * 9}")
     for name, some in rows.items():

@@ -68,8 +68,8 @@ def ours(pair: GridPair) -> Answer:
     points = [np.asarray(g.properties["mean"]) for g in (pair.a, pair.b)]
     began = time.process_time()
     a, b = (voxelise(PointCloud(p), pair.a.edge) for p in points)
-    found = register(a, b, free=pair.free, scale="free" if pair.about["source"] in SCALELESS else "fixed")
-    return found.transform, found.accepted, time.process_time() - began
+    registration = register(a, b, free=pair.free, scale="free" if pair.about["source"] in SCALELESS else "fixed")
+    return registration.transform, registration.accepted, time.process_time() - began
 
 
 def whole(pair: GridPair) -> dict[str, float]:
@@ -80,8 +80,8 @@ def whole(pair: GridPair) -> dict[str, float]:
     began = time.process_time()
     a, b = (extract(cloud(g, f), name=n) for g, f, n in zip((pair.a, pair.b), pair.free, "ab", strict=True))
     middle = time.process_time()
-    found = merge([a, b], scale="free" if pair.about["source"] in SCALELESS else "fixed", force=True)
-    return {"extract": middle - began, "merge": time.process_time() - middle, "joined": float(found.map is not None)}
+    result = merge([a, b], scale="free" if pair.about["source"] in SCALELESS else "fixed", force=True)
+    return {"extract": middle - began, "merge": time.process_time() - middle, "joined": float(result.map is not None)}
 
 
 def kiss(voxel: float) -> Callable[[GridPair], Answer]:
@@ -95,11 +95,11 @@ def kiss(voxel: float) -> Callable[[GridPair], Answer]:
         clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cell_middles(g))) for g in (pair.b, pair.a)]
         thin = [np.asarray(c.voxel_down_sample(voxel).points, np.float32) for c in clouds]
         matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(voxel, use_quatro=True))
-        found = matcher.estimate(*thin)
+        solution = matcher.estimate(*thin)
         seconds = time.process_time() - began
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = np.array(found.rotation), np.array(found.translation).ravel()
-        return upright(matrix, pair), bool(found.valid), seconds
+        matrix[:3, :3], matrix[:3, 3] = np.array(solution.rotation), np.array(solution.translation).ravel()
+        return upright(matrix, pair), bool(solution.valid), seconds
 
     return run
 
@@ -125,8 +125,8 @@ def open3d(pair: GridPair) -> dict[str, Answer]:
     out: dict[str, Answer] = {}
     for name, method in run.items():
         began = time.process_time()
-        found = method()
-        out[name] = upright(np.asarray(found.transformation), pair), True, features + time.process_time() - began
+        solution = method()
+        out[name] = upright(np.asarray(solution.transformation), pair), True, features + time.process_time() - began
     return out
 
 
@@ -134,23 +134,24 @@ def learned(pair: GridPair) -> Answer:
     """`merge` of the extracted maps: rooms matched by the embedder that ships propose poses, too."""
     from topomerge.fusion.merge import merge
 
-    maps = pair.about["kept"].maps()  # type: ignore[attr-defined]
+    maps = pair.about["evaluation_pair"].maps()  # type: ignore[attr-defined]
     began = time.process_time()
-    found = merge(maps)
-    pose = found.registration.transform if found.registration else None
-    return pose, found.merged, time.process_time() - began
+    result = merge(maps)
+    pose = result.registration.transform if result.registration else None
+    return pose, result.merged, time.process_time() - began
 
 
-def kept_pairs() -> Iterator[GridPair]:
+def heldout_pairs() -> Iterator[GridPair]:
     """Held-out pairs of extracted maps that show something in common, as cells."""
-    for kept in load_set(HELDOUT):
-        if kept.transform is None or kept.about["common"] < 1 or kept.about["scale_free"]:
+    for evaluation_pair in load_set(HELDOUT):
+        if evaluation_pair.transform is None or evaluation_pair.about["common"] < 1 or evaluation_pair.about["scale_free"]:
             continue
-        maps = kept.maps()
+        maps = evaluation_pair.maps()
         a, b = (m.grid.with_properties(mean=m.grid.centroids()) for m in maps)
-        about = {"sensors": kept.about["sensors"], "building": str(kept.about["building"]), "kind": "overlap"}
-        told = {**about, "source": kept.about["source"], "kept": kept}
-        yield GridPair(kept.name, a, b, (maps[0].free, maps[1].free), kept.transform, kept.about["common"], told)
+        about = {key: evaluation_pair.about[key] for key in ("sensors", "source")}
+        about |= {"building": str(evaluation_pair.about["building"]), "kind": "overlap", "evaluation_pair": evaluation_pair}
+        free, common = (maps[0].free, maps[1].free), evaluation_pair.about["common"]
+        yield GridPair(evaluation_pair.name, a, b, free, evaluation_pair.transform, common, about)
 
 
 def scaled(pair: GridPair) -> GridPair:
@@ -167,14 +168,14 @@ def measured(pair: GridPair, all_the_way: bool) -> dict[str, Any]:
     """All methods on one pair."""
     given = scaled(pair)
     answers = {"kiss02": kiss(0.2)(given), "kiss03": kiss(0.3)(given), **open3d(given)}
-    told = {}
+    outcomes = {}
     for name, where, (pose, believed, seconds) in (("ours", pair, ours(pair)), *((n, given, a) for n, a in answers.items())):
-        told[name] = {"err": None if pose is None else error(pose, where), "believed": believed, "seconds": seconds}
-    if "kept" in pair.about:
+        outcomes[name] = {"err": None if pose is None else error(pose, where), "believed": believed, "seconds": seconds}
+    if "evaluation_pair" in pair.about:
         pose, believed, seconds = learned(pair)
-        told["learned"] = {"err": None if pose is None else error(pose, pair), "believed": believed, "seconds": seconds}
+        outcomes["learned"] = {"err": None if pose is None else error(pose, pair), "believed": believed, "seconds": seconds}
     about = {k: pair.about[k] for k in ("sensors", "building", "kind", "source")}
-    return {"name": pair.name, "common": pair.common, **about, "methods": told, "whole": whole(pair) if all_the_way else None}
+    return {"name": pair.name, "common": pair.common, **about, "methods": outcomes, "whole": whole(pair) if all_the_way else None}
 
 
 def chosen() -> Iterator[Path]:
@@ -192,7 +193,7 @@ def chosen() -> Iterator[Path]:
 def pairs(which: str, done: set[str]) -> Iterator[tuple[int, GridPair]]:
     """Numbered pairs that are not done."""
     if which:
-        every = real_pairs() if which == "real" else kept_pairs()
+        every = real_pairs() if which == "real" else heldout_pairs()
         yield from ((k, pair) for k, pair in enumerate(every) if pair.name not in done)
         return
     for k, path in enumerate(list(chosen())):
@@ -209,8 +210,8 @@ def run(seconds: float, which: str = "") -> None:
         row = measured(pair, k % WHOLE == 0 and not which)
         with target.open("a") as out:
             out.write(json.dumps(row) + "\n")
-        told = {m: (round(r["seconds"], 1), r["err"] and round(r["err"][0], 2)) for m, r in row["methods"].items()}
-        print(row["name"], row["sensors"], told, row["whole"], flush=True)
+        summary = {m: (round(r["seconds"], 1), r["err"] and round(r["err"][0], 2)) for m, r in row["methods"].items()}
+        print(row["name"], row["sensors"], summary, row["whole"], flush=True)
         if time.process_time() > seconds:
             return
 

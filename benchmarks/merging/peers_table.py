@@ -45,7 +45,7 @@ def rows_of_methods(which: str = "") -> list[Row]:
     """A row a pair and method, as `merge_results` has them; none where nothing was measured."""
     path = TARGETS[which]
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    return [{**row, **told, "method": m} for row in rows for m, told in row["methods"].items()]
+    return [{**row, **outcome, "method": m} for row in rows for m, outcome in row["methods"].items()]
 
 
 HEADS = ("pairs", "right %", "within 0.1 m, 1° %", "believed, wrong", "s, median", "s, most")
@@ -60,15 +60,15 @@ def measures(mine: Sequence[Row]) -> list[Any]:
 
 def behind(rows: Sequence[Row], keys: Sequence[Callable[[Row], str]]) -> str:
     """Where another method has more right than ours."""
-    found = []
+    shortfalls = []
     for key in keys:
         for group in sorted({key(r) for r in rows}):
             mine = [r for r in rows if key(r) == group]
             for limit in ((0.5, 5.0), FINE):
                 many = {m: sum(good(r, limit) for r in mine if r["method"] == m) for m in NAMES}
                 more = [f"{NAMES[m]} {n}" for m, n in many.items() if n > many["ours"]]
-                found += [f"{group}, within {limit[0]} m: {', '.join(more)}, topomerge {many['ours']}"] * bool(more)
-    return "; ".join(found) or "nowhere"
+                shortfalls += [f"{group}, within {limit[0]} m: {', '.join(more)}, topomerge {many['ours']}"] * bool(more)
+    return "; ".join(shortfalls) or "nowhere"
 
 
 def real() -> str:
@@ -81,8 +81,8 @@ def real() -> str:
 def heldout() -> str:
     """Held-out pairs of extracted maps by the area in common."""
     rows = rows_of_methods("heldout")
-    told = by(rows, lambda r: bin_of(r["common"]), list(BINS), "in common", (*HEADS, "right and believed"), with_verdict)
-    return "\n\n".join([KEPT, told]) if rows else ""
+    outcome = by(rows, lambda r: bin_of(r["common"]), list(BINS), "in common", (*HEADS, "right and believed"), with_verdict)
+    return "\n\n".join([KEPT, outcome]) if rows else ""
 
 
 def with_verdict(mine: Sequence[Row]) -> list[Any]:

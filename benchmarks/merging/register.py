@@ -39,8 +39,8 @@ def ours(pair: GridPair) -> Answer:
     """`register` with cells only, as maps have them; the scale is free where that of the source is unknown."""
     a, b = (VoxelGrid(g.cells, g.origin, g.edge, g.shape) for g in (pair.a, pair.b))
     scaled = pair.about["source"] in SCALELESS or pair.about.get("scaled")
-    found = register(a, b, free=pair.free, scale="free" if scaled else "fixed")
-    return found.transform, found.accepted, found.probability
+    registration = register(a, b, free=pair.free, scale="free" if scaled else "fixed")
+    return registration.transform, registration.accepted, registration.probability
 
 
 def kiss(voxel: float) -> Callable[[GridPair], Answer]:
@@ -51,10 +51,10 @@ def kiss(voxel: float) -> Callable[[GridPair], Answer]:
 
         config = kiss_matcher.KISSMatcherConfig(voxel)
         matcher = kiss_matcher.KISSMatcher(config)
-        found = matcher.estimate(cell_middles(pair.b), cell_middles(pair.a))
+        solution = matcher.estimate(cell_middles(pair.b), cell_middles(pair.a))
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = np.array(found.rotation), np.array(found.translation).ravel()
-        return upright(matrix, pair), bool(found.valid), float(found.valid)
+        matrix[:3, :3], matrix[:3, 3] = np.array(solution.rotation), np.array(solution.translation).ravel()
+        return upright(matrix, pair), bool(solution.valid), float(solution.valid)
 
     return run
 
@@ -81,8 +81,8 @@ def fpfh(pair: GridPair, voxel: float = 0.3) -> Answer:
     checks = [reg.CorrespondenceCheckerBasedOnEdgeLength(0.9), reg.CorrespondenceCheckerBasedOnDistance(1.5 * voxel)]
     estimate = reg.TransformationEstimationPointToPoint(False)
     criteria = reg.RANSACConvergenceCriteria(100_000, 0.999)
-    found = reg.registration_ransac_based_on_feature_matching(b, a, fb, fa, True, 1.5 * voxel, estimate, 3, checks, criteria)
-    return upright(found.transformation, pair), True, float(found.fitness)
+    solution = reg.registration_ransac_based_on_feature_matching(b, a, fb, fa, True, 1.5 * voxel, estimate, 3, checks, criteria)
+    return upright(solution.transformation, pair), True, float(solution.fitness)
 
 
 def fgr(pair: GridPair, voxel: float = 0.3) -> Answer:
@@ -92,8 +92,8 @@ def fgr(pair: GridPair, voxel: float = 0.3) -> Answer:
     reg = o3d.pipelines.registration
     b, a, fb, fa = open3d_features(pair, voxel)
     option = reg.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * voxel)
-    found = reg.registration_fgr_based_on_feature_matching(b, a, fb, fa, option)
-    return upright(found.transformation, pair), True, float(found.fitness)
+    solution = reg.registration_fgr_based_on_feature_matching(b, a, fb, fa, option)
+    return upright(solution.transformation, pair), True, float(solution.fitness)
 
 
 METHODS: dict[str, Callable[[GridPair], Answer]] = {

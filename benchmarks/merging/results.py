@@ -74,15 +74,15 @@ def by(
     groups: Sequence[str],
     name: str,
     heads: Sequence[str] = HEADS,
-    told: Callable[[Sequence[Row]], Sequence[Any]] = measures,
+    columns: Callable[[Sequence[Row]], Sequence[Any]] = measures,
 ) -> str:
-    """A line a group and method: what is `told` of its rows, under these heads."""
+    """A line a group and method: `columns` of its rows, under these heads."""
     out = []
     for group in groups:
         for method, title in NAMES.items():
             mine = [r for r in rows if r["method"] == method and key(r) == group]
             if mine:
-                out.append([group, title, *told(mine)])
+                out.append([group, title, *columns(mine)])
     return table([name, "method", *heads], out)
 
 
@@ -115,8 +115,8 @@ def tally(name: str, rows: Sequence[Row]) -> list[object]:
     low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
     high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
     most = np.round(sorted((r["probability"] for r in rows), reverse=True)[:3], 2).tolist()
-    told = f"{k} of {n}: {100 * low:.1f} to {100 * high:.1f} %"
-    return [name, len(rows), sum(r["believed"] for r in rows), told, ", ".join(map(str, most))]
+    interval = f"{k} of {n}: {100 * low:.1f} to {100 * high:.1f} %"
+    return [name, len(rows), sum(r["believed"] for r in rows), interval, ", ".join(map(str, most))]
 
 
 def negatives(rows: Sequence[Row], strangers: Sequence[Row]) -> str:
@@ -141,16 +141,16 @@ def reliability(rows: Sequence[Row], strangers: Sequence[Row]) -> str:
     every = [(r["probability"], good(r), fair(r)) for r in rows] + [(r["probability"], False, fair(r)) for r in strangers]
     out: list[Sequence[object]] = []
     gaps = []
-    for known in ([e for e in every if e[2]], every):
-        p, y = np.array([e[0] for e in known]), np.array([e[1] for e in known])
+    for group in ([e for e in every if e[2]], every):
+        p, y = np.array([e[0] for e in group]), np.array([e[1] for e in group])
         which, gap = np.minimum((p * 10).astype(int), 9), 0.0
         for k in np.unique(which):
             mine = which == k
             gap += mine.mean() * abs(p[mine].mean() - y[mine].mean())
             if len(gaps) == 0:
-                told = f"{k / 10:.1f} to {k / 10 + 0.1:.1f}"
-                out.append([told, int(mine.sum()), f"{p[mine].mean():.2f}", f"{y[mine].mean():.2f}"])
-        gaps.append(f"{gap:.3f} over {len(known)}")
+                label = f"{k / 10:.1f} to {k / 10 + 0.1:.1f}"
+                out.append([label, int(mine.sum()), f"{p[mine].mean():.2f}", f"{y[mine].mean():.2f}"])
+        gaps.append(f"{gap:.3f} over {len(group)}")
     heads = table(["told", "pairs", "mean", "right"], out)
     return f"{heads}\n\nExpected calibration error {gaps[0]} pairs; {gaps[1]} with those that nobody could tell apart."
 
@@ -246,7 +246,7 @@ def section() -> str:
     large = [r for r in mine if kind_of(r) in ("80-200", ">200")]
     buildings = len({r["building"] for r in mine})
     sensors = sorted({"-".join(sorted(r["sensors"])) for r in large})
-    kept = share(large, lambda r: good(r) and r["believed"])
+    believed = share(large, lambda r: good(r) and r["believed"])
     parts = [
         "`python -m benchmarks.merging.pairs test 175; python -m benchmarks.merging.drawings test 110; "
         "python -m benchmarks.merging.drawings test differs; python -m benchmarks.merging.register test 1000 ours; "
@@ -257,7 +257,7 @@ def section() -> str:
         f"believed: probability {THRESHOLD} or more. In brackets 95 % intervals over buildings. Seconds of processor.",
         BEFORE,
         by(mine, kind_of, ("<40", *BINS), "m² in common"),
-        f"Sharing 80 m² or more: {len(large)} pairs, right {share(large, good)} %, right and believed {kept} %; by sensors:",
+        f"Sharing 80 m² or more: {len(large)} pairs, right {share(large, good)} %, right and believed {believed} %; by sensors:",
         by(large, lambda r: "-".join(sorted(r["sensors"])), sensors, "sensors"),
         "Maps against the floor plan of their own building (a third of the plans without a scale; right: horizontally):",
         by(drawn, _plan_of, ("a scan", "a scan, no scale", "a slice", "a slice, no scale"), "floor plan and"),

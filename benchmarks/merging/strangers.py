@@ -93,17 +93,18 @@ def of_drawings(split: str, done: Collection[str]) -> Iterator[Row]:
         if path.stem in done or path.stem.endswith("_overlap"):
             continue
         pair = load(path)
-        told = {k: pair.about[k] for k in ("kind", "building", "sensors", "differs", "walls_differ", "scaled") if k in pair.about}
+        keys = ("kind", "building", "sensors", "differs", "walls_differ", "scaled")
+        about = {k: pair.about[k] for k in keys if k in pair.about}
         scale = "free" if pair.about["scaled"] else "fixed"
         run = partial(register, pair.a, pair.b, free=pair.free, scale=scale, refined=False)
-        yield _row({"name": path.stem, **told}, run)
+        yield _row({"name": path.stem, **about}, run)
 
 
 def _row(about: Row, run: Callable[[], Registration]) -> Row:
     began = time.process_time()
-    found = run()
+    registration = run()
     seconds = time.process_time() - began
-    return {**about, "probability": found.probability, "believed": found.accepted, "seconds": seconds}
+    return {**about, "probability": registration.probability, "believed": registration.accepted, "seconds": seconds}
 
 
 def main(split: str = "train", pairs: str = "100") -> None:
