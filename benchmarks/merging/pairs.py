@@ -24,7 +24,7 @@ from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.pairs.recipe import Item, Library, Recipe, draw_items, library, plans_of
 
 from topomerge.extraction.voxels import voxelise
-from topomerge.fusion.storey_plan import with_means
+from topomerge.fusion.cell_means import with_means
 from topomerge.io import archive
 from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
 

@@ -30,7 +30,7 @@ from topomerge.datasets.pairs.evaluation_pair import load_set
 from benchmarks.merging.pairs import GridPair, load
 from benchmarks.merging.register import SCALELESS, open3d_features, real_pairs, upright
 from benchmarks.training.calibrate_merge import error
-from topomerge.fusion.storey_plan import cell_middles
+from topomerge.fusion.cell_means import cell_middles
 from topomerge.types import PointCloud, Sim3, VoxelGrid
 
 CACHE = Path("cache/merge")

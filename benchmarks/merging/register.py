@@ -27,8 +27,8 @@ from topomerge.datasets.real.sources import iter_real_pairs
 
 from benchmarks.merging.pairs import GridPair, common_area, free_of, grid_of, load
 from benchmarks.training.calibrate_merge import error, kind_of, right
+from topomerge.fusion.cell_means import cell_middles
 from topomerge.fusion.registration import register
-from topomerge.fusion.storey_plan import cell_middles
 from topomerge.types import Array, Sim3, VoxelGrid
 
 SCALELESS = ("halmstad",)  # no metres per pixel are known

@@ -20,12 +20,15 @@ import numpy as np
 from scipy.optimize import minimize
 
 from benchmarks.merging.pairs import GridPair, load
+from topomerge.fusion.judge import Judge
 from topomerge.fusion.registration import _order as order
 from topomerge.fusion.scale import search_scaled
-from topomerge.fusion.search import View, search, wrapped
+from topomerge.fusion.search import search
 from topomerge.fusion.storey_plan import plans
-from topomerge.fusion.verify import CLOSER, LEAD, VECTOR, Judge, closer_vector, lead, rank, vector
-from topomerge.fusion.winner_features import closer
+from topomerge.fusion.verify import LEAD_VECTOR, POSE_VECTOR, WINNER_VECTOR, lead, rank, vector, winner_vector
+from topomerge.fusion.winner_features import winner_features
+from topomerge.matching.plan_fields import PlanFields
+from topomerge.matching.poses import wrapped
 from topomerge.types import Array, Sim3
 
 FOLDER, DRAWN, ROWS = Path("cache/merge/train"), Path("cache/merge/train_drawings"), Path("cache/merge/judged.jsonl")
@@ -105,7 +108,7 @@ def together(first: GridPair, second: GridPair) -> GridPair:
 
 def judged(pair: GridPair) -> list[dict[str, Any]]:
     """Hypotheses with what they are judged by and their errors; the first ones with what only the best one is asked."""
-    a, b = ([View(p) for p in plans(g, f)] for g, f in ((pair.a, pair.free[0]), (pair.b, pair.free[1])))
+    a, b = ([PlanFields(p) for p in plans(g, f)] for g, f in ((pair.a, pair.free[0]), (pair.b, pair.free[1])))
     find = search_scaled if pair.about.get("scaled") else search
     if order(pair.b) < order(pair.a):
         judge, turn = Judge(b, a), True
@@ -114,10 +117,10 @@ def judged(pair: GridPair) -> list[dict[str, Any]]:
         judge, turn = Judge(a, b), False
         candidates = find(a, b)
     rows = []
-    for k, (c, f, _) in enumerate(rank(candidates, judge)[:KEPT]):
-        pose = c.pose.inverse() if turn else c.pose
-        told = {**closer(judge, c.pose), "pose": c.pose.matrix.tolist()} if k < LOOKED else {}
-        rows.append({**f, **told, "err": error(pose, pair)})
+    for k, h in enumerate(rank(candidates, judge)[:KEPT]):
+        pose = h.transform.inverse() if turn else h.transform
+        told = {**winner_features(judge, h.transform), "pose": h.transform.matrix.tolist()} if k < LOOKED else {}
+        rows.append({**h.features, **told, "err": error(pose, pair)})
     return rows
 
 
@@ -166,7 +169,7 @@ class Table:
 def tabled(rows: list[dict[str, Any]]) -> Table:
     """Hypotheses as arrays."""
     every = [(i, h) for i, row in enumerate(rows) for h in row["hyps"]]
-    near = [closer_vector(h) if "pieces" in h else np.full(len(CLOSER), np.nan) for _, h in every]
+    near = [winner_vector(h) if "pieces" in h else np.full(len(WINNER_VECTOR), np.nan) for _, h in every]
     names = [row["building"].split(" + ")[0] for row in rows]
     y = np.array([label(h, rows[i]) for i, h in every])
     x = np.array([vector(h) for _, h in every])
@@ -196,7 +199,7 @@ def fit() -> None:
     pairs; what left-out pairs say about them is printed of the pairs that each is for."""
     found = {row["name"]: row for row in map(json.loads, ROWS.read_text().splitlines())}
     rows = [row for row in with_differs(list(found.values()), "train") if row["hyps"] and fair(row)]
-    result: dict[str, Any] = {"names": [*VECTOR, *LEAD, *CLOSER], "threshold": THRESHOLD}
+    result: dict[str, Any] = {"names": [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR], "threshold": THRESHOLD}
     result["solid"] = fit_models([row for row in rows if "drawing" not in row["sensors"]], False)
     result["flat"] = fit_models(rows, True)
     TARGET.write_text(json.dumps(_rounded(result), indent=1) + "\n")
@@ -206,10 +209,10 @@ def fit_models(rows: list[dict[str, Any]], flat: bool) -> dict[str, Any]:
     """Both models of these pairs; told is what they say of those that are flat, or are not."""
     t = tabled(rows)
     sure = t.y >= 0
-    pose, held = fitted(t.x[sure], t.y[sure] > 0, VECTOR, 1.0), np.zeros(len(t.y))
+    pose, held = fitted(t.x[sure], t.y[sure] > 0, POSE_VECTOR, 1.0), np.zeros(len(t.y))
     for train, test in folds(t.building[t.owner]):
         train = train[sure[train]]
-        held[test] = logits(fitted(t.x[train], t.y[train] > 0, VECTOR, 1.0), t.x[test])
+        held[test] = logits(fitted(t.x[train], t.y[train] > 0, POSE_VECTOR, 1.0), t.x[test])
     chosen = [(i, best(t, held, pose, i)) for i in range(len(t.rows))]
     chosen = [(i, c) for i, c in chosen if c is not None]
     others = [(i, best(t, held, pose, i, True)) for i, c in chosen if (t.y[t.owner == i] > 0).any()]
@@ -219,7 +222,7 @@ def fit_models(rows: list[dict[str, Any]], flat: bool) -> dict[str, Any]:
     share = np.array([c[2] for _, c in chosen])  # type: ignore[index]
     building = np.array([t.building[i] for i, _ in (*chosen, *others)])
     weight = np.where(np.arange(len(y)) < len(chosen), 1.0, MISSED) * np.where(flat & (y == 0), STRICT, 1.0)
-    names, believed = [*VECTOR, *LEAD, *CLOSER], np.zeros(len(y))
+    names, believed = [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR], np.zeros(len(y))
     for train, test in folds(building):
         train = train[y[train] >= 0]
         model = fitted(x[train], y[train] > 0, names, STRENGTH, weight[train])

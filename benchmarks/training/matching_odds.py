@@ -48,7 +48,7 @@ def collect(manifest: Path) -> Iterator[Found]:
         for b, true in ((own, True), (pairs[(n + 7) % len(pairs)].maps()[1], False)):
             hypotheses = match(a, b).alternatives
             off = [is_right(p, h.transform) for h in hypotheses] if true else [False] * len(hypotheses)
-            evidence = np.array([list(h.evidence.values()) for h in hypotheses]).reshape(-1, 3)
+            evidence = np.array([list(h.features.values()) for h in hypotheses]).reshape(-1, 3)
             rooms, one = np.zeros((0, 5)), np.zeros(0, bool)
             if true and p.transform is not None:
                 meet, fit = rooms_in_common(a, b, p.transform)

@@ -22,7 +22,7 @@ from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.io.maps import load_map, save_map
 from topomerge.matching.consistency import matches_under, storey_map
-from topomerge.matching.door_poses import Poses
+from topomerge.matching.poses import PoseArrays
 from topomerge.matching.topdown import top_down
 from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
 
@@ -209,7 +209,7 @@ def laid(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
     if t is None or pair.kind != "overlap":
         return np.zeros((0, 2), np.int64)
     plans = (top_down(maps[0]), top_down(maps[1]))
-    pose = Poses(np.array([t.yaw]), np.array([t.translation]), np.array([t.scale]), np.ones(1))
+    pose = PoseArrays(np.array([t.yaw]), np.array([t.translation]), np.array([t.scale]), np.ones(1))
     rooms, fit = matches_under(t, plans, storey_map(pose, plans[0].floors, plans[1].floors)[0])
     kept: list[tuple[int, int]] = []
     for i, j in rooms[np.argsort(-fit, kind="stable")][: int((fit >= LAID).sum())].tolist():

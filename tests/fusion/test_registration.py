@@ -10,12 +10,13 @@ import pytest
 from tests.fusion.plans_of import MOVE, doubled, grid_of, off, office, part
 from tests.scenes import HEIGHT, Scene
 from topomerge.errors import InputError
+from topomerge.fusion.judge import Judge
 from topomerge.fusion.refine import refine_pose, surface
 from topomerge.fusion.registration import register
-from topomerge.fusion.search import View, direction_profile, yaw_candidates
 from topomerge.fusion.storey_plan import plans
-from topomerge.fusion.verify import Judge
+from topomerge.fusion.yaw_candidates import yaw_candidates
 from topomerge.kernels import align
+from topomerge.matching.plan_fields import PlanFields, direction_profile, distance_to
 from topomerge.types import Sim3, VoxelGrid
 
 
@@ -57,7 +58,7 @@ def test_order_of_cells_changes_nothing(halves):
 
 def test_a_hypothesis_is_tried_and_refined(halves):
     near = Sim3(-MOVE.yaw + 0.03, MOVE.inverse().translation)
-    found = register(*halves, hypotheses=[near], yaws=[0.3])
+    found = register(*halves, proposed=[near], yaws=[0.3])
     assert off(found.transform, MOVE.inverse(), middle_in_b())[0] < 0.03
 
 
@@ -112,7 +113,7 @@ def test_a_storey_that_fits_two_is_not_believed(points):
 
 def test_free_space_speaks_against_a_wall():
     hall, cut = Scene().shell(0, 0, 10, 8), Scene().shell(0, 0, 10, 8).wall((5, 0), (5, 8), doors=(3.0,))
-    a, b = ([View(p) for p in plans(grid_of(s.points()))] for s in (hall, cut))
+    a, b = ([PlanFields(p) for p in plans(grid_of(s.points()))] for s in (hall, cut))
     judged = Judge(a, b)(Sim3())
     assert judged["conflict"] > 0.3 and judged["conflict_share"] > 0.1
     assert Judge(a, a)(Sim3())["conflict"] == 0 and Judge(a, a)(Sim3())["ratio"] > 0.95
@@ -151,9 +152,8 @@ def test_poses_refined_on_a_distance_field():
     rng = np.random.default_rng(0)
     mask = np.zeros((120, 100), bool)
     mask[20:90, 30] = mask[20, 30:80] = mask[60, 30:60] = True
-    from topomerge.fusion.search import _distance
 
-    field = _distance(mask, 0.1)
+    field = distance_to(mask, 0.1)
     walls = (np.argwhere(mask) + 0.5) * 0.1
     middle = walls.mean(axis=0)
     start = np.array([[*(middle + rng.uniform(-0.2, 0.2, 2)), 0.04, 0.0] for _ in range(5)])

@@ -8,13 +8,14 @@ import pytest
 from tests.fusion.plans_of import doubled, grid_of, office
 from tests.scenes import HEIGHT, Scene
 from topomerge.errors import InputError
-from topomerge.fusion.storey_plan import extruded, plans, slices
+from topomerge.fusion.storey_levels import extruded, slices
+from topomerge.fusion.storey_plan import plans
 from topomerge.kernels.plan import column_bits, on_lines
 from topomerge.types import VoxelGrid
 
 
 def at(plan, mask, x, y) -> bool:
-    i, j = np.floor((np.array([x, y]) - plan.origin) / plan.cell).astype(int)
+    i, j = np.floor((np.array([x, y]) - plan.origin) / plan.edge).astype(int)
     return bool(mask[i, j])
 
 
@@ -25,13 +26,13 @@ def room():
 
 def test_walls_floor_and_furniture_of_a_room(room):
     (plan,) = plans(grid_of(room))
-    assert plan.floor == pytest.approx(0.021, abs=0.03)
-    assert plan.ceiling == pytest.approx(HEIGHT + 0.021, abs=0.06)
+    assert plan.levels[0] == pytest.approx(0.021, abs=0.03)
+    assert plan.levels[1] == pytest.approx(HEIGHT + 0.021, abs=0.06)
     assert at(plan, plan.free, 1, 3) and at(plan, plan.free, 5, 2)
     assert at(plan, plan.clutter, 2.5, 1.5) and not at(plan, plan.wall, 2.5, 1.5)
     assert at(plan, plan.wall, 3, 0.05) and at(plan, plan.wall, 6.05, 2)
     assert not (plan.wall & plan.free).any() and not (plan.clutter & (plan.wall | plan.free)).any()
-    assert plan.free.sum() * plan.cell**2 == pytest.approx(6 * 4 - 1, rel=0.06)
+    assert plan.free.sum() * plan.edge**2 == pytest.approx(6 * 4 - 1, rel=0.06)
 
 
 def test_without_ceiling_and_without_all_that_is_low(room):
@@ -75,7 +76,7 @@ def test_a_tilted_floor_stays_free(room):
     tilted = room.copy()
     tilted[:, 2] += 0.06 * tilted[:, 0]  # 0.36 m over the room: more than a band
     (plan,) = plans(grid_of(tilted))
-    assert plan.free.sum() * plan.cell**2 > 0.85 * 23
+    assert plan.free.sum() * plan.edge**2 > 0.85 * 23
 
 
 def test_extruded_drawings_are_maps():

@@ -7,20 +7,21 @@ import pytest
 
 from tests.fusion.plans_of import MOVE, grid_of, off, office, part
 from tests.scenes import Scene
+from topomerge.fusion.judge import Judge
 from topomerge.fusion.registration import register
-from topomerge.fusion.search import View
 from topomerge.fusion.storey_plan import plans
-from topomerge.fusion.verify import CLOSER, LEAD, VECTOR, Judge, closer_vector, model
-from topomerge.fusion.winner_features import closer
+from topomerge.fusion.verify import LEAD_VECTOR, POSE_VECTOR, WINNER_VECTOR, model, winner_vector
+from topomerge.fusion.winner_features import winner_features
+from topomerge.matching.plan_fields import PlanFields
 from topomerge.types import Sim3
 
 
-def views(points):
-    return tuple(View(p) for p in plans(grid_of(points)))
+def storeys(points):
+    return tuple(PlanFields(p) for p in plans(grid_of(points)))
 
 
 def seen(a, b, pose=None):
-    return closer(Judge(views(a), views(b)), pose or Sim3())
+    return winner_features(Judge(storeys(a), storeys(b)), pose or Sim3())
 
 
 def stretched(points, beyond=14.0, by=1.6):
@@ -77,10 +78,10 @@ def test_both_ways_say_the_same(points):
 
 def test_the_calibration_fits_its_features():
     found = model()
-    assert found["names"] == [*VECTOR, *LEAD, *CLOSER]
+    assert found["names"] == [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR]
     for kind in ("solid", "flat"):
         winner, pose = (found[kind][which]["weight"] for which in ("winner", "pose"))
-        assert len(winner) == len(found["names"]) and len(pose) == len(VECTOR)
+        assert len(winner) == len(found["names"]) and len(pose) == len(POSE_VECTOR)
     assert 0.5 <= found["threshold"] < 1
 
 
@@ -88,18 +89,18 @@ def test_little_evidence_is_no_praise():
     """Shares of nothing are drawn to what is usual: two walls that just touch must not beat a building that agrees."""
     known = dict.fromkeys(("tall_conflict", "crossing", "squares", "bad_squares", "in_place", "pieces", "by_chance"), 0.0)
     known |= {"moved_walls": 0.0, "worst_ratio": 0.5, "hanging": 0.0, "hanging_met": 0.0, "free": 0.0}
-    assert np.isfinite(closer_vector(known)).all() and len(closer_vector(known)) == len(CLOSER)
+    assert np.isfinite(winner_vector(known)).all() and len(winner_vector(known)) == len(WINNER_VECTOR)
 
 
 def test_amounts_grow_no_more_on_large_floors():
     """Ten times the floor with ten times the pieces out of place, lamps gone and high walls in the way says the same."""
     amounts = {"tall_conflict": 2.0, "pieces": 30.0, "in_place": 10.0, "by_chance": 1.0, "hanging": 9.0, "hanging_met": 4.0}
     shares = {"crossing": 20.0, "squares": 20.0, "bad_squares": 0.1, "moved_walls": 0.02, "worst_ratio": 0.7}
-    names = [CLOSER.index(n) for n in ("tall", "in_place", "out_of_place", "hanging", "fallen")]
+    names = [WINNER_VECTOR.index(n) for n in ("tall", "in_place", "out_of_place", "hanging", "fallen")]
     floors = [{**shares, **{k: m * v for k, v in amounts.items()}, "free": m * 2000.0} for m in (1.0, 10.0)]
-    one, ten = (closer_vector(f)[names] for f in floors)
+    one, ten = (winner_vector(f)[names] for f in floors)
     assert np.allclose(one, ten, atol=0.1)
-    small = closer_vector({**floors[0], "free": 20.0})[names]
+    small = winner_vector({**floors[0], "free": 20.0})[names]
     assert (small > one + 0.5).all()
 
 

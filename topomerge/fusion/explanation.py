@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from topomerge.fusion.registration import Alternative, Registration
+from topomerge.fusion.registration import Registration
+from topomerge.matching.poses import PoseHypothesis
 
 RIVAL_LAG = 1.5  # log odds: a hypothesis less far behind is as good
 Row = tuple[str, str, str]  # what, how much, what it says
@@ -52,7 +53,7 @@ def evidence_rows(registration: Registration) -> list[Row]:
     if f.get("ceiling_area", 0) > 0:
         words = f"how unlike they are over {f['ceiling_area']:.0f} m²; storeys of one plan often differ here"
         rows.append(("ceilings", f"{f['ceilings']:.2f} m", words))
-    rows += _closer_rows(f)
+    rows += _winner_rows(f)
     if np.isfinite(f.get("rmse", np.nan)):
         rows.append(("surfaces", f"{100 * f['rmse']:.1f} cm", "root mean square distance of surfaces that are one"))
     if len(registration.alternatives) > 1:
@@ -62,8 +63,8 @@ def evidence_rows(registration: Registration) -> list[Row]:
     return rows
 
 
-def _closer_rows(f: Mapping[str, float]) -> list[Row]:
-    """What only the best hypothesis was asked (`closer.closer`); joined maps of older versions do not have it."""
+def _winner_rows(f: Mapping[str, float]) -> list[Row]:
+    """What only the best hypothesis was asked (`winner_features`); joined maps of older versions do not have it."""
     if "moved_walls" not in f:
         return []
     rows = [
@@ -79,12 +80,12 @@ def _closer_rows(f: Mapping[str, float]) -> list[Row]:
     return rows
 
 
-def hypothesis_row(rank: int, other: Alternative, best: Alternative, middle: Mapping[str, float] | np.ndarray) -> list[str]:
+def hypothesis_row(rank: int, other: PoseHypothesis, best: PoseHypothesis, middle: Mapping[str, float] | np.ndarray) -> list[str]:
     """A hypothesis as text: rank, turn, distance from the best one, odds against it, walls, conflict."""
     at = np.asarray(middle, float)[None]
     away = float(np.linalg.norm(other.transform.apply(at) - best.transform.apply(at)))
     turn = (np.degrees(other.transform.yaw) + 180) % 360 - 180
-    odds = np.exp(np.clip(other.plausibility - best.plausibility, -15, 15))
+    odds = np.exp(np.clip(other.score - best.score, -15, 15))
     f = other.features
     share = f"{100 * f['conflict_share']:.1f} %"
     return [str(rank), f"{turn:.1f}", f"{away:.1f}", f"{odds:.2g}", f"{f['walls']:.1f}", f"{f['free']:.0f}", share]

@@ -21,10 +21,10 @@ from scipy import ndimage
 from topomerge.errors import InputError
 from topomerge.extraction.convolution import convolve, moore
 from topomerge.extraction.extract import COARSEST, FINEST, PRESETS, extract
-from topomerge.fusion.storey_plan import extruded
+from topomerge.fusion.storey_levels import extruded
 from topomerge.kernels import morton
 from topomerge.matching.consistency import matches_under, storey_map
-from topomerge.matching.door_poses import Poses
+from topomerge.matching.poses import PoseArrays
 from topomerge.matching.topdown import top_down
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
@@ -236,7 +236,7 @@ def rooms_in_common(a: TopometricMap, b: TopometricMap, transform: Sim3) -> tupl
     if not len(a.rooms) or not len(b.rooms):
         return np.zeros((0, 2), np.int64), np.zeros(0)
     plans = (top_down(a), top_down(b))
-    pose = Poses(np.array([transform.yaw]), np.array([transform.translation]), np.array([transform.scale]), np.ones(1))
+    pose = PoseArrays(np.array([transform.yaw]), np.array([transform.translation]), np.array([transform.scale]), np.ones(1))
     return matches_under(transform, plans, storey_map(pose, plans[0].floors, plans[1].floors)[0])
 
 

@@ -75,7 +75,7 @@ def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> Merge
     threshold = checked_threshold(settings.threshold)
     clock = _Clock()
     hypotheses = _room_hypotheses(a, b, settings, clock)
-    registration = register(a, b, scale=settings.scale, hypotheses=hypotheses, searched=settings.poses == "search")
+    registration = register(a, b, scale=settings.scale, proposed=hypotheses, searched=settings.poses == "search")
     believed = registration.transform is not None and registration.probability >= threshold
     result = MergeResult(
         "merged" if believed else "abstained",

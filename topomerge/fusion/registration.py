@@ -11,29 +11,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.fusion.cell_means import cell_middles
+from topomerge.fusion.judge import Judge
 from topomerge.fusion.refine import Surface, refine_pose, surface
 from topomerge.fusion.scale import search_scaled
-from topomerge.fusion.search import Candidate, View, search
-from topomerge.fusion.search import refined as moved
-from topomerge.fusion.storey_plan import cell_middles, plans
-from topomerge.fusion.verify import MARGIN_CAP, Judge, Ranked, model, probability, rank
-from topomerge.fusion.winner_features import closer
+from topomerge.fusion.search import search
+from topomerge.fusion.storey_plan import plans
+from topomerge.fusion.verify import MARGIN_CAP, model, probability, rank
+from topomerge.fusion.winner_features import winner_features
+from topomerge.matching.plan_fields import PlanFields
+from topomerge.matching.poses import PoseHypothesis, wrapped
+from topomerge.matching.refinement import refine
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
 log = logging.getLogger(__name__)
 ALTERNATIVES = 10
 DRIFTED = (0.5, np.radians(3.0))  # m, rad: a refinement that moves the middle by more has lost its way
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """A hypothesis: T_ab, log odds that it is right seen by itself, what it was judged by, and its probability beside all others
-    (those of a registration and that none is right sum to 1)."""
-
-    transform: Sim3
-    plausibility: float
-    features: dict[str, float]
-    probability: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -44,8 +37,9 @@ class Registration:
         transform: T_ab of the best hypothesis, believed or not; None where there was none.
         probability: that it is right, calibrated on simulated pairs; 0 without a hypothesis.
         accepted: is the probability above the threshold of the calibration?
-        features: what it was judged by (`verify.Judge`, `closer.closer`), with ``margin`` and ``rmse`` (m).
-        alternatives: the hypotheses, best first; the first one is the best before its fine registration.
+        features: what it was judged by (`Judge`, `winner_features`), with ``margin`` and ``rmse`` (m).
+        alternatives: the hypotheses, best first, their scores the log odds of each seen by itself (`verify.rank`); the first one
+            is the best before its fine registration.
         reason: in words.
         seconds: step -> s.
     """
@@ -54,7 +48,7 @@ class Registration:
     probability: float
     accepted: bool
     features: dict[str, float] = field(default_factory=dict)
-    alternatives: tuple[Alternative, ...] = ()
+    alternatives: tuple[PoseHypothesis, ...] = ()
     reason: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -67,13 +61,13 @@ class Prepared:
     """What registration needs of a map; made once where a map is registered with several.
 
     Args:
-        views: its storeys, lowest first.
+        storeys: their plans, lowest first.
         order: larger maps come first; among equal ones the order is arbitrary, but always the same.
         middle: (3,) of its cells, m.
         surface: makes its points and normals, for the fine registration.
     """
 
-    views: tuple[View, ...]
+    storeys: tuple[PlanFields, ...]
     order: tuple[int, str]
     middle: Array
     surface: Callable[[], Surface]
@@ -89,8 +83,8 @@ def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
         InputError: an empty map.
     """
     grid = _grid(map)
-    views = tuple(View(p) for p in plans(map, free))
-    return Prepared(views, _order(map), cell_middles(grid).mean(axis=0), lambda: surface(grid))
+    storeys = tuple(PlanFields(p) for p in plans(map, free))
+    return Prepared(storeys, _order(map), cell_middles(grid).mean(axis=0), lambda: surface(grid))
 
 
 def register(
@@ -98,7 +92,7 @@ def register(
     b: Map | Prepared,
     *,
     scale: str = "fixed",
-    hypotheses: Sequence[Sim3] = (),
+    proposed: Sequence[Sim3] = (),
     free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
     yaws: Sequence[float] = (),
     refined: bool = True,
@@ -108,12 +102,12 @@ def register(
 
     Args:
         a, b: topometric maps or occupied cells, or what `prepare` made of them.
-        scale: "fixed", or "free" where b's unit may differ (found between 0.5 and 2).
-        hypotheses: poses T_ab from matched rooms, tried beside those found by correlation.
+        scale: "fixed", or "free" where b's unit may differ (looked for between 0.5 and 2).
+        proposed: poses T_ab of matched rooms, tried beside those of the correlation.
         free: cells of a and of b known to be empty; topometric maps bring their own.
         yaws: further turns of b to try, rad.
         refined: finish with the fine registration? Without it the pose is right to a cell.
-        searched: look for poses by correlation? Else the hypotheses are all there is.
+        searched: look for poses by correlation? Else the proposed ones are all there is.
 
     Raises:
         InputError: an empty map, or another word for the scale.
@@ -124,27 +118,27 @@ def register(
     a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
-        turned = [h.inverse() for h in hypotheses], [-y for y in yaws]
-        found = register(b, a, scale=scale, hypotheses=turned[0], yaws=turned[1], refined=refined, searched=searched)
-        return replace(_inverse(found), seconds={**found.seconds, **clock.seconds})
-    first, second = a.views, b.views
+        poses, turns = [pose.inverse() for pose in proposed], [-y for y in yaws]
+        swapped = register(b, a, scale=scale, proposed=poses, yaws=turns, refined=refined, searched=searched)
+        return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
+    first, second = a.storeys, b.storeys
     if searched:
-        candidates = (search_scaled if scale == "free" else search)(first, second, hypotheses, yaws)
+        hypotheses = (search_scaled if scale == "free" else search)(first, second, proposed, yaws)
     else:
-        candidates = moved(first, second, [Candidate(h, 0.0, True) for h in hypotheses])
+        hypotheses = refine(first, second, [PoseHypothesis(pose, from_rooms=True) for pose in proposed])
     clock("search")
-    if not candidates:
+    if not hypotheses:
         reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
         return Registration(None, 0.0, False, reason=reason, seconds=clock.seconds)
     judge = Judge(first, second)
-    ranked = rank(candidates, judge)
-    seen = closer(judge, ranked[0][0].pose)
+    ranked = rank(hypotheses, judge)
+    winner = winner_features(judge, ranked[0].transform)
     clock("verify")
-    pose, rmse = ranked[0][0].pose, float("nan")
+    pose, rmse = ranked[0].transform, float("nan")
     if refined and not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
         pose, rmse = fine(a, b, pose, scale == "free")
     clock("refine")
-    return _verdict(ranked, seen, pose, rmse, clock.seconds)
+    return _verdict(ranked, winner, pose, rmse, clock.seconds)
 
 
 class _Clock:
@@ -160,19 +154,19 @@ class _Clock:
 
 
 def _verdict(
-    ranked: Sequence[Ranked], seen: dict[str, float], pose: Sim3, rmse: float, seconds: dict[str, float]
+    ranked: Sequence[PoseHypothesis], winner: dict[str, float], pose: Sim3, rmse: float, seconds: dict[str, float]
 ) -> Registration:
     """The best of ranked hypotheses, refined to `pose`, with its probability and the reason in words."""
-    margin = ranked[0][2] - ranked[1][2] if len(ranked) > 1 else MARGIN_CAP
-    features = {**ranked[0][1], **seen, "margin": margin, "rmse": rmse}
-    chance, every = probability(ranked, seen)
+    margin = ranked[0].score - ranked[1].score if len(ranked) > 1 else MARGIN_CAP
+    features = {**ranked[0].features, **winner, "margin": margin, "rmse": rmse}
+    chance, chances = probability(ranked, winner)
     accepted = chance >= model()["threshold"]
     share = 100 * features["conflict_share"]
     reason = (
         f"{'believed' if accepted else 'not believed'}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of "
         f"free floor seen by both, {share:.1f} % of the walls stand on free floor of the other map"
     )
-    others = tuple(Alternative(c.pose, s, f, p) for (c, f, s), p in zip(ranked[:ALTERNATIVES], every, strict=False))
+    others = tuple(replace(h, probability=p) for h, p in zip(ranked[:ALTERNATIVES], chances, strict=False))
     return Registration(pose, chance, accepted, features, others, reason, seconds)
 
 
@@ -189,18 +183,17 @@ def _order(m: Map) -> tuple[int, str]:
 
 def fine(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
     """Point-to-plane refinement of T_ab, unless it runs away, and the root mean square distance of the surfaces, m."""
-    found = refine_pose(a.surface(), b.surface(), start, scaled)
-    middle = b.middle[None]
-    moved = float(np.linalg.norm(found.pose.apply(middle) - start.apply(middle)))
-    turned = abs((found.pose.yaw - start.yaw + np.pi) % (2 * np.pi) - np.pi)
-    if not np.isfinite(found.rmse) or moved > DRIFTED[0] or turned > DRIFTED[1]:
-        log.debug("refinement moved %.2f m, %.1f degrees: left out", moved, np.degrees(turned))
+    moved = refine_pose(a.surface(), b.surface(), start, scaled)
+    shift = float(np.linalg.norm(moved.pose.apply(b.middle[None]) - start.apply(b.middle[None])))
+    turn = abs(wrapped(moved.pose.yaw - start.yaw))
+    if not np.isfinite(moved.rmse) or shift > DRIFTED[0] or turn > DRIFTED[1]:
+        log.debug("refinement moved %.2f m, %.1f degrees: left out", shift, np.degrees(turn))
         return start, float("nan")
-    return found.pose, found.rmse
+    return moved.pose, moved.rmse
 
 
-def _inverse(found: Registration) -> Registration:
+def _inverse(registration: Registration) -> Registration:
     """The same registration seen from the other map."""
-    others = tuple(replace(o, transform=o.transform.inverse()) for o in found.alternatives)
-    transform = None if found.transform is None else found.transform.inverse()
-    return replace(found, transform=transform, alternatives=others)
+    others = tuple(replace(h, transform=h.transform.inverse()) for h in registration.alternatives)
+    transform = None if registration.transform is None else registration.transform.inverse()
+    return replace(registration, transform=transform, alternatives=others)

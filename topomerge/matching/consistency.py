@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 from topomerge.kernels.poses import pose_evidence
 from topomerge.matching.assignment import by_overlap
 from topomerge.matching.costs import best_partners
-from topomerge.matching.door_poses import Poses, door_poses, joined_poses, middle_poses, scaled_poses
+from topomerge.matching.door_poses import door_poses, middle_poses, scaled_poses
 from topomerge.matching.odds import CONFLICT, FLOOR, hypothesis_probability
-from topomerge.matching.result import Hypothesis
+from topomerge.matching.poses import PoseArrays, PoseHypothesis, joined_poses
 from topomerge.matching.topdown import TopDown, top_down
 from topomerge.types import Array, Sim3, TopometricMap
 
@@ -44,7 +44,7 @@ class Sampled(NamedTuple):
 
 def hypotheses(
     a: TopometricMap, b: TopometricMap, cost: Array, similarity: Array, scale_free: bool = False, number: int = 10
-) -> tuple[Hypothesis, ...]:
+) -> tuple[PoseHypothesis, ...]:
     """Up to `number` ways to lay b onto a, best first.
 
     Args:
@@ -66,14 +66,14 @@ def hypotheses(
 
 def candidate_poses(
     a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array, scale_free: bool
-) -> Poses:
+) -> PoseArrays:
     """Poses of all doors of all pairs, and of middles of the rooms."""
     if scale_free:
         return joined_poses(door_poses(a, b, plans, pairs, weight), scaled_poses(a, b, plans, pairs, weight))
     return joined_poses(door_poses(a, b, plans, pairs, weight), middle_poses(a, b, plans, pairs, 0.2 * weight))
 
 
-def votes(poses: Poses) -> Array:
+def votes(poses: PoseArrays) -> Array:
     """(H,) logarithm of 1 + the weight of all poses that lay the map within 1 m and 10 degrees of each."""
     turn = 6 * np.stack([np.cos(poses.yaw), np.sin(poses.yaw), 3 * np.log(poses.scale)], axis=1)  # 10 degrees are 1 m
     place = np.concatenate([poses.shift, turn], axis=1)
@@ -83,11 +83,11 @@ def votes(poses: Poses) -> Array:
     return np.log1p(np.array([poses.weight[n].sum() for n in near]))
 
 
-def _scores(poses: Poses, plans: tuple[TopDown, TopDown], samples: int, sigma: float) -> Array:
+def _scores(poses: PoseArrays, plans: tuple[TopDown, TopDown], samples: int, sigma: float) -> Array:
     """(H, 4) score, m of walls that agree, m that conflict, m2 of floor in common; the mean of b on a and of a on b."""
     out = np.zeros((len(poses.yaw), 3))
     size = np.sqrt(poses.scale)  # of a length in the middle of both maps
-    back = inverse(poses)
+    back = poses.inverse()
     for which, (to, some) in enumerate((plans, plans[::-1])):
         s = Sampled(*some.samples(samples))
         p = poses if which == 0 else back
@@ -102,7 +102,7 @@ def _scores(poses: Poses, plans: tuple[TopDown, TopDown], samples: int, sigma: f
     return np.concatenate([score[:, None], out], axis=1)
 
 
-def storey_map(poses: Poses, to: Array, floors: Array) -> Array:
+def storey_map(poses: PoseArrays, to: Array, floors: Array) -> Array:
     """(H, S_b) storey of `to` that each storey of `floors` falls on, -1 none."""
     height = poses.scale[:, None] * floors[None] + poses.shift[:, 2:]
     off = abs(height[:, :, None] - to[None, None])
@@ -110,15 +110,7 @@ def storey_map(poses: Poses, to: Array, floors: Array) -> Array:
     return np.where(np.take_along_axis(off, best[:, :, None], 2)[:, :, 0] <= STOREY, best, -1).astype(np.int64)
 
 
-def inverse(poses: Poses) -> Poses:
-    """Of a on b."""
-    c, s = np.cos(-poses.yaw) / poses.scale, np.sin(-poses.yaw) / poses.scale
-    x, y, z = poses.shift.T
-    back = -np.stack([c * x - s * y, s * x + c * y, z / poses.scale], axis=1)
-    return Poses(-poses.yaw, back, 1 / poses.scale, poses.weight)
-
-
-def distinct(poses: Poses, score: Array, number: int) -> Array:
+def distinct(poses: PoseArrays, score: Array, number: int) -> Array:
     """Up to `number` rows, best first, none like a better one."""
     kept: list[int] = []
     for i in np.argsort(-score, kind="stable").tolist():
@@ -133,7 +125,7 @@ def distinct(poses: Poses, score: Array, number: int) -> Array:
     return np.array(kept, int)
 
 
-def refined(poses: Poses, plans: tuple[TopDown, TopDown], scale_free: bool) -> Poses:
+def refined(poses: PoseArrays, plans: tuple[TopDown, TopDown], scale_free: bool) -> PoseArrays:
     """Poses moved so that walls of b come to lie on walls of a: point to nearest wall, in rounds that trust less and less."""
     places, storey, is_wall, _ = plans[1].samples(FINE)
     places, storey = places[is_wall], storey[is_wall]
@@ -157,24 +149,22 @@ def refined(poses: Poses, plans: tuple[TopDown, TopDown], scale_free: bool) -> P
             move[h] = step * (move[h] - at[near].mean()) + to.mean()
             turn[h] *= step
     shift = np.stack([move.real, move.imag, poses.shift[:, 2]], axis=1)
-    return Poses(np.angle(turn), shift, np.abs(turn), poses.weight)
+    return PoseArrays(np.angle(turn), shift, np.abs(turn), poses.weight)
 
 
-def rank(poses: Poses, evidence: Array, plans: tuple[TopDown, TopDown]) -> tuple[Hypothesis, ...]:
+def rank(poses: PoseArrays, evidence: Array, plans: tuple[TopDown, TopDown]) -> tuple[PoseHypothesis, ...]:
     """Hypotheses with their matches: those that reach 0.6 of the best agreement first, by score."""
     agree = evidence[:, 1] + FLOOR * evidence[:, 3]
     short = agree >= SHORTLIST * agree.max()
     order = np.lexsort((-evidence[:, 0], ~short))
     chance = hypothesis_probability(evidence[:, 1:])
-    found = []
+    ranked = []
     for h in order.tolist():
-        x, y, z = poses.shift[h].tolist()
-        yaw = (float(poses.yaw[h]) + np.pi) % (2 * np.pi) - np.pi
-        pose = Sim3(yaw, (x, y, z), float(poses.scale[h]))
+        pose = poses.transform(h)
         rooms, fit = matches_under(pose, plans, storey_map(poses.take(np.array([h])), plans[0].floors, plans[1].floors)[0])
-        told = dict(zip(("agree_m", "conflict_m", "floor_m2"), evidence[h, 1:].round(3).tolist(), strict=True))
-        found.append(Hypothesis(pose, rooms, fit, float(chance[h]), float(evidence[h, 0]), told))
-    return tuple(found)
+        features = dict(zip(("agree_m", "conflict_m", "floor_m2"), evidence[h, 1:].round(3).tolist(), strict=True))
+        ranked.append(PoseHypothesis(pose, float(evidence[h, 0]), float(chance[h]), features, True, rooms, fit))
+    return tuple(ranked)
 
 
 def matches_under(transform: Sim3, plans: tuple[TopDown, TopDown], storeys: Array) -> tuple[Array, Array]:

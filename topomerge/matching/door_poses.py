@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from topomerge.matching.poses import PoseArrays, joined_poses
 from topomerge.matching.topdown import TopDown
 from topomerge.types import Array, TopometricMap
 
@@ -32,20 +33,6 @@ class Doors:
     kind: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """H candidates: u -> scale * R(yaw) u + shift; `weight` is the similarity of the rooms that suggested each."""
-
-    yaw: Array
-    shift: Array  # (H, 3)
-    scale: Array
-    weight: Array
-
-    def take(self, rows: Array) -> Poses:
-        """Some of them."""
-        return Poses(self.yaw[rows], self.shift[rows], self.scale[rows], self.weight[rows])
-
-
 def doors_of(map: TopometricMap, plan: TopDown) -> Doors:
     """Doors and openings of a map; which side of a door a room is on is read off the floor around it."""
     edges = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
@@ -64,7 +51,7 @@ def doors_of(map: TopometricMap, plan: TopDown) -> Doors:
     return Doors(room, both["centre"].astype(float), into, both["width"].astype(float), both["kind"])
 
 
-def door_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> Poses:
+def door_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> PoseArrays:
     """One pose for each two doors of each pair of rooms (P, 2), at the scale 1."""
     of = [doors_of(m, p) for m, p in zip((a, b), plans, strict=True)]
     p, q, w = _door_pairs(of[0], of[1], pairs, weight)
@@ -72,7 +59,7 @@ def door_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown
     return _put(of[0].centre[p], of[1].centre[q], yaw, np.ones(len(p)), w, a, b, of[0].room[p], of[1].room[q])
 
 
-def middle_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> Poses:
+def middle_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> PoseArrays:
     """Four poses for each pair of rooms, middle on middle along the walls: for rooms without doors in common."""
     quarter = (plans[0].direction[0] - plans[1].direction[0]) + np.arange(4) * np.pi / 2
     i, j = np.repeat(pairs[:, 0], 4), np.repeat(pairs[:, 1], 4)
@@ -81,7 +68,7 @@ def middle_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDo
     return _put(*middle, yaw, np.ones(len(i)), np.repeat(weight, 4), a, b, i, j)
 
 
-def scaled_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> Poses:
+def scaled_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> PoseArrays:
     """Poses at a scale of their own: from two doors of one room on two doors of another, the ratio of whose distances it is; and
     from single doors at the ratio of the rooms' heights."""
     of = [doors_of(m, p) for m, p in zip((a, b), plans, strict=True)]
@@ -97,12 +84,6 @@ def scaled_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDo
     p, q, yaw, ratio, w = first
     third = _put(of[0].centre[p], of[1].centre[q], snapped(yaw, plans), ratio, w, a, b, of[0].room[p], of[1].room[q])
     return joined_poses(second, third)
-
-
-def joined_poses(*some: Poses) -> Poses:
-    """All of them."""
-    names = ("yaw", "shift", "scale", "weight")
-    return Poses(*(np.concatenate([getattr(p, n) for p in some]) for n in names))
 
 
 def snapped(yaw: Array, plans: tuple[TopDown, TopDown]) -> Array:
@@ -151,10 +132,10 @@ def _ordered(rows: Array) -> list[tuple[int, int]]:
 
 def _put(
     to: Array, point: Array, yaw: Array, scale: Array, weight: Array, a: TopometricMap, b: TopometricMap, i: Array, j: Array
-) -> Poses:
+) -> PoseArrays:
     """Poses that bring points (H, 3) of b onto points of a; upright by the floors of the storeys of rooms i and j."""
     c, s = scale * np.cos(yaw), scale * np.sin(yaw)
     x = to[:, 0] - (c * point[:, 0] - s * point[:, 1])
     y = to[:, 1] - (s * point[:, 0] + c * point[:, 1])
     z = a.storeys["floor"][a.rooms["storey"][i]] - scale * b.storeys["floor"][b.rooms["storey"][j]]
-    return Poses(yaw, np.stack([x, y, z], axis=1), scale, weight)
+    return PoseArrays(yaw, np.stack([x, y, z], axis=1), scale, weight)

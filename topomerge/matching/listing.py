@@ -6,46 +6,47 @@ import math
 from typing import Any
 
 from topomerge.io.listing import plain
-from topomerge.matching.result import Hypothesis, Matching
+from topomerge.matching.poses import PoseHypothesis
+from topomerge.matching.result import Matching
 from topomerge.types import TopometricMap
 
-FORMAT = 1
+MATCHING_FORMAT = 1
 
 
-def matching_to_json(found: Matching, a: TopometricMap, b: TopometricMap) -> dict[str, Any]:
+def matching_to_json(matching: Matching, a: TopometricMap, b: TopometricMap) -> dict[str, Any]:
     """Rooms with their probabilities and all hypotheses; matrices are row-major and map points of b into the frame of a."""
-    rows = zip(found.rooms.tolist(), found.probability.tolist(), strict=True)
+    rows = zip(matching.rooms.tolist(), matching.probability.tolist(), strict=True)
     listing = {
-        "format": FORMAT,
+        "format": MATCHING_FORMAT,
         "maps": [{"source": m.source, "rooms": len(m.rooms), "storeys": len(m.storeys)} for m in (a, b)],
         "matches": [{"rooms": rooms, "probability": round(p, 4)} for rooms, p in rows],
-        "hypotheses": [_hypothesis(h) for h in found.alternatives],
-        "statistics": dict(found.statistics),
+        "hypotheses": [_hypothesis(h) for h in matching.alternatives],
+        "statistics": dict(matching.statistics),
     }
     out: dict[str, Any] = plain(listing)
     return out
 
 
-def _hypothesis(h: Hypothesis) -> dict[str, Any]:
+def _hypothesis(h: PoseHypothesis) -> dict[str, Any]:
     return {
         "probability": round(h.probability, 4),
         "score": round(h.score, 3),
         "transform": {"matrix": h.transform.matrix.tolist(), "scale": h.transform.scale, "yaw": h.transform.yaw},
         "rooms": h.rooms.tolist(),
-        "evidence": dict(h.evidence),
+        "evidence": dict(h.features),
     }
 
 
-def matching_to_text(found: Matching, a: TopometricMap, b: TopometricMap) -> str:
+def matching_to_text(matching: Matching, a: TopometricMap, b: TopometricMap) -> str:
     """The table that `topomerge match` prints."""
-    lines = [f"{len(found.rooms)} matches of {len(a.rooms)} and {len(b.rooms)} rooms"]
-    if len(found.rooms):
+    lines = [f"{len(matching.rooms)} matches of {len(a.rooms)} and {len(b.rooms)} rooms"]
+    if len(matching.rooms):
         lines += ["", "room a  area m2   room b  area m2   probability"]
-    for (i, j), p in zip(found.rooms.tolist(), found.probability.tolist(), strict=True):
+    for (i, j), p in zip(matching.rooms.tolist(), matching.probability.tolist(), strict=True):
         lines.append(f"{i:>6}  {a.rooms['area'][i]:>7.1f}   {j:>6}  {b.rooms['area'][j]:>7.1f}   {p:>11.2f}")
-    if found.alternatives:
+    if matching.alternatives:
         lines += ["", "hypothesis  probability  matches  yaw deg        x        y        z  scale"]
-    for k, h in enumerate(found.alternatives[:5]):
+    for k, h in enumerate(matching.alternatives[:5]):
         numbers = "  ".join(f"{v:>7.2f}" for v in h.transform.translation)
         yaw = math.degrees(h.transform.yaw)
         lines.append(f"{k:>10}  {h.probability:>11.2f}  {len(h.rooms):>7}  {yaw:>7.1f}  {numbers}  {h.transform.scale:>5.3f}")

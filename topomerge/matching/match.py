@@ -15,7 +15,8 @@ from topomerge.matching.consistency import hypotheses
 from topomerge.matching.costs import descriptor_costs, similarities, usual_best
 from topomerge.matching.growing import align, grow
 from topomerge.matching.odds import match_probability
-from topomerge.matching.result import Hypothesis, Matching
+from topomerge.matching.poses import PoseHypothesis
+from topomerge.matching.result import Matching
 from topomerge.types import Array, TopometricMap
 
 METHODS = ("consistent", "growing", "assignment", "thesis")
@@ -65,7 +66,7 @@ def match(
     if method == "assignment":
         pairs = assign(cost, 2 * usual_best(cost) if largest_cost is None else largest_cost)
         return Matching(pairs, similarity[tuple(pairs.T)], statistics=told)
-    found: tuple[Hypothesis, ...]
+    found: tuple[PoseHypothesis, ...]
     if method == "consistent":
         found = hypotheses(a, b, cost, similarity, scale_free, KEPT)
     else:
@@ -103,7 +104,7 @@ def checked(describe: Descriptor, map: TopometricMap) -> Array:
     return rows
 
 
-def marginal(a: TopometricMap, b: TopometricMap, found: tuple[Hypothesis, ...]) -> tuple[Array, Array]:
+def marginal(a: TopometricMap, b: TopometricMap, found: tuple[PoseHypothesis, ...]) -> tuple[Array, Array]:
     """Matches of the best hypothesis, and all whose probability over the hypotheses is above 0.5 and that exclude none of those.
 
     The probability of a match is the sum, over the hypotheses that have it, of theirs times that rooms which fit so are one.
@@ -122,7 +123,7 @@ def marginal(a: TopometricMap, b: TopometricMap, found: tuple[Hypothesis, ...]) 
 
 def _from_growing(
     a: TopometricMap, b: TopometricMap, cost: Array, similarity: Array, c_max: float | None, de_max: float
-) -> tuple[Hypothesis, ...]:
+) -> tuple[PoseHypothesis, ...]:
     """Hypotheses of the growing; their probability goes with the square of the number of matches."""
     grown = grow(a, b, cost, c_max, de_max)[:KEPT]
     weight = np.array([len(p) ** 2 for p in grown], float)
@@ -131,5 +132,5 @@ def _from_growing(
         rooms = np.array(pairs, np.int64)
         pose, error = align(a.rooms["centroid"][rooms[:, 0]], b.rooms["centroid"][rooms[:, 1]])
         fit = similarity[tuple(rooms.T)]
-        found.append(Hypothesis(pose, rooms, fit, float(share), float(len(rooms)), {"error_m": error}))
+        found.append(PoseHypothesis(pose, float(len(rooms)), float(share), {"error_m": error}, True, rooms, fit))
     return tuple(found)

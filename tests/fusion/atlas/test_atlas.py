@@ -12,11 +12,12 @@ import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import FRAMES, NAMES, office_map, stranger, truth
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.maps import LOADED_AT_ONCE, Maps, map_key
-from topomerge.fusion.atlas.pairs import Checks, Hypothesis, hypotheses, promise
+from topomerge.fusion.atlas.pairs import Checks, hypotheses, promise
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import solve
 from topomerge.fusion.pose_difference import pose_difference
 from topomerge.fusion.result import merge_to_json
+from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
 
 SHIFTED = Sim3(0.0, (4.5, 0.0, 0.0))  # by a room
@@ -76,7 +77,7 @@ def poisoned(maps: list[TopometricMap], known: dict, i: int, j: int, wrong: Sim3
     keys = map_key(maps[i]), map_key(maps[j])
     pose = wrong @ truth(i, j)
     pair, pose = (keys, pose) if keys[0] < keys[1] else (keys[::-1], pose.inverse())
-    return {**known, pair: (Hypothesis(pose, p),)}
+    return {**known, pair: (PoseHypothesis(pose, probability=p),)}
 
 
 @pytest.mark.parametrize("p", [0.93, 0.997])
@@ -108,7 +109,7 @@ def test_a_poisoned_map_is_not_let_in(maps, known):
     keys = map_key(west), map_key(other)
     pose = Sim3(0.2, (3.0, 2.0, 0.0))
     pair, pose = (keys, pose) if keys[0] < keys[1] else (keys[::-1], pose.inverse())
-    result = tm.atlas(maps, registrations={**known, pair: (Hypothesis(pose, 0.95),)})
+    result = tm.atlas(maps, registrations={**known, pair: (PoseHypothesis(pose, probability=0.95),)})
     assert result.alone == (4,) and right(result, {k: k for k in range(4)})
     assert [link.maps for link in result.rejected] == [(0, 4)] and "west, stranger" in result.words()
 

@@ -86,7 +86,7 @@ class StoreyPlan:
         return self.inside & ~self.standing
 
     @cached_property
-    def known(self) -> Array:
+    def explored(self) -> Array:
         """(nx, ny) bool."""
         return self.wall | self.inside
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from topomerge.fusion.atlas.pairs import Check, Checks, Hypothesis, alike
+from topomerge.fusion.atlas.pairs import Check, Checks, alike
 from topomerge.fusion.atlas.pose_graph import Measured, optimise
+from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
 BACKING = 1.5  # log odds that other maps may add: look-alikes of a place are alike to all maps of it
@@ -24,7 +25,7 @@ DOUBT = 0.3  # probability: a hypothesis above it contradicts another place
 BELIEVED = 0.5  # probability
 EXCHANGE_GAIN = 0.5  # log odds by which another link must be better to take a link's place
 HEAVIEST_WALLS = 20.0  # m2 of walls in common, above which a measurement counts no more
-Hypotheses = Mapping[tuple[int, int], tuple[Hypothesis, ...]]
+Hypotheses = Mapping[tuple[int, int], tuple[PoseHypothesis, ...]]
 Poses = Mapping[int, Sim3]
 
 
@@ -39,7 +40,7 @@ class Link:
     """
 
     maps: tuple[int, int]
-    hypothesis: Hypothesis
+    hypothesis: PoseHypothesis
     log_odds: float
     against: tuple[int, int] | None = None
 
@@ -89,16 +90,16 @@ class Assembler:
         assembly.rejected = self._rejected(assembly)
         return assembly
 
-    def _candidates(self, banned: set[tuple[int, int]]) -> list[tuple[tuple[int, int], Hypothesis]]:
+    def _candidates(self, banned: set[tuple[int, int]]) -> list[tuple[tuple[int, int], PoseHypothesis]]:
         """Hypotheses that could be believed with all backing, most probable first."""
         candidates = [(pair, h) for pair, hs in self.hypotheses.items() if pair not in banned for h in hs]
         candidates = [(pair, h) for pair, h in candidates if h.log_odds + self._backing(pair, h) >= self.limit]
         return sorted(candidates, key=lambda e: (-e[1].log_odds, e[0]))
 
-    def _backing(self, pair: tuple[int, int], h: Hypothesis) -> float:
+    def _backing(self, pair: tuple[int, int], h: PoseHypothesis) -> float:
         """Log odds that backing may add: it may tell a hypothesis from its rivals, and speak for it."""
         any_of_them = min(sum(other.probability for other in self.hypotheses[pair]), 0.999)
-        return max(Hypothesis(h.pose, any_of_them).log_odds - h.log_odds, 0.0) + BACKING
+        return max(PoseHypothesis(h.transform, probability=any_of_them).log_odds - h.log_odds, 0.0) + BACKING
 
     def _grown(self, banned: set[tuple[int, int]]) -> Assembly:
         assembly = Assembly([{k: Sim3()} for k in range(self.count)])
@@ -119,19 +120,21 @@ class Assembler:
 
     def _join(self, assembly: Assembly, a: dict[int, Sim3], b: dict[int, Sim3], link: Link) -> None:
         """Bring component b into a's frame, and settle all poses."""
-        move = across(a, b, link.maps, link.hypothesis.pose)
+        move = across(a, b, link.maps, link.hypothesis.transform)
         joined = {**a, **{k: move @ pose for k, pose in b.items()}}
         assembly.components = [c for c in assembly.components if c is not a and c is not b]
         assembly.links.append(link)
         assembly.components.append(self.settled(joined, assembly.links)[0])
 
-    def heard(self, a: Poses, b: Poses, pair: tuple[int, int], h: Hypothesis, rival_of: tuple[int, int] | None = None) -> Link:
+    def heard(
+        self, a: Poses, b: Poses, pair: tuple[int, int], h: PoseHypothesis, rival_of: tuple[int, int] | None = None
+    ) -> Link:
         """A link between two components with what all their maps say to it.
 
         Args:
             rival_of: the pair whose claim this one contradicts; it is not asked, and contradictions are not looked into.
         """
-        move = across(a, b, pair, h.pose)
+        move = across(a, b, pair, h.transform)
         place = {**a, **{j: move @ pose for j, pose in b.items()}}
         pair_check = self.checks(*pair, place[pair[0]].inverse() @ place[pair[1]])
         backing, against, loudest, worst = 0.0, pair_check.log_odds if pair_check.log_odds < VOICE_VETO else 0.0, None, 0.0
@@ -152,13 +155,13 @@ class Assembler:
                 loudest, worst = (one, two), said
         return Link(pair, h, h.log_odds + min(backing, self._backing(pair, h)) + against, loudest)
 
-    def _voice(self, i: int, j: int, pose: Sim3) -> tuple[float, Hypothesis | None]:
+    def _voice(self, i: int, j: int, pose: Sim3) -> tuple[float, PoseHypothesis | None]:
         """What maps i < j say to a pose T_ij that other maps propose, log odds; and their own claim, if it is another one."""
         check = self.checks(i, j, pose)
         best = next(iter(self.hypotheses.get((i, j), ())), None)
         if best is None:
             return check.log_odds, None
-        if self.agrees(i, j, best.pose, pose):
+        if self.agrees(i, j, best.transform, pose):
             return max(check.log_odds, float(np.clip(best.log_odds + SAME_PLACE, 0.0, VOICE_MOST))), None
         return check.log_odds, best if best.probability > DOUBT else None
 
@@ -172,7 +175,7 @@ class Assembler:
         for link in assembly.links:
             a, b = self._parted(assembly, link)
             i, j = link.maps
-            seen = self.heard(a, b, link.maps, replace(link.hypothesis, pose=a[i].inverse() @ b[j]))
+            seen = self.heard(a, b, link.maps, replace(link.hypothesis, transform=a[i].inverse() @ b[j]))
             links.append(replace(seen, hypothesis=link.hypothesis))
         return links
 
@@ -187,13 +190,13 @@ class Assembler:
             grown = bool(new)
         return {k: p for k, p in component.items() if k in side}, {k: p for k, p in component.items() if k not in side}
 
-    def _contradicted(self, assembly: Assembly) -> Iterator[tuple[tuple[int, int], Hypothesis]]:
+    def _contradicted(self, assembly: Assembly) -> Iterator[tuple[tuple[int, int], PoseHypothesis]]:
         """Best hypotheses of pairs that lie elsewhere in their component."""
         for (i, j), hypotheses in sorted(self.hypotheses.items()):
             poses = assembly.of(i)
             if not hypotheses or j not in poses or hypotheses[0].probability < BELIEVED:
                 continue
-            if not self.agrees(i, j, hypotheses[0].pose, poses[i].inverse() @ poses[j]):
+            if not self.agrees(i, j, hypotheses[0].transform, poses[i].inverse() @ poses[j]):
                 yield (i, j), hypotheses[0]
 
     def _exchange(self, assembly: Assembly) -> None:
@@ -216,7 +219,7 @@ class Assembler:
                 if pair[0] not in first or pair[1] not in second:
                     continue
                 i, j = link.maps
-                now = self.heard(a, b, link.maps, replace(link.hypothesis, pose=a[i].inverse() @ b[j]))
+                now = self.heard(a, b, link.maps, replace(link.hypothesis, transform=a[i].inverse() @ b[j]))
                 then = self.heard(first, second, pair, h)
                 if then.log_odds >= max(now.log_odds + EXCHANGE_GAIN, self.limit):
                     yield link, then, (a, b)
@@ -242,7 +245,7 @@ class Assembler:
         return optimise(poses, edges, self.scaled, min(poses)), edges
 
     def _measured(self, poses: Poses, links: Sequence[Link], fine: bool) -> Iterator[Measured]:
-        link_poses = {link.maps: link.hypothesis.pose for link in links}
+        link_poses = {link.maps: link.hypothesis.transform for link in links}
         names = sorted(poses)
         for i in names:
             for j in (k for k in names if k > i):

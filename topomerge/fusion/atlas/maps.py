@@ -62,7 +62,7 @@ class Maps:
 
     def area(self, k: int) -> float:
         """Floor area, m2, of what is known from above."""
-        return float(sum(v.plan.known.sum() * v.plan.cell**2 for v in self.prepared(k).views))
+        return float(sum(v.plan.explored.sum() * v.plan.edge**2 for v in self.prepared(k).storeys))
 
     def rows(self, k: int) -> Array:
         """(R, D) descriptors of the rooms."""

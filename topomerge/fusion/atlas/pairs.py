@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 
 from topomerge.fusion.atlas.maps import Maps
+from topomerge.fusion.judge import Judge
 from topomerge.fusion.pose_difference import pose_difference
 from topomerge.fusion.registration import fine, register
-from topomerge.fusion.search import Candidate, View, pairs_at, refined
-from topomerge.fusion.verify import Judge, plausibility
+from topomerge.fusion.verify import plausibility
 from topomerge.matching.costs import descriptor_costs, similarities
 from topomerge.matching.match import match
+from topomerge.matching.plan_fields import PlanFields
+from topomerge.matching.poses import PoseHypothesis
+from topomerge.matching.refinement import refine, storeys_at
 from topomerge.types import Array, Sim3
 
 PAIR_HYPOTHESES = 6  # of a pair at most
@@ -26,24 +29,8 @@ NOISE_CONFLICT = 0.3  # m2 of walls on free floor, below which it may be noise
 USUAL_CONFLICT = 0.12  # share of the walls on free floor that true poses seldom exceed
 CONFLICT_ODDS = 30.0  # log odds against a pose, of each share of 1 above that
 LEAST_HALF_WIDTH = 1.0  # m, of the place by which a pose is measured
-MOST_LOG_ODDS = 7.0
 SAMPLED_COLUMNS = 4000
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A pose T_ij and how probable it is; the hypotheses of a pair and "none of them" sum to 1 at most."""
-
-    pose: Sim3
-    probability: float
-    features: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def log_odds(self) -> float:
-        """Of its probability, between -7 and 7."""
-        p = float(np.clip(self.probability, 1e-6, 1 - 1e-6))
-        return float(np.clip(np.log(p / (1 - p)), -MOST_LOG_ODDS, MOST_LOG_ODDS))
 
 
 @dataclass(frozen=True)
@@ -63,18 +50,18 @@ class Check:
     features: Mapping[str, float]
 
 
-def hypotheses(maps: Maps, i: int, j: int, scale: str = "fixed") -> tuple[Hypothesis, ...]:
+def hypotheses(maps: Maps, i: int, j: int, scale: str = "fixed") -> tuple[PoseHypothesis, ...]:
     """Where map j may lie in map i, most probable first; each with its share of the probability that one of them is right."""
     poses = _room_poses(maps, i, j, scale) if maps.matched else []
-    registration = register(maps.prepared(i), maps.prepared(j), scale=scale, hypotheses=poses, refined=False)
+    registration = register(maps.prepared(i), maps.prepared(j), scale=scale, proposed=poses, refined=False)
     if registration.transform is None or not registration.alternatives:
         return ()
-    best, probability = registration.alternatives[0].plausibility, registration.probability
-    ranked = [Hypothesis(registration.transform, probability, registration.features)]
+    best, probability = registration.alternatives[0].score, registration.probability
+    ranked = [PoseHypothesis(registration.transform, probability=probability, features=registration.features)]
     for other in registration.alternatives[1:PAIR_HYPOTHESES]:
-        share = probability * float(np.exp(other.plausibility - best))
+        share = probability * float(np.exp(other.score - best))
         if share >= LEAST_PROBABILITY:
-            ranked.append(Hypothesis(other.transform, min(share, 1 - probability), other.features))
+            ranked.append(replace(other, probability=min(share, 1 - probability)))
     return tuple(ranked)
 
 
@@ -111,12 +98,12 @@ class Checks:
     def place(self, i: int, j: int, pose: Sim3) -> Array:
         """`place` of maps i and j (i < j) under T_ij."""
         a, b = self.maps.prepared(i), self.maps.prepared(j)
-        return _once(self._places, (i, j), pose, b.middle, lambda: place(a.views, b.views, pose))
+        return _once(self._places, (i, j), pose, b.middle, lambda: place(a.storeys, b.storeys, pose))
 
     def fine(self, i: int, j: int, pose: Sim3) -> Sim3:
         """T_ij after the fine registration (i < j); as it was where a map is a slice, which has no planes."""
         a, b = self.maps.prepared(i), self.maps.prepared(j)
-        if any(v.plan.sliced for v in (*a.views, *b.views)):
+        if any(v.plan.sliced for v in (*a.storeys, *b.storeys)):
             return pose
         return _once(self._fine, (i, j), pose, b.middle, lambda: fine(a, b, pose, self.scaled)[0])
 
@@ -128,15 +115,15 @@ class Checks:
         return _once(self._checks, (i, j), pose, self.maps.prepared(j).middle, lambda: self._judged(i, j, pose))
 
     def _judged(self, i: int, j: int, pose: Sim3) -> Check:
-        a, b = self.maps.prepared(i).views, self.maps.prepared(j).views
+        a, b = self.maps.prepared(i).storeys, self.maps.prepared(j).storeys
         if not len(common_points(a, b, pose)):
             return Check(pose, 0.0, False, {})
         judge = Judge(a, b)
         moved, features = pose, judge(pose)
-        for candidate in refined(a, b, [Candidate(pose, 0.0, True)], self.scaled):
-            again = judge(candidate.pose)
-            if alike(candidate.pose, pose, place(a, b, pose).mean(axis=0)) and speaks(again) > speaks(features):
-                moved, features = candidate.pose, again
+        for candidate in refine(a, b, [PoseHypothesis(pose, from_rooms=True)], self.scaled):
+            again = judge(candidate.transform)
+            if alike(candidate.transform, pose, place(a, b, pose).mean(axis=0)) and speaks(again) > speaks(features):
+                moved, features = candidate.transform, again
         overlap = features["free"] >= OVERLAP_FLOOR or features["walls"] >= OVERLAP_WALLS
         return Check(moved, speaks(features) if overlap else 0.0, overlap, features)
 
@@ -169,20 +156,20 @@ def alike(p: Sim3, q: Sim3, at: Array, limits: tuple[float, float, float] = DRIF
     return all(d <= limit for d, limit in zip(pose_difference(p, q, at), limits, strict=True))
 
 
-def common_points(a: Sequence[View], b: Sequence[View], pose: Sim3) -> Array:
+def common_points(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
     """(n, 3) points of b's floors, a sample, where both maps know something under T_ab."""
     samples = [np.zeros((0, 3))]
-    for v, w in pairs_at(a, b, pose.translation[2], pose.scale):
-        rows = np.argwhere(w.plan.known)
+    for v, w in storeys_at(a, b, pose.translation[2], pose.scale):
+        rows = np.argwhere(w.plan.explored)
         rows = rows[:: max(len(rows) // SAMPLED_COLUMNS, 1)]
-        at = np.column_stack([w.plan.origin + (rows + 0.5) * w.plan.cell, np.full(len(rows), w.plan.guess)])
-        there = np.floor((pose.apply(at)[:, :2] - v.plan.origin) / v.plan.cell).astype(np.int64)
+        at = np.column_stack([w.plan.origin + (rows + 0.5) * w.plan.edge, np.full(len(rows), w.plan.floor_guess)])
+        there = np.floor((pose.apply(at)[:, :2] - v.plan.origin) / v.plan.edge).astype(np.int64)
         inside = ((there >= 0) & (there < v.plan.wall.shape)).all(axis=1)
-        samples.append(at[inside][v.plan.known[tuple(there[inside].T)]])
+        samples.append(at[inside][v.plan.explored[tuple(there[inside].T)]])
     return np.concatenate(samples)
 
 
-def place(a: Sequence[View], b: Sequence[View], pose: Sim3) -> Array:
+def place(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array:
     """(5, 3) points of b that stand for the place which both maps saw: its middle, and as far from it as it is wide."""
     points = common_points(a, b, pose)
     if not len(points):

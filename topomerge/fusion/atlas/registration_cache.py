@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from topomerge import __version__
-from topomerge.fusion.atlas.pairs import Hypothesis
 from topomerge.fusion.atlas.solve import RegistrationsByPair
 from topomerge.fusion.verify import model
 from topomerge.io.listing import plain
+from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
 PAIRS_FILE, PAIRS_FORMAT = "pairs.json", 1
@@ -51,17 +51,17 @@ def _stamp(settings: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _hypothesis(listed: Mapping[str, Any]) -> Hypothesis:
+def _hypothesis(listed: Mapping[str, Any]) -> PoseHypothesis:
     x, y, z = map(float, listed["translation"])
     p = float(listed["probability"])
     if not 0 <= p <= 1:
         raise ValueError(f"probability {p}")
     pose = Sim3(float(listed["yaw"]), (x, y, z), float(listed["scale"]))
-    return Hypothesis(pose, p, {str(k): float(v) for k, v in listed["features"].items()})
+    return PoseHypothesis(pose, probability=p, features={str(k): float(v) for k, v in listed["features"].items()})
 
 
-def _listed(hypothesis: Hypothesis) -> dict[str, Any]:
-    pose = hypothesis.pose
+def _listed(hypothesis: PoseHypothesis) -> dict[str, Any]:
+    pose = hypothesis.transform
     return {
         "yaw": pose.yaw,
         "translation": list(pose.translation),

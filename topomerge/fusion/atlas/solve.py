@@ -17,16 +17,17 @@ from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.assembly import Assembler, Assembly, Link
 from topomerge.fusion.atlas.maps import Maps, map_key
-from topomerge.fusion.atlas.pairs import Checks, Hypothesis, hypotheses, promise
+from topomerge.fusion.atlas.pairs import Checks, hypotheses, promise
 from topomerge.fusion.atlas.pose_graph import residual
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.inputs import check_cells, check_scale, check_units, checked_threshold, without_rooms
 from topomerge.io.maps import load_map
+from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
 
 SURE_LINK = 4.0  # log odds of a link, above which no further ones are looked for within its component
 ENOUGH_REGISTRATIONS = 3  # of a map, after which none within its component is made
-RegistrationsByPair = MutableMapping[tuple[str, str], tuple[Hypothesis, ...]]  # by the keys of both maps
+RegistrationsByPair = MutableMapping[tuple[str, str], tuple[PoseHypothesis, ...]]  # by the keys of both maps
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ class _Explorer:
 
     def __init__(self, maps: Maps, keys: Sequence[str], scale: str, threshold: float, registrations: RegistrationsByPair) -> None:
         self.maps, self.keys, self.scale, self.registrations = maps, keys, scale, registrations
-        self.tried: dict[tuple[int, int], tuple[Hypothesis, ...]] = {}
+        self.tried: dict[tuple[int, int], tuple[PoseHypothesis, ...]] = {}
         self.checks = Checks(maps, scale == "free")
         self.assembler = Assembler(len(maps), self.tried, self.checks, threshold, scale == "free")
         self.promise = np.zeros((len(maps), len(maps)))
@@ -165,7 +166,7 @@ class _Explorer:
             for m in (*outside[:1], *inside[:1]):
                 yield min(k, m), max(k, m)
 
-    def _registered(self, i: int, j: int) -> tuple[Hypothesis, ...]:
+    def _registered(self, i: int, j: int) -> tuple[PoseHypothesis, ...]:
         pair = (self.keys[i], self.keys[j])
         if pair not in self.registrations:
             self.registrations[pair] = hypotheses(self.maps, i, j, self.scale)
@@ -208,5 +209,5 @@ def _renamed(link: Link, order: Sequence[int]) -> Link:
     against = None if link.against is None else (order[link.against[0]], order[link.against[1]])
     h = link.hypothesis
     if j < i:
-        i, j, h = j, i, Hypothesis(h.pose.inverse(), h.probability, h.features)
+        i, j, h = j, i, replace(h, transform=h.transform.inverse())
     return Link((i, j), h, link.log_odds, against and (min(against), max(against)))
