@@ -30,21 +30,21 @@ RIGHT = (0.5, np.radians(5.0))  # m, rad
 SIZES = (2, 4, 8, 16)
 
 
-def errors(made: AtlasSet, found: AtlasResult) -> dict[int, tuple[float, float] | None]:
+def errors(made: AtlasSet, result: AtlasResult) -> dict[int, tuple[float, float] | None]:
     """Error of each map in its component's first map, m and rad; None for maps of two buildings in one component."""
     out: dict[int, tuple[float, float] | None] = {}
     sensors: Any = made.about["sensors"]
-    for members in found.components:
+    for members in result.components:
         first = members[0]
         for k in members[1:]:
             one, two = made.truth[first], made.truth[k]
             if one is None or two is None:
                 out[k] = None
                 continue
-            true, middle = one.inverse() @ two, found.maps[k].grid.centroids().mean(axis=0)
-            off = found.transforms[k].apply(middle[None])[0] - true.apply(middle[None])[0]
+            true, middle = one.inverse() @ two, result.maps[k].grid.centroids().mean(axis=0)
+            off = result.transforms[k].apply(middle[None])[0] - true.apply(middle[None])[0]
             flat = "laser2d" in (sensors[first], sensors[k])
-            out[k] = (float(np.linalg.norm(off[:2] if flat else off)), pose_difference(true, found.transforms[k], middle)[1])
+            out[k] = (float(np.linalg.norm(off[:2] if flat else off)), pose_difference(true, result.transforms[k], middle)[1])
     return out
 
 
@@ -52,25 +52,25 @@ def measure(folder: Path) -> dict[str, Any]:
     """One set: what is told of it."""
     made = load(folder)
     began = process_time()
-    found = atlas(made.files)
+    result = atlas(made.files)
     seconds = process_time() - began
-    off = errors(made, found)
+    off = errors(made, result)
     right = [k for k, e in off.items() if e is not None and e[0] < RIGHT[0] and e[1] < RIGHT[1]]
     belong = sum(t is not None for t in made.truth)
-    best = max((sum(k in right for k in members[1:]) for members in found.components), default=0)
+    best = max((sum(k in right for k in members[1:]) for members in result.components), default=0)
     return {
         "name": made.name,
         "maps": len(made.files),
         "seconds": seconds,  # of one core
         "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "registered": found.registered[0],
-        "pairs": found.registered[1],
+        "registered": result.registered[0],
+        "pairs": result.registered[1],
         "could": belong - 1,
         "right": best,
         "wrong": len(off) - len(right),
-        "components": [list(c) for c in found.components if len(c) > 1],
+        "components": [list(c) for c in result.components if len(c) > 1],
         "errors": {str(k): e for k, e in off.items()},
-        "thrown": [list(link.maps) for link in found.rejected],
+        "thrown": [list(link.maps) for link in result.rejected],
         "building": made.about["building"],
         "sensors": made.about["sensors"],
     }
@@ -112,9 +112,9 @@ def main(split: str, anew: bool = False) -> None:
         if folder.name not in done:
             one = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
             command = [sys.executable, "-m", "benchmarks.merging.atlas", "one", str(folder)]
-            told = subprocess.run(command, capture_output=True, text=True, check=True, env=one)
+            finished = subprocess.run(command, capture_output=True, text=True, check=True, env=one)
             with path.open("a") as out:
-                out.write(told.stdout.splitlines()[-1] + "\n")
+                out.write(finished.stdout.splitlines()[-1] + "\n")
             print(folder.name, flush=True)
     print(table([json.loads(line) for line in path.read_text().splitlines()]))
 
