@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # From a fresh clone to a merged map, with nothing kept from before: the lines that are typed, and the seconds that each takes.
-# benchmarks/fresh_clone.sh [FROM]: what is cloned, this repository by default.
+# benchmarks/speed/fresh_clone.sh [FROM]: what is cloned, this repository by default.
 set -euo pipefail
-from=$(realpath "${1:-$(dirname "$0")/..}")
+from=$(realpath "${1:-$(dirname "$0")/../..}")
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 export PIP_NO_CACHE_DIR=1
