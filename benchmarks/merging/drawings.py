@@ -20,10 +20,11 @@ import numpy as np
 from scipy import ndimage
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.pairs.drawing import draw
-from topomerge.datasets.pairs.example import _building
+from topomerge.datasets.pairs.example import candidate
 from topomerge.datasets.pairs.flat import raise_flat
-from topomerge.datasets.pairs.pairs import _places, draw_frames
-from topomerge.datasets.pairs.recipe import Item, Library, plans_of
+from topomerge.datasets.pairs.items import Item, plans_of
+from topomerge.datasets.pairs.pairs import draw_frames, visited_places
+from topomerge.datasets.pairs.recipe import Library
 
 from benchmarks.merging.pairs import COMMON, ELSEWHERE, GridPair, _misfit, columns_seen, grid_of, items, load, sim3_of, unpacked
 from topomerge.errors import InputError
@@ -53,10 +54,9 @@ def places_of(pair: GridPair, item: Item, plans: Library) -> list[Place]:
     storeys = plans_of(item, plans)
     for k in range(len(item.buildings)):
         try:
-            building = _building(item, k, storeys)
-            other = _building(item, len(item.buildings), storeys) if item.hard == "other-building" else None
+            building, other = candidate(item, k, storeys)
             rng = np.random.default_rng([item.seed, k])
-            known = _places(building, item.overlap, item.rooms, item.hard or None, other, item.over_stairs, rng)
+            known = visited_places(building, item.pair_settings, other, rng)
         except InputError:
             continue
         frames = draw_frames(2, item.scale, rng)

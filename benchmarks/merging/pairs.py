@@ -20,8 +20,9 @@ from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.pairs.example import _first_pair, one_thread, time_limit
+from topomerge.datasets.pairs.items import Item, draw_items, plans_of
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.pairs.recipe import Item, Library, Recipe, draw_items, library, plans_of
+from topomerge.datasets.pairs.recipe import Library, Recipe, library
 
 from topomerge.extraction.voxels import voxelise
 from topomerge.fusion.cell_means import with_means

@@ -19,7 +19,8 @@ from statistics import median
 from time import perf_counter, process_time
 
 from topomerge.datasets.pairs.example import make_file
-from topomerge.datasets.pairs.recipe import Item, Recipe, draw_items
+from topomerge.datasets.pairs.items import Item, draw_items
+from topomerge.datasets.pairs.recipe import Recipe
 
 from benchmarks.speed.bench import line
 

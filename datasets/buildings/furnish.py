@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from topomerge.datasets.buildings.furniture import MIDDLE, ROOMS, ROWS, WALL, Item, footprints, make_item
+from topomerge.datasets.buildings.furniture import FURNITURE_OF, MIDDLE, ROWS, WALL, Item, footprints, make_item
 from topomerge.datasets.core.solids import rotation
 
 from topomerge.types import Array
@@ -110,7 +110,7 @@ def furnish(floor: Floor, kind: str, density: float, clutter: float, doors: Arra
         return []
     area, rng = floor.shape.area, floor.rng
     out: list[Item | None] = []
-    for name, where, least, every in ROOMS.get(kind, ROOMS["office"]):
+    for name, where, least, every in FURNITURE_OF.get(kind, FURNITURE_OF["office"]):
         count = (least + (area / every if every else 0.0)) * density
         number = int(count) + int(rng.random() < count % 1)
         if where == ROWS:

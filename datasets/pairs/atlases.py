@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.pairs.pairs import ROOMS, Atlas, draw_frames, seen_by_both
+from topomerge.datasets.pairs.pairs import ROOMS_A_MAP, Atlas, draw_frames, seen_by_both
 from topomerge.datasets.pairs.parts import room_graph
 from topomerge.datasets.simulation.scanner import scan
 from topomerge.datasets.simulation.session import session
@@ -20,7 +20,7 @@ def make_atlas(
     building: Building,
     sensors: Sequence[str] = ("tls", "depth", "lidar"),
     rng: np.random.Generator | int = 0,
-    rooms: int = ROOMS,
+    rooms: int = ROOMS_A_MAP,
     scale: bool = False,
     difficulty: Difficulty | None = None,
     source: str = "procedural",

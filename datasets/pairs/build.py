@@ -21,8 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.core.script import exit_status
 from topomerge.datasets.pairs.example import Row, about, make_file, refusal
-from topomerge.datasets.pairs.recipe import Item, Recipe, check, draw_items, library, plans_of
+from topomerge.datasets.pairs.items import Item, draw_items, plans_of
+from topomerge.datasets.pairs.recipe import Recipe, check, library
 
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
@@ -192,26 +194,22 @@ def _backend(settings: Build) -> Iterator[None]:
 
 def main(words: list[str] | None = None) -> int:
     """Read the settings with Hydra, build, and print what came of it."""
-    from topomerge.config import compose
-
     words = sys.argv[1:] if words is None else words
     if {"-h", "--help"} & set(words):
         print(f"{__doc__}\nKeys: configs/build.yaml and configs/data/*.yaml; for example data.pairs=100 cache=/tmp/cache jobs=2")
         return 0
-    try:
-        settings = compose("build", Build, words)
-        report = build(settings, lambda text: print(f"build: {text}", file=sys.stderr, flush=True))
-    except InputError as error:
-        print(f"build: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("build: interrupted; start it again to go on", file=sys.stderr)
-        return 130
+    return exit_status("build", lambda: _build_and_print(words))
+
+
+def _build_and_print(words: list[str]) -> None:
+    from topomerge.config import compose
+
+    settings = compose("build", Build, words)
+    report = build(settings, lambda text: print(f"build: {text}", file=sys.stderr, flush=True))
     each = f", {report.seconds / report.made:.2f} s of work each" if report.made else ""
     print(f"{report.manifest}: {report.pairs} pairs, {report.made} made now{each}, {sum(report.refused.values())} refused")
     for reason, count in report.refused.items():
         print(f"  {count} times: {reason}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.pairs.degrade import UNCHANGED, degraded
 from topomerge.datasets.pairs.drawing import with_plan
 from topomerge.datasets.pairs.evaluation_pair import kept_arrays, save_maps, told_of_maps
+from topomerge.datasets.pairs.items import Item, difficulty_of
 from topomerge.datasets.pairs.pairs import Pair, make_pair
-from topomerge.datasets.pairs.recipe import Item, difficulty_of
 from topomerge.datasets.pairs.truth import room_truth, true_matches
 
 from topomerge.embedding.graph import from_arrays, graph_arrays
@@ -204,25 +204,19 @@ def _first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> Pair:
     refused: InputError | None = None
     for k in range(len(item.buildings)):
         try:
-            building = _building(item, k, plans)
-            other = _building(item, len(item.buildings), plans) if item.hard == "other-building" else None
-            pair = make_pair(
-                building,
-                item.overlap,
-                item.sensors,
-                np.random.default_rng([item.seed, k]),
-                item.scale,
-                item.hard or None,
-                item.rooms,
-                other,
-                difficulty_of(item),
-                item.source,
-                item.over_stairs,
-            )
+            building, other = candidate(item, k, plans)
+            rng = np.random.default_rng([item.seed, k])
+            pair = make_pair(building, item.pair_settings, rng, other, difficulty_of(item), item.source)
             return with_plan(pair, building) if item.change[0] == "plan" else pair
         except InputError as error:
             refused = error
     raise refused or InputError("an item without buildings")
+
+
+def candidate(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> tuple[Building, Building | None]:
+    """Candidate k of an item's buildings, and its other building where the item is a hard negative that has one."""
+    other = _building(item, len(item.buildings), plans) if item.hard == "other-building" else None
+    return _building(item, k, plans), other
 
 
 def _building(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> Building:

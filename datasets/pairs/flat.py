@@ -172,17 +172,15 @@ def floor_overlap(a: Array, b: Array, cell: float = 0.2) -> float:
 
 
 def flat_pair(
-    name: str, a: Flat, b: Flat, truth: Sim3, sensors: tuple[str, str], source: str, building: str, seed: int, kept: bool = False
+    name: str, a: Flat, b: Flat, truth: Sim3, sensors: tuple[str, str], source: str, building: str, seed: int | None = None
 ) -> Pair:
     """A pair of floors.
 
     Args:
         truth: maps b's frame into a's, both as their owners gave them.
-        seed: of the frames that both are moved to.
-        kept: stay in the owners' frames, which differ.
+        seed: of the frames that both are moved to; None: they stay in the owners' frames, which differ.
     """
-    rng = np.random.default_rng(seed)
-    frames = [Sim3(), Sim3()] if kept else draw_frames(2, False, rng)
+    frames = [Sim3(), Sim3()] if seed is None else draw_frames(2, False, np.random.default_rng(seed))
     clouds = [
         raise_flat(flat.moved(Sim3(f.yaw, (*f.translation[:2], 0.0))), f.translation[2])
         for flat, f in zip((a, b), frames, strict=True)

@@ -19,7 +19,7 @@ from topomerge.types import Array, PointCloud, Sim3
 
 HARD = ("other-building", "other-storey", "twin-wing")
 KINDS = ("overlap", *HARD)
-ROOMS = 15  # a map
+ROOMS_A_MAP = 15  # a map
 SCALES = (0.5, 2.0)  # a map of unknown scale is larger or smaller by so much
 AWAY = 20.0  # m, frames lie that far apart along x and y
 TURN = np.radians(3)  # frames are turned against each other by more than this
@@ -102,58 +102,69 @@ def is_identity(transform: Sim3) -> bool:
     return abs(transform.yaw) < 1e-3 and shift < 0.01 and abs(transform.scale - 1) < 1e-3
 
 
-def make_pair(
-    building: Building,
-    overlap: float = 0.5,
-    sensors: Sequence[str] = ("tls", "depth"),
-    rng: np.random.Generator | int = 0,
-    scale: bool = False,
-    hard: str | None = None,
-    rooms: int = ROOMS,
-    other: Building | None = None,
-    difficulty: Difficulty | None = None,
-    source: str = "procedural",
-    over_stairs: bool = False,
-) -> Pair:
-    """Two sessions in a building, each scanned along a walk through a connected part of it.
+@dataclass(frozen=True)
+class PairSettings:
+    """Which parts of a building two surveyors visit, and with what.
 
     Args:
         overlap: share of the rooms that both visit (of hard negatives: rooms with the same plan).
         sensors: names, of a and of b.
-        rng: generator or seed; the same seed gives the same points.
+        rooms: of each map, at most.
         scale: b's scale is unknown.
         hard: None, or one of `HARD`: b is another building, another storey with the same plan, or another wing with nearly the
             same plan (other ends and other furniture, perhaps mirrored: `twin_wing`).
-        rooms: of each map, at most.
+        over_stairs: walks lead over stairs, where the building has any (`two_parts`).
+    """
+
+    overlap: float = 0.5
+    sensors: Sequence[str] = ("tls", "depth")
+    rooms: int = ROOMS_A_MAP
+    scale: bool = False
+    hard: str | None = None
+    over_stairs: bool = False
+
+    def __post_init__(self) -> None:
+        if self.hard is not None and self.hard not in HARD:
+            raise InputError(f"hard negative {self.hard!r}: {', '.join(HARD)} are possible")
+        if len(self.sensors) != 2:
+            raise InputError(f"a pair needs two sensors, not {len(self.sensors)}")
+
+
+def make_pair(
+    building: Building,
+    settings: PairSettings | None = None,
+    rng: np.random.Generator | int = 0,
+    other: Building | None = None,
+    difficulty: Difficulty | None = None,
+    source: str = "procedural",
+) -> Pair:
+    """Two sessions in a building, each scanned along a walk through a connected part of it.
+
+    Args:
+        rng: generator or seed; the same seed gives the same points.
         other: the building of "other-building"; None: one of the same kind with another seed.
         difficulty: of both sessions.
-        over_stairs: walks lead over stairs, where the building has any (`two_parts`).
 
     Raises:
         InputError: the building has no such parts, or a room can't be reached.
     """
-    rng, difficulty = np.random.default_rng(rng), difficulty or Difficulty()
-    if hard is not None and hard not in HARD:
-        raise InputError(f"hard negative {hard!r}: {', '.join(HARD)} are possible")
-    if len(sensors) != 2:
-        raise InputError(f"a pair needs two sensors, not {len(sensors)}")
-    places, visited = _places(building, overlap, rooms, hard, other, over_stairs, rng)
-    frames = draw_frames(2, scale, rng)
+    settings, difficulty = settings or PairSettings(), difficulty or Difficulty()
+    rng, sensors, hard = np.random.default_rng(rng), settings.sensors, settings.hard
+    places, visited = visited_places(building, settings, other, rng)
+    frames = draw_frames(2, settings.scale, rng)
     days = (difficulty, ELSEWHERE if hard == "twin-wing" else difficulty)
     a, b = (
         scan(session(place, day, rng), sensor, part, rng, frame=frame)
         for place, part, sensor, frame, day in zip(places, visited, sensors, frames, days, strict=True)
     )
-    share_of = 0.0 if hard else share(visited[0].tolist(), visited[1].tolist())
-    truth = None if hard in ("other-building", "twin-wing") else frames[0] @ frames[1].inverse()
     parts = (tuple(visited[0].tolist()), tuple(visited[1].tolist()))
     return Pair(
-        name=f"{building.name}:{sensors[0]}-{sensors[1]}:{round(100 * overlap)}" + (f":{hard}" if hard else ""),
+        name=f"{building.name}:{sensors[0]}-{sensors[1]}:{round(100 * settings.overlap)}" + (f":{hard}" if hard else ""),
         a=a,
         b=b,
-        truth=truth,
+        truth=None if hard in ("other-building", "twin-wing") else frames[0] @ frames[1].inverse(),
         shared=() if hard else seen_by_both(a, b),
-        overlap=share_of,
+        overlap=0.0 if hard else share(*parts),
         sensors=(sensors[0], sensors[1]),
         source=source,
         building=building.name,
@@ -169,16 +180,11 @@ def seen_by_both(a: PointCloud, b: PointCloud) -> tuple[tuple[int, int], ...]:
     return tuple((int(i), int(i)) for i in np.flatnonzero(np.logical_and.reduce(seen)))
 
 
-def _places(
-    building: Building,
-    overlap: float,
-    rooms: int,
-    hard: str | None,
-    other: Building | None,
-    over_stairs: bool,
-    rng: np.random.Generator,
+def visited_places(
+    building: Building, settings: PairSettings, other: Building | None, rng: np.random.Generator
 ) -> tuple[tuple[Building, Building], tuple[Array, Array]]:
-    """The two buildings, and the rooms that are visited in each."""
+    """The two buildings of a pair, and the rooms that are visited in each."""
+    overlap, rooms, hard = settings.overlap, settings.rooms, settings.hard
     if hard == "other-building":
         other = other or _another(building)
         a, b = (two_parts(x, rooms, 1.0, rng)[0] for x in (building, other))
@@ -187,7 +193,7 @@ def _places(
         twins = twin_rooms(building)
         a, b = two_parts(building, rooms, overlap, rng, twins)
         return (building, building), (a, np.array(sorted(twins[i] for i in b.tolist())))
-    parts = two_parts(building, rooms, overlap, rng, over_stairs=over_stairs)
+    parts = two_parts(building, rooms, overlap, rng, over_stairs=settings.over_stairs)
     return (building, twin_wing(building, rng) if hard == "twin-wing" else building), parts
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.pairs.pairs import ROOMS, Pair, draw_frames, make_pair
+from topomerge.datasets.pairs.pairs import ROOMS_A_MAP, Pair, PairSettings, draw_frames, make_pair
 from topomerge.datasets.simulation.scanner import scan
 from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.session import session
@@ -54,7 +54,7 @@ def simulate(
     building = make_building(kind, seed, max(storeys, 2) if twins else storeys, Difficulty(differ=0.0) if twins else None)
     rng = np.random.default_rng([seed, 1])
     if len(sensors) == 2:
-        pair = make_pair(building, overlap, sensors, rng, scale, hard, ROOMS if rooms is None else rooms)
+        pair = make_pair(building, PairSettings(overlap, sensors, ROOMS_A_MAP if rooms is None else rooms, scale, hard), rng)
         assert pair.frames is not None
         return building, pair, pair.frames[0]
     if hard or scale:

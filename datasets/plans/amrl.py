@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 from topomerge.datasets.plans.raster import add_contacts, add_rooms, contacts, flood, guess_kinds
-from topomerge.datasets.plans.sketch import Sketch
+from topomerge.datasets.plans.sketch import Sketch, read_limited
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -24,14 +24,12 @@ FRONT = 5.0  # m; wider gaps in the outer walls make what lies behind them outsi
 MARGIN = FRONT  # m of outside around the map
 SMALLEST = 1.5  # m2 of a room
 CAVITY = 0.5  # m; narrower space lies within the walls
-MAX_BYTES, MAX_CELLS = 50 << 20, 50_000_000
+LINE_MAP_BYTES, LINE_MAP_CELLS = 50 << 20, 50_000_000
 
 
 def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of the one storey."""
-    if path.stat().st_size > MAX_BYTES:
-        raise InputError(f"absurd size: {path.stat().st_size} bytes for one storey")
-    yield path.name.removesuffix(".vectormap.json"), partial(sketch, path.read_bytes())
+    yield path.name.removesuffix(".vectormap.json"), partial(sketch, read_limited(path, LINE_MAP_BYTES))
 
 
 def sketch(text: bytes) -> Sketch:
@@ -91,7 +89,7 @@ def _drawn(lines: Array) -> tuple[Array, Array]:
     """(h, w) bool raster of the walls, and its origin, m."""
     low, high = lines.min(axis=(0, 1)) - MARGIN, lines.max(axis=(0, 1)) + MARGIN
     shape = np.ceil((high - low) / CELL).astype(int)
-    if shape.astype(float).prod() > MAX_CELLS:
+    if shape.astype(float).prod() > LINE_MAP_CELLS:
         raise InputError(f"absurd scale: a map of {high[0] - low[0]:.0f} by {high[1] - low[1]:.0f} m")
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     count = (length / CELL * 2).astype(int) + 2

@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 import shapely.affinity
 from topomerge.datasets.plans.doors import place_door
-from topomerge.datasets.plans.sketch import Sketch, overlaps
+from topomerge.datasets.plans.sketch import Sketch, overlaps, read_limited
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -58,7 +58,7 @@ ASTRAY = 2.0  # m, how far a door may be from where the portal is drawn
 SAME = 1.2  # m; two marks of a portal between the same rooms, one drawn from each side, are one door
 TRUSTED, HOPELESS = 1.6, 3.0  # factors between the scale of the file and that of usual rooms
 PARTLY, WITHIN = 0.25, 0.95  # share of a room in another one up to which, or from which on, the other one gives way
-MAX_BYTES = 20 << 20
+CAMPUS_BYTES = 20 << 20
 
 
 class _NoDoctype(ElementTree.TreeBuilder):
@@ -71,9 +71,7 @@ class _NoDoctype(ElementTree.TreeBuilder):
 
 def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name and maker of the one storey of a file."""
-    if path.stat().st_size > MAX_BYTES:
-        raise InputError(f"absurd size: {path.stat().st_size} bytes for one plan")
-    yield path.stem.removesuffix("_updated"), partial(sketch, path.read_bytes())
+    yield path.stem.removesuffix("_updated"), partial(sketch, read_limited(path, CAMPUS_BYTES))
 
 
 def sketch(text: bytes) -> Sketch:

@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 import shapely.geometry
 from topomerge.datasets.plans.doors import place_door
-from topomerge.datasets.plans.sketch import Sketch, overlaps
+from topomerge.datasets.plans.sketch import Sketch, check_size, overlaps
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -38,13 +38,12 @@ FRONT, DOOR = 2.4, 0.9  # m, of shops and of the others
 REACH = 1.0  # m between a room and the hall it opens to
 NARROW = 0.6  # m; strips of floor between shops that are narrower are no halls
 DEGREE = 111_320.0  # m
-MAX_BYTES = 50 << 20
+MALL_BYTES = 50 << 20
 
 
 def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     """Name (of the folder) and maker of the one storey."""
-    if path.stat().st_size > MAX_BYTES:
-        raise InputError(f"absurd size: {path.stat().st_size} bytes for one storey")
+    check_size(path, MALL_BYTES)
     yield path.parent.name, partial(sketch, path)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 from topomerge.datasets.core.plan import Wall
 from topomerge.datasets.plans.doors import doorway, sides, window
-from topomerge.datasets.plans.sketch import Sketch
+from topomerge.datasets.plans.sketch import Sketch, read_limited
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -44,7 +44,7 @@ DOOR, BATHTUB, TOILET = 0.75, 1.2, 0.74  # m, usual lengths
 DOOR_RANGE = (0.7, 0.9)  # m, of the median narrow door
 SNAP = 6.0  # px; walls whose ends miss each other by less are joined
 THICKNESS = 0.12  # m
-MAX_MEMBERS, MAX_TOTAL, MAX_BYTES = 100_000, 1 << 30, 1 << 20  # of an archive, and of one plan
+ARCHIVE_MEMBERS, ARCHIVE_BYTES, PLAN_BYTES = 100_000, 1 << 30, 1 << 20  # of an archive, and of one plan
 
 Rows = list[tuple[Array, str, str]]  # (2, 2) px, category, type
 
@@ -56,21 +56,19 @@ def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
         InputError: truncated or absurdly large archive.
     """
     if path.suffix == ".txt":
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"absurd size: {path.stat().st_size} bytes for one plan")
-        yield path.stem, partial(sketch, path.read_bytes())
+        yield path.stem, partial(sketch, read_limited(path, PLAN_BYTES))
         return
     total = 0
     try:
         with tarfile.open(path, "r:*") as archive:
             for count, member in enumerate(archive):
                 total += member.size
-                if count >= MAX_MEMBERS or total > MAX_TOTAL:
-                    raise InputError(f"absurd size: more than {MAX_MEMBERS} members or {MAX_TOTAL >> 20} MiB")
+                if count >= ARCHIVE_MEMBERS or total > ARCHIVE_BYTES:
+                    raise InputError(f"absurd size: more than {ARCHIVE_MEMBERS} members or {ARCHIVE_BYTES >> 20} MiB")
                 if not member.isfile() or not member.name.endswith(".txt"):
                     continue
                 name = member.name.removeprefix("./").removesuffix(".txt")
-                if member.size > MAX_BYTES:
+                if member.size > PLAN_BYTES:
                     yield name, partial(_refuse, f"absurd size: {member.size} bytes for one plan")
                     continue
                 stream = archive.extractfile(member)

@@ -16,7 +16,7 @@ import shapely
 import yaml
 from topomerge.datasets.core.plan import Flight, Wall
 from topomerge.datasets.plans.doors import doorway, sides
-from topomerge.datasets.plans.sketch import Sketch
+from topomerge.datasets.plans.sketch import Sketch, read_limited
 
 from topomerge.errors import InputError
 from topomerge.types import Array
@@ -45,7 +45,7 @@ KINDS = {  # words in the names of waypoints
     "shop": "storage",
 }
 USUAL = {"hotel": "hotel", "clinic": "ward", "office": "office"}  # kind of most rooms, by the building's name
-MAX_BYTES = 20 << 20
+RMF_BYTES = 20 << 20
 DEEPEST = 50  # a plan has 6
 
 Level = dict[str, Any]
@@ -57,9 +57,7 @@ def sketches(path: Path) -> Iterator[tuple[str, Callable[[], Sketch]]]:
     Raises:
         InputError: no YAML, or not of this format.
     """
-    if path.stat().st_size > MAX_BYTES:
-        raise InputError(f"absurd size: {path.stat().st_size} bytes for one building")
-    text, loader = path.read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    text, loader = read_limited(path, RMF_BYTES, "building"), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         _check_depth(text, loader)
         site = yaml.load(text, loader)

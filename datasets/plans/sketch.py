@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import shapely
@@ -65,6 +66,25 @@ class Sketch:
         if ends[0] != ends[1]:
             self.openings.append(opening)
             self.ends.append(ends)
+
+
+def check_size(path: Path, limit: int, what: str = "plan") -> None:
+    """Refuse a file that is too large to be what it should be.
+
+    Args:
+        limit: bytes.
+
+    Raises:
+        InputError: with the size.
+    """
+    if path.stat().st_size > limit:
+        raise InputError(f"absurd size: {path.stat().st_size} bytes for one {what}")
+
+
+def read_limited(path: Path, limit: int, what: str = "plan") -> bytes:
+    """The bytes of a file that has at most `limit` of them (`check_size`)."""
+    check_size(path, limit, what)
+    return path.read_bytes()
 
 
 def finish(sketch: Sketch) -> tuple[Plan, list[str]]:

@@ -9,15 +9,13 @@ Regions become rooms, levels storeys. Without the regions' meshes, a point of th
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.pairs.flat import rooms_at
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.public.sources import SPACING, cut_pair, join_rooms
+from topomerge.datasets.public.sources import SPACING, join_rooms, part_pairs
 
 from topomerge.errors import InputError
 from topomerge.io.points import read_points
@@ -42,12 +40,7 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     houses = sorted(p.parent.parent for p in folder.glob("*/house_segmentations/*.house"))
     if not houses:
         raise InputError(f"{folder}: has no */house_segmentations/*.house; give the folder of the houses (scans)")
-    for house in houses:
-        yield house.name, partial(_pair, house)
-
-
-def _pair(house: Path) -> Pair:
-    return cut_pair(read_house(house), house.name, "matterport", "matterport", zlib.crc32(house.name.encode()))
+    yield from part_pairs(houses, read_house, "matterport")
 
 
 def read_house(folder: Path) -> PointCloud:

@@ -12,15 +12,13 @@ from __future__ import annotations
 
 import io
 import re
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.public.sources import cut_pair, hull, join_rooms
+from topomerge.datasets.public.sources import hull, join_rooms, part_pairs
 
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, TrueRoom
@@ -39,12 +37,7 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     areas = sorted(p for p in folder.iterdir() if p.is_dir() and re.fullmatch(r"Area_\d\w*", p.name))
     if not areas:
         raise InputError(f"{folder}: has no folder Area_1 ...; give the one of Stanford3dDataset_v1.2")
-    for area in areas:
-        yield area.name, partial(_pair, area)
-
-
-def _pair(area: Path) -> Pair:
-    return cut_pair(read_area(area), area.name, "s3dis", "matterport", zlib.crc32(area.name.encode()))
+    yield from part_pairs(areas, read_area, "s3dis")
 
 
 def read_area(area: Path) -> PointCloud:

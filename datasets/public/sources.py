@@ -14,8 +14,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -87,6 +89,18 @@ def hull(points: Array) -> Array:
     if shape.geom_type != "Polygon":
         raise InputError("its points lie on one line; no room has this shape")
     return np.asarray(shapely.normalize(shape).exterior.coords)[-2::-1].copy()
+
+
+def part_pairs(
+    folders: Sequence[Path], read: Callable[[Path], PointCloud], source: str
+) -> Iterator[tuple[str, Callable[[], Pair]]]:
+    """Name and maker of a pair of parts of each building, which `read` gives as a labelled cloud."""
+    for folder in folders:
+        yield folder.name, partial(_part_pair, folder, read, source)
+
+
+def _part_pair(folder: Path, read: Callable[[Path], PointCloud], source: str) -> Pair:
+    return cut_pair(read(folder), folder.name, source, "matterport", zlib.crc32(folder.name.encode()))
 
 
 def cut_pair(cloud: PointCloud, name: str, source: str, sensor: str, seed: int) -> Pair:

@@ -58,7 +58,7 @@ def _pair(path: Path, a: str, b: str) -> Pair:
     frames = [Sim3(f.yaw, (*f.translation[:2], 0.0)) for f in draw_frames(2, False, np.random.default_rng(seed))]
     maps = [draw(poses[rows], ranges[rows], frame, name) for rows, frame in zip(split(len(poses), a, b), frames, strict=True)]
     truth = frames[0] @ frames[1].inverse()
-    return flat_pair(name, maps[0], maps[1], truth, ("laser2d", "laser2d"), "carmen", _site(path), seed, kept=True)
+    return flat_pair(name, maps[0], maps[1], truth, ("laser2d", "laser2d"), "carmen", _site(path))
 
 
 def split(count: int, a: str, b: str) -> tuple[Array, Array]:

@@ -54,7 +54,7 @@ def _pair(read: Callable[[str], Flat], points: dict[str, Array], a: str, b: str,
     except (KeyError, IndexError) as error:
         raise InputError(f"{a}-{b}: a key point is missing ({error}); copy the list of pairs again") from error
     sensors = tuple("drawing" if n.endswith("layout") else "phone" for n in (a, b))
-    return flat_pair(f"{a}-{b}", *maps, truth, (sensors[0], sensors[1]), "halmstad", a.split("_")[0], 0, kept=True)
+    return flat_pair(f"{a}-{b}", *maps, truth, (sensors[0], sensors[1]), "halmstad", a.split("_")[0])
 
 
 def _read(folder: Path, name: str) -> Flat:

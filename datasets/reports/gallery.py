@@ -14,7 +14,7 @@ from matplotlib.patches import Polygon
 from topomerge.datasets.buildings.furniture import footprints
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.building import Building
-from topomerge.datasets.pairs.pairs import Pair, make_pair
+from topomerge.datasets.pairs.pairs import Pair, PairSettings, make_pair
 from topomerge.datasets.pairs.picture import picture
 from topomerge.datasets.pairs.truth import room_truth, true_matches
 
@@ -140,7 +140,7 @@ def main(folder: str) -> None:
         save(building_picture(make_building(kind, seed, storeys)), Path(folder) / f"building_{kind}.png")
     for number, (kind, seed, storeys, overlap, sensors, hard) in enumerate(PAIRS):
         building = make_building(kind, seed, storeys)
-        pair = make_pair(building, overlap, sensors, seed, hard=hard, rooms=12)
+        pair = make_pair(building, PairSettings(overlap, sensors, 12, hard=hard), seed)
         assert pair.frames is not None
         save(picture(building, pair, pair.frames[0]), Path(folder) / f"pair_{number}_maps.png")
         maps = (extract(pair.a), extract(pair.b))

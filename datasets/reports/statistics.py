@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from topomerge.datasets.core.script import exit_status
 from topomerge.datasets.pairs.example import refusal
-from topomerge.datasets.pairs.recipe import Item
+from topomerge.datasets.pairs.items import Item
 
 from topomerge.errors import InputError
 from topomerge.io import archive
@@ -47,7 +48,7 @@ class Counted:
         rows: what is told of each pair (`example.make_arrays`).
         bytes: of each file.
         apart: m, of all pairs: see `middles_apart`.
-        outdated: pairs in the folder that are of another version of the data (`recipe.PAIR_FORMAT`); none of them is counted.
+        outdated: pairs in the folder that are of another version of the data (`items.PAIR_FORMAT`); none of them is counted.
         refused: reasons and how often, without the names and numbers in them; of all versions in the folder. What took too
             long, or failed in a way that may not happen again, leaves no file and is not among them.
     """
@@ -255,16 +256,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     if (given.manifest is None) == (given.pairs is None):
         parser.error("name a manifest, or a folder with --pairs")
-    try:
-        lines = list(report(count_manifest(given.manifest) if given.manifest else count_folder(given.pairs)))
-        if given.write:
-            insert(given.write, lines)
-        else:
-            print("\n".join(lines))
-    except InputError as error:
-        print(f"statistics: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return exit_status("statistics", lambda: _write(given))
+
+
+def _write(given: argparse.Namespace) -> None:
+    lines = list(report(count_manifest(given.manifest) if given.manifest else count_folder(given.pairs)))
+    if given.write:
+        insert(given.write, lines)
+    else:
+        print("\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -57,15 +57,15 @@ class Sensor:
     grazing: float = 5.0
     dark: float = 0.03
     lost: float = 0.005
-    glass: float = 0.1
-    mixed: float = 0.3
+    jitter: tuple[float, float] = (0.0, 0.0)
     drift: float = 0.0
     tilt: float = 0.0
-    jitter: tuple[float, float] = (0.0, 0.0)
+    glass: float = 0.1
     ghost: float = 0.05
+    metric: bool = True
+    mixed: float = 0.3
     plain: float = 1.0
     lowest: float = -1.0
-    metric: bool = True
 
     def rays(self, number: int) -> tuple[Array, tuple[int, int]]:
         """About `number` directions (rows * columns, 3), x ahead, z up, as an image; and its rows and columns."""

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from topomerge.datasets.core.plan import Opening, Plan
 from topomerge.datasets.pairs import build as module
-from topomerge.datasets.pairs import example, recipe
+from topomerge.datasets.pairs import example, items
 from topomerge.datasets.pairs.build import Build, build, main
 from topomerge.datasets.pairs.example import PairSet, Row, load_example
-from topomerge.datasets.pairs.recipe import Item, Recipe, check, draw_items, plans_of
+from topomerge.datasets.pairs.items import Item, draw_items, plans_of
+from topomerge.datasets.pairs.recipe import Recipe, check
 
 from tests.datasets.boxes import room
 from tests.package_copy import copied, edited_kernel
@@ -73,7 +74,7 @@ def test_what_is_there_is_not_made_again(whole: Path) -> None:
 def test_another_kernel_refuses_cached_maps(monkeypatch, tmp_path, addition: str, maps: bool, same: bool) -> None:
     item = replace(draw_items(SMALL, {})[0], maps=maps)
     before = item.name
-    monkeypatch.setattr(recipe, "code_digest", partial(code_digest, package=edited_kernel(tmp_path, addition)))
+    monkeypatch.setattr(items, "code_digest", partial(code_digest, package=edited_kernel(tmp_path, addition)))
     assert (item.name == before) is same
 
 
@@ -84,7 +85,7 @@ def test_other_weights_of_the_extraction_refuse_cached_pairs(monkeypatch, tmp_pa
     with (package / "extraction" / "plans" / "plan_network.npz").open("ab") as file:
         file.write(b" ")
     for digest in (code_digest, data_digest):
-        monkeypatch.setattr(recipe, digest.__name__, partial(digest, package=package))
+        monkeypatch.setattr(items, digest.__name__, partial(digest, package=package))
     assert item.name != before
 
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.pairs.drawing import draw, with_plan
 from topomerge.datasets.pairs.flat import raise_flat
-from topomerge.datasets.pairs.pairs import make_pair
+from topomerge.datasets.pairs.pairs import PairSettings, make_pair
 
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
@@ -32,7 +32,7 @@ def test_walls_stand_where_rooms_end_and_doors_are_open() -> None:
 
 def test_the_plan_lies_where_the_scan_would_be() -> None:
     building = make_building("house", 3)
-    pair = make_pair(building, 0.5, ("depth", "depth"), 4, rooms=4)
+    pair = make_pair(building, PairSettings(0.5, ("depth", "depth"), 4), 4)
     drawn = with_plan(pair, building)
     assert drawn.truth == pair.truth and drawn.sensors == ("depth", "drawing")
     assert drawn.truth is not None and drawn.frames is not None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.building import Building
-from topomerge.datasets.pairs.pairs import Pair, draw_frames, make_pair
+from topomerge.datasets.pairs.pairs import Pair, PairSettings, draw_frames, make_pair
 from topomerge.datasets.pairs.parts import room_graph, share, twin_rooms, two_parts
 from topomerge.datasets.pairs.truth import TRUTH_DTYPE, cell_labels, room_truth, true_matches
 
@@ -23,7 +23,7 @@ def tower() -> Building:
 
 @pytest.fixture(scope="module")
 def pair() -> Pair:
-    return make_pair(make_building("house", 3), 0.5, ("depth", "tls"), 5, rooms=4, scale=True)
+    return make_pair(make_building("house", 3), PairSettings(0.5, ("depth", "tls"), 4, scale=True), 5)
 
 
 def connected(building: Building, part: set[int]) -> bool:
@@ -83,7 +83,7 @@ def test_points_of_a_shared_room_coincide(pair: Pair) -> None:
 
 def test_the_same_seed_gives_the_same_pair() -> None:
     building = make_building("house", 3)
-    one, same, other = (make_pair(building, 0.5, ("depth", "depth"), seed, rooms=3) for seed in (1, 1, 2))
+    one, same, other = (make_pair(building, PairSettings(0.5, ("depth", "depth"), 3), seed) for seed in (1, 1, 2))
     assert one.truth == same.truth != other.truth
     assert one.b.points.tobytes() == same.b.points.tobytes() != other.b.points.tobytes()
 
@@ -105,7 +105,7 @@ def test_a_pair_that_tests_nothing_or_contradicts_itself_is_refused(pair: Pair) 
         with pytest.raises(InputError, match=reason):
             replace(pair, **wrong)
     with pytest.raises(InputError, match="hard negative 'odd'"):
-        make_pair(make_building("house", 3), hard="odd")
+        make_pair(make_building("house", 3), PairSettings(hard="odd"))
 
 
 def strip() -> tuple[TopometricMap, PointCloud]:

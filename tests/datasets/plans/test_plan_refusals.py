@@ -158,7 +158,7 @@ def test_truncated_archive_is_refused(tmp_path: Path) -> None:
 
 
 def test_absurdly_large_archive_is_not_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("topomerge.datasets.plans.r2v.MAX_TOTAL", 1 << 20)
+    monkeypatch.setattr("topomerge.datasets.plans.r2v.ARCHIVE_BYTES", 1 << 20)
     path = pack(tmp_path / "all.tar.xz", {"zeros.bin": bytes(2 << 20), "a.txt": write.r2v(tmp_path / "a.txt").read_bytes()})
     assert reason(path).startswith("absurd size")
 
