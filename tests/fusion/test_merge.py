@@ -11,9 +11,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import topomerge as tm
+from tests.fusion.atlas.atlas_scenes import office_map
+from tests.fusion.atlas.atlas_scenes import stranger as another
 from tests.fusion.plans_of import MOVE, off, office, part
 from tests.scenes import Scene
 from topomerge.errors import InputError
+from topomerge.fusion.atlas.solve import solve
 from topomerge.fusion.fuse import room_of_rooms
 from topomerge.fusion.result import STEPS, MergeResult, merge_to_json
 from topomerge.matching.odds import match_probability
@@ -232,3 +235,37 @@ def test_maps_with_one_room_or_none_are_tried(halves):
     found = tm.merge([empty, halves[0]], force=True)
     assert any("has no rooms" in w for w in found.warnings)
     assert not found.merged
+
+
+@pytest.fixture(scope="module")
+def registrations() -> dict:
+    """No registration is made twice."""
+    return {}
+
+
+@pytest.fixture
+def remembered(registrations, monkeypatch):
+    """Merging makes no registration twice."""
+    monkeypatch.setattr("topomerge.fusion.merge.solve", lambda maps, settings, _: solve(maps, settings, registrations))
+
+
+def test_three_maps_are_merged_by_an_atlas(tmp_path, remembered):
+    result = tm.merge([office_map(0), office_map(1), office_map(2)])
+    assert result.merged and result.probability > 0.9 and set(result.transforms) == {1, 2}
+    assert {m.maps for m in result.matches} == {(0, 1), (0, 2), (1, 2)}
+    listing = merge_to_json(result)
+    assert list(listing["transforms"]) == ["1", "2"] and listing["transforms"]["2"]["into"] == 0
+    assert listing["transforms"]["2"]["rmse_m"] < 0.05
+    json.dumps(listing, allow_nan=False)
+    result.save(tmp_path / "merged")
+    assert sorted(p.name for p in (tmp_path / "merged").iterdir()) == ["map.tmap", "merge.json", "merged.ply", "report.html"]
+    page = (tmp_path / "merged" / "report.html").read_text(encoding="utf-8")
+    assert "All maps belong together" in page and "south" in page and "data-scene=" in page
+
+
+def test_a_first_map_that_stands_apart_is_told(remembered):
+    result = tm.merge([another(), office_map(0), office_map(2)])
+    assert result.status == "abstained" and not result.transforms and result.map is None
+    assert "stranger stands apart" in result.reason and "west, east" in result.reason
+    forced = tm.merge([another(), office_map(0), office_map(2)], force=True)
+    assert forced.status == "abstained" and set(forced.transforms) == {1, 2} and "force" in forced.reason

@@ -13,7 +13,8 @@ from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.solve import AtlasResult, AtlasSettings, RegistrationsByPair, solve
+from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, solve
 from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import fuse, rooms_in_common
 from topomerge.fusion.inputs import check_pair, check_poses, check_scale, checked_threshold, pair_warnings

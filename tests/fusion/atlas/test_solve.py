@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,11 +11,9 @@ import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import FRAMES, NAMES, office_map, stranger, truth
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.maps import LOADED_AT_ONCE, Maps, map_key
-from topomerge.fusion.atlas.pairs import Checks, hypotheses, promise
+from topomerge.fusion.atlas.pairs import promise
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.solve import solve
 from topomerge.fusion.pose_difference import pose_difference
-from topomerge.fusion.result import merge_to_json
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
 
@@ -24,7 +21,7 @@ SHIFTED = Sim3(0.0, (4.5, 0.0, 0.0))  # by a room
 
 
 @pytest.fixture(scope="module")
-def known():
+def registrations():
     """Registrations that were made before: they are the same for any order."""
     return {}
 
@@ -35,8 +32,8 @@ def maps() -> list[TopometricMap]:
 
 
 @pytest.fixture(scope="module")
-def found(maps, known) -> AtlasResult:
-    return tm.atlas(maps, registrations=known)
+def atlas(maps, registrations) -> AtlasResult:
+    return tm.atlas(maps, registrations=registrations)
 
 
 def off(result: AtlasResult, k: int, m: int, pose: Sim3) -> tuple[float, float]:
@@ -52,36 +49,36 @@ def right(result: AtlasResult, members: dict[int, int], first: int = 0) -> bool:
     return all(metres < 0.08 and degrees < 0.5 for metres, degrees in gaps)
 
 
-def test_parts_of_a_building_come_together_and_a_stranger_stays_apart(found):
-    assert found.components == ((0, 1, 2, 3), (4,)) and found.alone == (4,) and found.status == "parted"
-    assert right(found, {k: k for k in range(4)}) and found.transforms[4] == Sim3()
-    assert "west, south, east, north" in found.words() and "stranger stands apart" in found.words()
-    assert found.probability(0) > 0.9 and found.probability(1) == 0.0 and not found.rejected
-    assert len(found.links) == 3 and all(found.residuals[k] < 0.05 for k in range(4))
-    assert found.registered[0] < found.registered[1] == 10  # the rest follows from the links
+def test_parts_of_a_building_come_together_and_a_stranger_stays_apart(atlas):
+    assert atlas.components == ((0, 1, 2, 3), (4,)) and atlas.alone == (4,) and atlas.status == "parted"
+    assert right(atlas, {k: k for k in range(4)}) and atlas.transforms[4] == Sim3()
+    assert "west, south, east, north" in atlas.words() and "stranger stands apart" in atlas.words()
+    assert atlas.probability(0) > 0.9 and atlas.probability(1) == 0.0 and not atlas.rejected
+    assert len(atlas.links) == 3 and all(atlas.residuals[k] < 0.05 for k in range(4))
+    assert atlas.registered[0] < atlas.registered[1] == 10  # the rest follows from the links
 
 
-def test_the_order_of_the_maps_does_not_matter(found, maps, known):
+def test_the_order_of_the_maps_does_not_matter(atlas, maps, registrations):
     order = [3, 4, 1, 0, 2]
-    turned = tm.atlas([maps[k] for k in order], registrations=known)
-    assert {frozenset(order[k] for k in c) for c in turned.components} == {frozenset(c) for c in found.components}
+    turned = tm.atlas([maps[k] for k in order], registrations=registrations)
+    assert {frozenset(order[k] for k in c) for c in turned.components} == {frozenset(c) for c in atlas.components}
     for k in (0, 2, 3, 4):
         if order[k] != 4:
-            metres, degrees = off(turned, 0, k, found.transforms[3].inverse() @ found.transforms[order[k]])
+            metres, degrees = off(turned, 0, k, atlas.transforms[3].inverse() @ atlas.transforms[order[k]])
             assert metres < 1e-6 and degrees < 1e-6
-    assert turned.registered == found.registered
+    assert turned.registered == atlas.registered
 
 
-def poisoned(maps: list[TopometricMap], known: dict, i: int, j: int, wrong: Sim3, p: float) -> dict:
+def poisoned(maps: list[TopometricMap], registrations: dict, i: int, j: int, wrong: Sim3, p: float) -> dict:
     """The registrations, with a wrong one of maps i and j (`wrong` moves map j in the frame of map i)."""
     keys = map_key(maps[i]), map_key(maps[j])
     pose = wrong @ truth(i, j)
     pair, pose = (keys, pose) if keys[0] < keys[1] else (keys[::-1], pose.inverse())
-    return {**known, pair: (PoseHypothesis(pose, probability=p),)}
+    return {**registrations, pair: (PoseHypothesis(pose, probability=p),)}
 
 
 @pytest.mark.parametrize("p", [0.93, 0.997])
-def test_a_wrong_hypothesis_in_a_cycle_is_thrown_out_and_named(maps, known, p, monkeypatch):
+def test_a_wrong_hypothesis_in_a_cycle_is_thrown_out_and_named(maps, registrations, p, monkeypatch):
     # Which pairs are tried goes by how alike rooms look, which any training may change: the poisoned one is tried here.
     maps, first = maps[:4], {id(maps[0]), id(maps[3])}
 
@@ -89,108 +86,61 @@ def test_a_wrong_hypothesis_in_a_cycle_is_thrown_out_and_named(maps, known, p, m
         return 1e6 if {id(inner[i]), id(inner[j])} == first else promise(inner, i, j)
 
     monkeypatch.setattr("topomerge.fusion.atlas.solve.promise", ranked)
-    result = tm.atlas(maps, registrations=poisoned(maps, known, 0, 3, SHIFTED, p))
+    result = tm.atlas(maps, registrations=poisoned(maps, registrations, 0, 3, SHIFTED, p))
     assert result.components == ((0, 1, 2, 3),) and right(result, {k: k for k in range(4)})
     assert [link.maps for link in result.rejected] == [(0, 3)] and result.rejected[0].hypothesis.probability == p
     assert "west, north" in result.words() and "thrown out" in result.words() and result.status == "merged"
 
 
-def test_two_claims_of_one_weight_are_not_believed(maps, known):
-    """Of west and south, of south and east: right, of west and east: wrong; nothing else is known, and free space is silent."""
+def test_two_claims_of_one_weight_are_not_believed(maps, registrations):
+    """Of west and south, of south and east: right, of west and east: wrong; no other pair is there, free space is silent."""
     three = [maps[0], maps[1], maps[2]]
-    weak = {pair: tuple(replace(h, probability=min(h.probability, 0.93)) for h in hs) for pair, hs in known.items()}
+    weak = {pair: tuple(replace(h, probability=min(h.probability, 0.93)) for h in hs) for pair, hs in registrations.items()}
     result = tm.atlas(three, registrations=poisoned(maps, weak, 0, 2, SHIFTED, 0.95))
     assert 2 not in result.components[0] or right(result, {0: 0, 1: 1, 2: 2})  # never at the wrong place
 
 
-def test_a_poisoned_map_is_not_let_in(maps, known):
+def test_a_poisoned_map_is_not_let_in(maps, registrations):
     """A stranger that one pair believes to be surely part of the building stands on free floor there."""
     west, other = maps[0], maps[4]
     keys = map_key(west), map_key(other)
     pose = Sim3(0.2, (3.0, 2.0, 0.0))
     pair, pose = (keys, pose) if keys[0] < keys[1] else (keys[::-1], pose.inverse())
-    result = tm.atlas(maps, registrations={**known, pair: (PoseHypothesis(pose, probability=0.95),)})
+    result = tm.atlas(maps, registrations={**registrations, pair: (PoseHypothesis(pose, probability=0.95),)})
     assert result.alone == (4,) and right(result, {k: k for k in range(4)})
     assert [link.maps for link in result.rejected] == [(0, 4)] and "west, stranger" in result.words()
 
 
-def test_an_ambiguous_pair_is_settled_by_the_others(maps, known):
-    """South and north share a corridor only: three places are about as good; west and east know which is right."""
-    inner = Maps(maps)
-    pair = hypotheses(inner, 1, 3)
-    assert pair[0].probability < 0.9 and len(pair) > 1
-    check = Checks(inner)(1, 3, truth(1, 3))
-    assert check.overlap and check.log_odds > 0
-
-
-def test_checks_see_walls_on_free_floor(maps):
-    checks = Checks(Maps(maps))
-    right, wrong = checks(0, 2, truth(0, 2)), checks(0, 2, Sim3(0.3, (2.0, 1.0, 0.0)) @ truth(0, 2))
-    assert right.log_odds > 2 and wrong.log_odds < -2 and right.overlap and wrong.overlap
-    assert checks(2, 0, truth(2, 0)).log_odds == right.log_odds
-    far = checks(0, 2, Sim3(0.0, (99.0, 0.0, 0.0)))
-    assert not far.overlap and far.log_odds == 0.0
-    assert not checks(0, 2, Sim3(0.0, (0.0, 0.0, 9.0))).overlap
-
-
-def test_the_joined_map_is_that_of_the_whole(found, maps):
-    joined = found.joined(0)
+def test_the_joined_map_is_that_of_the_whole(atlas, maps):
+    joined = atlas.joined(0)
     assert 9 <= len(joined.rooms) <= 11 and joined.rooms["area"].sum() == pytest.approx(24 * 14, rel=0.15)
     assert joined.source == " + ".join(NAMES) and joined.free is not None
     bits = joined.provenance
     assert np.bitwise_or.reduce(bits) == 0b1111
     for k in range(4):
         seen = joined.grid.centroids()[(bits >> k) & 1 == 1]
-        back = FRAMES[k].inverse().apply(found.transforms[k].inverse().apply(seen))
+        back = FRAMES[k].inverse().apply(atlas.transforms[k].inverse().apply(seen))
         own = FRAMES[k].inverse().apply(maps[k].grid.centroids())
         assert np.allclose(back.min(axis=0), own.min(axis=0), atol=0.2)
         assert np.allclose(back.max(axis=0), own.max(axis=0), atol=0.2)
 
 
-def test_files_are_read_when_needed(maps, found, known, tmp_path):
+def test_files_are_read_when_needed(maps, atlas, registrations, tmp_path):
     paths = []
     for k in (0, 1, 2, 3, 4):
         paths.append(tmp_path / f"{k}.tmap")
         tm.save_map(maps[k], paths[-1])
-    result = tm.atlas(paths, registrations=known)
-    assert result.components == found.components and result.names == found.names
-    assert all(np.allclose(result.transforms[k].matrix, found.transforms[k].matrix, atol=1e-9) for k in range(4))
+    result = tm.atlas(paths, registrations=registrations)
+    assert result.components == atlas.components and result.names == atlas.names
+    assert all(np.allclose(result.transforms[k].matrix, atlas.transforms[k].matrix, atol=1e-9) for k in range(4))
     inner = Maps(paths)
     assert [len(inner[k].rooms) for k in range(5)] == [len(m.rooms) for m in maps] and len(inner._loaded) == LOADED_AT_ONCE
     assert promise(inner, 0, 2) > promise(inner, 0, 4)
 
 
-def test_strangers_stay_strangers(maps, known):
-    result = tm.atlas([maps[0], maps[4]], registrations=known)
+def test_strangers_stay_strangers(maps, registrations):
+    result = tm.atlas([maps[0], maps[4]], registrations=registrations)
     assert result.status == "abstained" and result.components == ((0,), (1,)) and "nothing could be connected" in result.words()
-
-
-@pytest.fixture
-def remembered(known, monkeypatch):
-    """Merging makes no registration twice."""
-    monkeypatch.setattr("topomerge.fusion.merge.solve", lambda maps, settings, _: solve(maps, settings, known))
-
-
-def test_three_maps_are_merged_by_an_atlas(maps, tmp_path, remembered):
-    result = tm.merge([maps[0], maps[1], maps[2]])
-    assert result.merged and result.probability > 0.9 and set(result.transforms) == {1, 2}
-    assert {m.maps for m in result.matches} == {(0, 1), (0, 2), (1, 2)}
-    listing = merge_to_json(result)
-    assert list(listing["transforms"]) == ["1", "2"] and listing["transforms"]["2"]["into"] == 0
-    assert listing["transforms"]["2"]["rmse_m"] < 0.05
-    json.dumps(listing, allow_nan=False)
-    result.save(tmp_path / "merged")
-    assert sorted(p.name for p in (tmp_path / "merged").iterdir()) == ["map.tmap", "merge.json", "merged.ply", "report.html"]
-    page = (tmp_path / "merged" / "report.html").read_text(encoding="utf-8")
-    assert "All maps belong together" in page and "south" in page and "data-scene=" in page
-
-
-def test_a_first_map_that_stands_apart_is_told(maps, remembered):
-    result = tm.merge([maps[4], maps[0], maps[2]])
-    assert result.status == "abstained" and not result.transforms and result.map is None
-    assert "stranger stands apart" in result.reason and "west, east" in result.reason
-    forced = tm.merge([maps[4], maps[0], maps[2]], force=True)
-    assert forced.status == "abstained" and set(forced.transforms) == {1, 2} and "force" in forced.reason
 
 
 def test_bad_maps_are_refused(maps):
@@ -208,12 +158,6 @@ def test_bad_maps_are_refused(maps):
     empty = replace(maps[0], grid=maps[0].grid.subset(np.zeros(len(maps[0].grid), bool)), room=maps[0].room[:0], source="empty")
     with pytest.raises(InputError, match="empty: has no occupied cells"):
         tm.atlas([maps[1], empty])
-
-
-def test_keys_tell_maps_by_what_they_hold(maps):
-    assert map_key(maps[0]) == map_key(replace(maps[0], source="other", seconds={"x": 1.0}))
-    moved = replace(maps[0], grid=replace(maps[0].grid, origin=maps[0].grid.origin + 1.0))
-    assert len({map_key(m) for m in (*maps, moved)}) == 6
 
 
 @pytest.mark.slow
