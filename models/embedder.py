@@ -13,9 +13,10 @@ from topomerge.models.voxelcnn import VoxelCNN
 from topomerge.models.yaw import Turned
 from torch import Tensor, nn
 
-from topomerge.embedding.network import GEOMETRY, GRAPH, Network, check, needed, pair_tensors, tensors
+from topomerge.embedding.network import GRAPH, TABLE_PARTS, Network, check, needed, pair_tensors, tensors
+from topomerge.embedding.schema import width
 
-POINTS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}
+POINT_ENCODERS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}
 
 
 class Table(nn.Module):
@@ -39,16 +40,16 @@ class GeometryEncoder(nn.Module):
         geometry, self.width = network.geometry, network.geometry.width
         self.parts = nn.ModuleDict()
         for part in geometry.parts:
-            if part in POINTS:
-                self.parts[part] = Turned(POINTS[part](self.width), geometry.yaws, geometry.canonical)
+            if part in POINT_ENCODERS:
+                self.parts[part] = Turned(POINT_ENCODERS[part](self.width), geometry.yaws, geometry.canonical)
             else:
-                self.parts[part] = Table(GEOMETRY[part], self.width, network.dropout)
+                self.parts[part] = Table(width(TABLE_PARTS[part]), self.width, network.dropout)
         self.join = nn.Sequential(nn.LayerNorm(len(self.parts) * self.width), nn.ReLU(), nn.Dropout(network.dropout))
         self.out = nn.Linear(len(self.parts) * self.width, self.width)
 
     def forward(self, tensors: Mapping[str, Tensor]) -> Tensor:
-        found = [module(tensors[needed(part)]) for part, module in self.parts.items()]
-        out: Tensor = self.out(self.join(torch.cat(found, dim=1)))
+        rooms = [module(tensors[needed(part)]) for part, module in self.parts.items()]
+        out: Tensor = self.out(self.join(torch.cat(rooms, dim=1)))
         return out
 
 
@@ -81,7 +82,7 @@ class Embedder(nn.Module):
 
     @property
     def temperature(self) -> Tensor:
-        """Learned, but kept between 0.02 and 1."""
+        """Learned, between 0.02 and 1."""
         return self.log_temperature.exp().clamp(0.02, 1.0)
 
     def forward(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Parts that the encoders share: small perceptrons, standardised inputs, sums over the neighbours of a room."""
+"""Parts that the encoders share: small perceptrons and standardised inputs."""
 
 from __future__ import annotations
 
@@ -39,40 +39,12 @@ class Standardise(nn.Module):
     def fit(self, values: Tensor) -> None:
         """Take mean and standard deviation from rows (n, width); columns that never change are left as they are."""
         if len(values):
-            found = logarithm(values.double())
-            spread = found.std(dim=0, unbiased=False)
-            self.mean.copy_(found.mean(dim=0))
+            logarithms = logarithm(values.double())
+            spread = logarithms.std(dim=0, unbiased=False)
+            self.mean.copy_(logarithms.mean(dim=0))
             self.spread.copy_(torch.where(spread > 1e-4, spread, torch.ones_like(spread)))
 
 
 def logarithm(values: Tensor) -> Tensor:
     """Sign times the logarithm of 1 + size."""
     return values.sign() * values.abs().log1p()
-
-
-def segment_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """(count, W) sums of the rows (n, W) that have each index (n,); 0 where there is none."""
-    out: Tensor = torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device).index_add(0, index, values)
-    return out
-
-
-def segment_mean(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """(count, W) means likewise."""
-    ones = torch.ones((values.shape[0], 1), dtype=values.dtype, device=values.device)
-    return segment_sum(values, index, count) / segment_sum(ones, index, count).clamp(min=1)
-
-
-def segment_max(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """(count, W) largest of values (n, W) of 0 and more likewise."""
-    zeros = torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device)
-    out: Tensor = zeros.scatter_reduce(0, index[:, None].expand(-1, values.shape[1]), values, "amax")
-    return out
-
-
-def segment_softmax(scores: Tensor, index: Tensor, count: int) -> Tensor:
-    """(n, H) softmax of scores (n, H) among the rows with the same index.
-
-    Scores are bounded, not shifted by the largest one of each index: exp of 30 is far from overflow, and the graph is simpler.
-    """
-    weight = (30 * torch.tanh(scores / 30)).exp()
-    return weight / segment_sum(weight, index, count)[index].clamp(min=1e-12)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from itertools import pairwise
 
 import torch
-from topomerge.models.doors import DoorLayer
-from topomerge.models.gat import GatLayer
+from topomerge.models.door_conv import DoorConv
+from topomerge.models.edge_sage_conv import EdgeSAGEConv
+from topomerge.models.edge_value_conv import EdgeValueConv
 from topomerge.models.layers import Standardise
-from topomerge.models.sage import SageLayer
 from torch import Tensor, nn
+from torch_geometric.nn import GATv2Conv, SAGEConv
 
-from topomerge.embedding.network import Node
-
-KNOTS, DISTANCE = 11, 5  # bumps of the distance between two rooms, which is this column of edge_attr
-EDGE, PAIR, NEAR = 11, 3, 5  # widths of edge_attr and door_attr (`embedding.graph`), and of near_attr (`embedding.door_layout`)
+from topomerge.embedding.network import ROOM_KNOTS, Node, pair_tensors
+from topomerge.embedding.schema import column, width
 
 
 def dense(*widths: int) -> nn.Sequential:
@@ -23,56 +22,72 @@ def dense(*widths: int) -> nn.Sequential:
 
 
 def bumps(distance: Tensor) -> Tensor:
-    """(n,) m -> (n, KNOTS): distances are told as bumps 1 m apart, so that 3 m and 4 m are two things."""
-    knots = torch.arange(KNOTS, dtype=distance.dtype, device=distance.device)
+    """(n,) m -> (n, `ROOM_KNOTS`): distances come as bumps 1 m apart, so that 3 m and 4 m are two things."""
+    knots = torch.arange(ROOM_KNOTS, dtype=distance.dtype, device=distance.device)
     return (-((distance[:, None] - knots) ** 2)).exp()
 
 
+def room_layer(settings: Node, channels: int) -> nn.Module:
+    """One layer over the rooms: (R, channels), edge_index, edges (E, settings.width) if there are features -> (R, channels)."""
+    edge_dim = settings.width if settings.edges else None
+    if settings.kind == "sage":
+        return EdgeSAGEConv(channels, edge_dim) if edge_dim else SAGEConv(channels, channels)
+    if settings.edge_values:
+        return EdgeValueConv(channels, edge_dim, settings.heads)
+    return GATv2Conv(channels, channels // settings.heads, settings.heads, edge_dim=edge_dim, add_self_loops=False)
+
+
 class NodeEncoder(nn.Module):
-    """(R, width) -> (R, out): each room with what it knows of its neighbours.
+    """(R, width) -> (R, out): each room with what it learns from its neighbours.
 
     Args:
         settings: kind of layer and how they are stacked; kind `none` gives the rooms back.
-        width: of the rooms.
+        channels: width of the rooms.
     """
 
-    def __init__(self, settings: Node, width: int, dropout: float) -> None:
+    def __init__(self, settings: Node, channels: int, dropout: float) -> None:
         super().__init__()
         self.settings = settings
-        told = settings.width if settings.edges else 0
+        self.distance = column("edge_attr", "distance")
         self.edges, self.edge, self.pairs, self.doors = None, None, None, nn.ModuleList()
-        if told and settings.kind != "none":
-            self.edges = Standardise(EDGE)
-            wide = (EDGE + KNOTS, 2 * told) if settings.around else (EDGE,)
-            self.edge = dense(*wide, told)
-        if settings.doors and settings.kind != "none":
-            pair = NEAR if settings.near else PAIR
-            self.pairs = Standardise(pair)
-            self.doors = nn.ModuleList(DoorLayer(told, pair) for _ in range(settings.doors))
+        if settings.edges and settings.kind != "none":
+            columns = width("edge_attr")
+            self.edges = Standardise(columns)
+            hidden = (columns + ROOM_KNOTS, 2 * settings.width) if settings.around else (columns,)
+            self.edge = dense(*hidden, settings.width)
+        if pair_tables := pair_tensors(settings)[1:]:
+            pair_dim = width(pair_tables[0])
+            self.pairs = Standardise(pair_dim)
+            self.doors = nn.ModuleList(DoorConv(settings.width, pair_dim) for _ in range(settings.doors))
         count = 0 if settings.kind == "none" else settings.layers
-        if settings.kind == "gat":
-            layers: list[nn.Module] = [GatLayer(width, told, settings.heads, settings.told) for _ in range(count)]
-        else:
-            layers = [SageLayer(width, told) for _ in range(count)]
-        self.layers = nn.ModuleList(layers)
-        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(count))
+        self.layers = nn.ModuleList(room_layer(settings, channels) for _ in range(count))
+        self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(count))
         self.drop = nn.Dropout(dropout)
-        self.out = width * (count + 1) if settings.jump == "cat" else width
+        self.out = channels * (count + 1) if settings.jump == "cat" else channels
 
     def forward(
         self, rooms: Tensor, edge_index: Tensor, edge_attr: Tensor, pair_index: Tensor | None, pair_attr: Tensor | None
     ) -> Tensor:
-        edges = None
-        if self.edges is not None and self.edge is not None:
-            scaled = self.edges(edge_attr)
-            edges = self.edge(torch.cat([scaled, bumps(edge_attr[:, DISTANCE])], dim=1) if self.settings.around else scaled)
-            for layer in self.doors:
-                assert self.pairs is not None and pair_index is not None and pair_attr is not None
-                edges = layer(edges, pair_index, self.pairs(pair_attr), pair_attr[:, 0])
-        found = [rooms]
+        edges = self._edges(edge_attr, pair_index, pair_attr)
+        ways = edge_index.flip(0)  # edges lead from a room to its neighbours; messages come back
+        states = [rooms]
         for layer, norm in zip(self.layers, self.norms, strict=True):
-            told = self.drop(torch.relu(norm(layer(found[-1], edge_index, edges))))
-            found.append(found[-1] + told if self.settings.skip else told)
+            update = layer(states[-1], ways) if edges is None else layer(states[-1], ways, edges)
+            update = self.drop(torch.relu(norm(update)))
+            states.append(states[-1] + update if self.settings.skip else update)
         if self.settings.jump == "cat":
-            return torch.cat(found, dim=1)
-        return torch.stack(found).amax(dim=0) if self.settings.jump == "max" else found[-1]
+            return torch.cat(states, dim=1)
+        return torch.stack(states).amax(dim=0) if self.settings.jump == "max" else states[-1]
+
+    def _edges(self, edge_attr: Tensor, pair_index: Tensor | None, pair_attr: Tensor | None) -> Tensor | None:
+        """(E, settings.width) of the edges, from their features and the doors beside them."""
+        if self.edges is None or self.edge is None:
+            return None
+        scaled = self.edges(edge_attr)
+        if self.settings.around:
+            scaled = torch.cat([scaled, bumps(edge_attr[:, self.distance])], dim=1)
+        edges: Tensor = self.edge(scaled)
+        for layer in self.doors:
+            assert self.pairs is not None and pair_index is not None and pair_attr is not None
+            edges = layer(edges, pair_index.flip(0), self.pairs(pair_attr), pair_attr[:, 0])
+        return edges

@@ -10,12 +10,13 @@ import torch
 from topomerge.models.embedder import Embedder
 from torch import Tensor, nn
 
+from topomerge.embedding.graph import POINTS_PER_ROOM
+from topomerge.embedding.schema import TABLES
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 
-WIDTHS = {"x": (16,), "engineered": (12,), "shapedna": (32,), "room_points": (512, 3), "edge_attr": (11,), "door_attr": (3,)}
-WIDTHS |= {"near_attr": (5,)}
-OPSET = 18
+SHAPES = {"room_points": (POINTS_PER_ROOM, 3)} | {name: (len(columns),) for name, columns in TABLES.items()}  # of each row
+ONNX_OPSET = 18
 
 
 class Positional(nn.Module):
@@ -36,8 +37,8 @@ def sample(network: Embedder, rooms: int = 6, edges: int = 10, doors: int = 12, 
     count = {"edge_attr": edges, "door_attr": doors, "near_attr": doors}
     out = {}
     for name in network.tensors:
-        if name in WIDTHS:
-            out[name] = torch.rand((count.get(name, rooms), *WIDTHS[name]), generator=generator) * 3
+        if name in SHAPES:
+            out[name] = torch.rand((count.get(name, rooms), *SHAPES[name]), generator=generator) * 3
         else:
             most, number = (rooms, edges) if name == "edge_index" else (edges, doors)
             out[name] = torch.randint(0, max(most, 1), (2, number), generator=generator)
@@ -57,14 +58,14 @@ def save_onnx(network: Embedder, path: str | Path) -> None:
     dims = {name: torch.export.Dim(name, min=2) for name in ("rooms", "edges", "doors")}
     first = {"edge_attr": "edges", "door_attr": "doors", "near_attr": "doors"}
     shapes = tuple(
-        {1: dims["edges" if name == "edge_index" else "doors"]} if name not in WIDTHS else {0: dims[first.get(name, "rooms")]}
+        {1: dims["edges" if name == "edge_index" else "doors"]} if name not in SHAPES else {0: dims[first.get(name, "rooms")]}
         for name in network.tensors
     )
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), replacing(path) as beside:
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            Positional(network.eval()), tuple(sample(network).values()), dynamo=True, opset_version=OPSET, verbose=False,
+            Positional(network.eval()), tuple(sample(network).values()), dynamo=True, opset_version=ONNX_OPSET, verbose=False,
             input_names=list(network.tensors), output_names=["embedding", "dustbin"], dynamic_shapes=(shapes,),
         )  # fmt: skip
         assert program is not None

@@ -13,7 +13,15 @@ import torch
 from safetensors.torch import save
 from topomerge.models.embedder import Embedder
 
-from topomerge.embedding.weights import CLASS, FORMAT, SETTINGS, WEIGHTS, does_not_fit, read_weights
+from topomerge.embedding.weights import (
+    EMBEDDER_CLASS,
+    EMBEDDER_FORMAT,
+    SETTINGS_FILE,
+    WEIGHTS_FILE,
+    does_not_fit,
+    features_read,
+    read_weights,
+)
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 
@@ -34,21 +42,22 @@ def save_embedder(network: Embedder, folder: str | Path, about: Mapping[str, Any
         raise InputError(f"{folder}: can't be written ({error.strerror or error})") from error
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
     weights = save(state)
-    told = {
-        "format": FORMAT,
-        "class": CLASS,
+    settings = {
+        "format": EMBEDDER_FORMAT,
+        "class": EMBEDDER_CLASS,
         "network": asdict(network.network),
+        "features": features_read(network.network),
         "sha256": hashlib.sha256(weights).hexdigest(),
         "about": dict(about or {}),
     }
-    with replacing(folder / WEIGHTS) as beside:
+    with replacing(folder / WEIGHTS_FILE) as beside:
         beside.write_bytes(weights)
-    with replacing(folder / SETTINGS) as beside:
-        beside.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    with replacing(folder / SETTINGS_FILE) as beside:
+        beside.write_text(json.dumps(settings, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_embedder(folder: str | Path) -> tuple[Embedder, dict[str, Any]]:
-    """The network, ready to use, and what is told about it.
+    """The network, ready to use, and on what it was trained.
 
     Args:
         folder: one that `save_embedder` wrote, or a run, whose best embedder is taken.

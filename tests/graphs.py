@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from topomerge.embedding.door_layout import door_layout
+from topomerge.embedding.schema import width
 from topomerge.io import archive
 from topomerge.training.packed import GraphPair
 
@@ -27,14 +28,14 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
     near = [torch.from_numpy(array) for array in door_layout(index.numpy(), middle.numpy(), door.repeat(2, 1).numpy())]
     size = 1 + 3 * torch.rand((rooms, 1, 3), generator=g)
     return {
-        "x": 10 * torch.rand((rooms, 16), generator=g),
-        "engineered": torch.rand((rooms, 12), generator=g),
-        "shapedna": torch.rand((rooms, 32), generator=g),
+        "x": 10 * torch.rand((rooms, width("x")), generator=g),
+        "engineered": torch.rand((rooms, width("engineered")), generator=g),
+        "shapedna": torch.rand((rooms, width("shapedna")), generator=g),
         "room_points": size * (torch.rand((rooms, points, 3), generator=g) - torch.tensor([0.5, 0.5, 0.0])),
         "edge_index": index,
-        "edge_attr": torch.randn((index.shape[1], 11), generator=g),
+        "edge_attr": torch.randn((index.shape[1], width("edge_attr")), generator=g),
         "door_index": doors,
-        "door_attr": torch.randn((doors.shape[1], 3), generator=g),
+        "door_attr": torch.randn((doors.shape[1], width("door_attr")), generator=g),
         "near_index": near[0],
         "near_attr": near[1],
         "pos": middle,

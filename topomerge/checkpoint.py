@@ -2,7 +2,7 @@
 
 A folder: the embedder (`models.weights`), `optimizer.safetensors` and, written last, `state.json`:
 
-    {"format": 1, "class": "topomerge.training", "sha256": {file: …}, "told": {…}}
+    {"format": 2, "class": "topomerge.training", "sha256": {file: …}, "progress": {…}}
 """
 
 from __future__ import annotations
@@ -18,33 +18,38 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
+from topomerge.embedding.weights import SETTINGS_FILE, WEIGHTS_FILE
 from topomerge.errors import InputError
 from topomerge.models.embedder import Embedder
-from topomerge.models.weights import SETTINGS, WEIGHTS, save_embedder
+from topomerge.models.weights import save_embedder
 
-FORMAT = 1
-CLASS = "topomerge.training"
-OPTIMIZER, STATE = "optimizer.safetensors", "state.json"
+STATE_FORMAT = 2
+STATE_CLASS = "topomerge.training"
+OPTIMIZER_FILE, STATE_FILE = "optimizer.safetensors", "state.json"
 
 
 def save_state(
-    folder: str | Path, network: Embedder, optimizer: torch.optim.Optimizer, told: Mapping[str, Any], about: Mapping[str, Any]
+    folder: str | Path,
+    network: Embedder,
+    optimizer: torch.optim.Optimizer,
+    progress: Mapping[str, Any],
+    about: Mapping[str, Any],
 ) -> None:
     """Replace a folder by the state as it is; a kill in between leaves the old one, or the new one beside it.
 
     Args:
-        told: what else is needed to go on, as JSON has it.
+        progress: what else is needed to go on, as JSON has it.
         about: of the embedder.
     """
     folder = Path(folder)
     new, old = folder.with_name(f"{folder.name}.new"), folder.with_name(f"{folder.name}.old")
-    for left in (new, old):
-        shutil.rmtree(left, ignore_errors=True)
+    for stale in (new, old):
+        shutil.rmtree(stale, ignore_errors=True)
     save_embedder(network, new, about)
-    (new / OPTIMIZER).write_bytes(save(_flat(optimizer)))
-    digests = {name: _digest(new / name) for name in (WEIGHTS, SETTINGS, OPTIMIZER)}
-    state = {"format": FORMAT, "class": CLASS, "sha256": digests, "told": dict(told)}
-    (new / STATE).write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
+    (new / OPTIMIZER_FILE).write_bytes(save(_flat(optimizer)))
+    digests = {name: _digest(new / name) for name in (WEIGHTS_FILE, SETTINGS_FILE, OPTIMIZER_FILE)}
+    state = {"format": STATE_FORMAT, "class": STATE_CLASS, "sha256": digests, "progress": dict(progress)}
+    (new / STATE_FILE).write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
     if folder.exists():
         folder.rename(old)
     new.rename(folder)
@@ -52,35 +57,37 @@ def save_state(
 
 
 def load_state(folder: str | Path, network: Embedder, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
-    """Put the state into a network and its optimizer; what `told` was comes back.
+    """Put the state into a network and its optimizer; `progress` comes back.
 
     Raises:
         InputError: no such folder, damaged, of another format, class or network.
     """
     folder = Path(folder)
-    if not folder.exists() and (newer := folder.with_name(f"{folder.name}.new")).joinpath(STATE).exists():
+    if not folder.exists() and (newer := folder.with_name(f"{folder.name}.new")).joinpath(STATE_FILE).exists():
         folder = newer  # killed between two renames
     try:
-        state = json.loads((folder / STATE).read_text(encoding="utf-8"))
+        state = json.loads((folder / STATE_FILE).read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{folder / STATE}: {error.strerror or error}; there is nothing to resume") from error
+        raise InputError(f"{folder / STATE_FILE}: {error.strerror or error}; there is nothing to resume") from error
     except ValueError as error:
-        raise InputError(f"{folder / STATE}: damaged or cut off ({' '.join(str(error).split())[:80]})") from error
-    if not isinstance(state, dict) or state.get("class") != CLASS:
-        raise InputError(f"{folder / STATE}: is no state of a training")
-    if state.get("format") != FORMAT:
-        raise InputError(f"{folder / STATE}: has format {state.get('format')!r}, this program reads {FORMAT}; start again")
-    for name in (WEIGHTS, SETTINGS, OPTIMIZER):
+        raise InputError(f"{folder / STATE_FILE}: damaged or cut off ({' '.join(str(error).split())[:80]})") from error
+    if not isinstance(state, dict) or state.get("class") != STATE_CLASS:
+        raise InputError(f"{folder / STATE_FILE}: is no state of a training")
+    if state.get("format") != STATE_FORMAT:
+        raise InputError(
+            f"{folder / STATE_FILE}: has format {state.get('format')!r}, this program reads {STATE_FORMAT}; start again"
+        )
+    for name in (WEIGHTS_FILE, SETTINGS_FILE, OPTIMIZER_FILE):
         if not (folder / name).exists() or _digest(folder / name) != state["sha256"].get(name):
             raise InputError(f"{folder / name}: missing, cut off, or not of this state; start again without resume")
     try:
-        network.load_state_dict(load((folder / WEIGHTS).read_bytes()))
-        _fill(optimizer, load((folder / OPTIMIZER).read_bytes()))
+        network.load_state_dict(load((folder / WEIGHTS_FILE).read_bytes()))
+        _fill(optimizer, load((folder / OPTIMIZER_FILE).read_bytes()))
     except (RuntimeError, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:160]
         raise InputError(f"{folder}: is of another network than the one configured ({reason})") from error
-    told: dict[str, Any] = state["told"]
-    return told
+    progress: dict[str, Any] = state["progress"]
+    return progress
 
 
 def _digest(path: Path) -> str:
@@ -93,9 +100,9 @@ def _flat(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def _fill(optimizer: torch.optim.Optimizer, flat: Mapping[str, Tensor]) -> None:
-    told = optimizer.state_dict()
+    current = optimizer.state_dict()
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in flat.items():
         number, name = key.split(".", 1)
         state.setdefault(int(number), {})[name] = value
-    optimizer.load_state_dict({**told, "state": state})
+    optimizer.load_state_dict({**current, "state": state})

@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 from topomerge.datasets.pairs.pairs import Pair
 
-from topomerge.embedding.graph import ROOM_FEATURES
+from topomerge.embedding.schema import column
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.io.maps import load_map, save_map
@@ -27,7 +27,7 @@ from topomerge.matching.topdown import top_down
 from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
 
 TWIN_AREA, TWIN_SIDE = 0.05, 0.25  # share, m: rooms that differ by less are near-identical
-GLIMPSED = ROOM_FEATURES.index("glimpsed")
+GLIMPSED = column("x", "glimpsed")
 COLUMN = 0.2  # m, columns by which the area in common is measured
 BELOW = 0.15  # m: what is that far below a floor is the ceiling of the storey below
 STOREY = 1.0  # m between two storeys, at least

@@ -65,7 +65,7 @@ class Recipe:
     scale: float = 0.0
     spread: float = 0.5
     voxel_size: float = 0.1
-    points_per_room: int = graph.POINTS
+    points_per_room: int = graph.POINTS_PER_ROOM
     stacks: float = 0.0
     over_stairs: float = 0.0
     maps: bool = False

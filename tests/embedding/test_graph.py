@@ -9,7 +9,8 @@ import pytest
 
 from tests.scenes_map import building
 from topomerge.embedding import graph
-from topomerge.embedding.graph import DOOR_FEATURES, EDGE_FEATURES, ROOM_FEATURES, graph_arrays, to_graph
+from topomerge.embedding.graph import graph_arrays, to_graph
+from topomerge.embedding.schema import DOOR_FEATURES, EDGE_FEATURES, ROOM_FEATURES
 from topomerge.errors import InputError
 from topomerge.types import TopometricMap, VoxelGrid
 

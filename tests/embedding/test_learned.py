@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import numpy
 
 from tests.scenes_map import building
 from topomerge.embedding.embedders import embedder
@@ -16,7 +18,7 @@ from topomerge.embedding.graph import graph_arrays
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.embedding.room_cells import joined
-from topomerge.embedding.weights import SETTINGS, WEIGHTS, embedder_folder, read_weights, unpacked
+from topomerge.embedding.weights import SETTINGS_FILE, WEIGHTS_FILE, embedder_folder, read_weights, unpacked
 from topomerge.errors import InputError
 
 ROOT = Path(__file__).parent.parent.parent
@@ -42,7 +44,6 @@ def graphs() -> dict[str, dict[str, np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def torch():
-    pytest.importorskip("safetensors")
     return pytest.importorskip("torch")
 
 
@@ -87,8 +88,8 @@ def test_the_embedder_that_ships_is_as_with_torch(torch):
 @pytest.mark.parametrize("file", sorted(path.stem for path in (CONFIGS / "node").glob("*.yaml")))
 def test_every_node_encoder_is_as_with_torch(torch, file, tmp_path):
     yaml = pytest.importorskip("yaml")
-    told = yaml.safe_load((CONFIGS / "node" / f"{file}.yaml").read_text())
-    node = Node(**{k: v for k, v in told.items() if not k.startswith("_")})
+    options = yaml.safe_load((CONFIGS / "node" / f"{file}.yaml").read_text())
+    node = Node(**{k: v for k, v in options.items() if not k.startswith("_")})
     compare(saved(torch, Network(Geometry(["scalars"], width=16), node, size=24), tmp_path), graphs())
 
 
@@ -96,9 +97,9 @@ def test_every_node_encoder_is_as_with_torch(torch, file, tmp_path):
 @pytest.mark.parametrize("jump", ["last", "cat", "max"])
 def test_every_geometry_of_numbers_is_as_with_torch(torch, file, jump, tmp_path):
     yaml = pytest.importorskip("yaml")
-    told = yaml.safe_load((CONFIGS / "geometry" / f"{file}.yaml").read_text())
+    options = yaml.safe_load((CONFIGS / "geometry" / f"{file}.yaml").read_text())
     node = Node("sage", 2, skip=jump == "max", jump=jump, width=8)
-    network = Network(Geometry(told["parts"], width=16), node, size=8)
+    network = Network(Geometry(options["parts"], width=16), node, size=8)
     rows = {"small": graphs()["small"], "one": graphs()["one"]}
     compare(saved(torch, network, tmp_path), rows)
 
@@ -118,7 +119,7 @@ def test_torch_is_never_imported():
     code = (
         "import sys, topomerge as tm; from tests.scenes_map import building; from topomerge.cli.main import COMMANDS\n"
         "found = tm.merge([building(1), building(2)]); tm.load_embedder()(building(1)); assert found.descriptor == 'learned'\n"
-        "print([m for m in ('torch', 'torch_geometric', 'safetensors', 'hydra', 'lightning_fabric') if m in sys.modules])"
+        "print([m for m in ('torch', 'torch_geometric', 'hydra', 'lightning_fabric') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -134,39 +135,52 @@ def packed(table: object, body: bytes) -> bytes:
     return len(text).to_bytes(8, "little") + text + body
 
 
-def test_numbers_are_read_as_safetensors_reads_them():
-    numpy = pytest.importorskip("safetensors.numpy")
-    data = (PRETRAINED / WEIGHTS).read_bytes()
-    ours, theirs = unpacked(data), numpy.load(data)
-    assert ours.keys() == theirs.keys() and all(np.array_equal(ours[n], theirs[n]) for n in theirs)
+def write_weights(data: bytes, folder: Path) -> None:
+    """Bytes as the weights of the embedder that ships, with the digest that fits."""
+    settings = json.loads((PRETRAINED / SETTINGS_FILE).read_text())
+    (folder / WEIGHTS_FILE).write_bytes(data)
+    (folder / SETTINGS_FILE).write_text(json.dumps({**settings, "sha256": hashlib.sha256(data).hexdigest()}))
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
-        (lambda t: t["project.0.bias"].update(dtype="I64"), "no float32"),
-        (lambda t: t["project.0.bias"].update(shape=[-128]), "no float32"),
-        (lambda t: t["project.0.bias"].update(shape=[1 << 62]), "cut off"),
-        (lambda t: t["project.0.bias"].update(data_offsets=[1 << 40, (1 << 40) + 512]), "cut off"),
-        (lambda t: t["project.0.bias"].update(data_offsets=[0]), "no shape and place"),
-        (lambda t: t.update({"project.0.bias": 3}), "no shape and place"),
-        (lambda t: t.pop("project.0.bias"), "project.0.bias"),
-        (lambda t: t.update({"more": t["project.0.bias"]}), "more is of no layer"),
-        (lambda t: t["project.0.bias"].update(shape=[64], data_offsets=[0, 256]), r"is \(64,\), not \(128,\)"),
-        (lambda t: t["project.0.weight"].update(shape=[192, 128]), ""),
-        (lambda t: t["node.edges.spread"].update(data_offsets=[0, 44]), "spread: is not above 0"),
+        (lambda t: t["project.0.bias"].update(dtype="I64"), "no safetensors"),
+        (lambda t: [row.update(dtype="I32") for row in t.values()], "is no float32"),
+        (lambda t: t["project.0.bias"].update(dtype="BF17"), "no safetensors"),
+        (lambda t: t["project.0.bias"].update(shape=[-128]), "no safetensors"),
+        (lambda t: t["project.0.bias"].update(shape=[1 << 62]), "no safetensors"),
+        (lambda t: t["project.0.bias"].update(data_offsets=[1 << 40, (1 << 40) + 512]), "no safetensors"),
+        (lambda t: t["project.0.bias"].update(data_offsets=[0]), "no safetensors"),
+        (lambda t: t.update({"project.0.bias": 3}), "no safetensors"),
+        (lambda t: t.update({"more": t["project.0.bias"]}), "no safetensors"),
+        (lambda t: t["project.0.bias"].update(shape=[1, 1, 1, 1, 1, 128]), "at most five axes"),
+        (lambda t: t.update({"x" * (1 << 20): t.pop("project.0.bias")}), "its header is cut off"),
     ],
 )
-def test_weights_that_do_not_fit_are_refused(change, said, tmp_path):
-    import hashlib
-
-    table, body = header((PRETRAINED / WEIGHTS).read_bytes())
+def test_headers_that_lie_are_refused(change, message, tmp_path):
+    table, body = header((PRETRAINED / WEIGHTS_FILE).read_bytes())
     change(table)
-    data = packed(table, body)
-    told = json.loads((PRETRAINED / SETTINGS).read_text())
-    (tmp_path / WEIGHTS).write_bytes(data)
-    (tmp_path / SETTINGS).write_text(json.dumps({**told, "sha256": hashlib.sha256(data).hexdigest()}))
-    with pytest.raises(InputError, match=rf"embedder\.safetensors: does not fit .*{said}"):
+    write_weights(packed(table, body), tmp_path)
+    with pytest.raises(InputError, match=rf"^[^\n]*embedder\.safetensors: does not fit [^\n]*{message}[^\n]*$"):
+        load_embedder(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda w: w.pop("project.0.bias"), "project.0.bias"),
+        (lambda w: w.update({"more": w["project.0.bias"]}), "more is of no layer"),
+        (lambda w: w.update({"project.0.bias": w["project.0.bias"][:64]}), r"is \(64,\), not \(128,\)"),
+        (lambda w: w.update({"project.0.weight": w["project.0.weight"].T.copy()}), ""),
+        (lambda w: w.update({"node.edges.spread": 0 * w["node.edges.spread"]}), "spread: is not above 0"),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(change, message, tmp_path):
+    weights = numpy.load((PRETRAINED / WEIGHTS_FILE).read_bytes())
+    change(weights)
+    write_weights(numpy.save(weights), tmp_path)
+    with pytest.raises(InputError, match=rf"embedder\.safetensors: does not fit .*{message}"):
         load_embedder(tmp_path)
 
 
@@ -177,7 +191,7 @@ def test_what_is_no_safetensors_file_is_refused(data):
 
 
 def test_folders_of_an_embedder(tmp_path):
-    assert embedder_folder(PRETRAINED / WEIGHTS) == PRETRAINED == embedder_folder(PRETRAINED)
+    assert embedder_folder(PRETRAINED / WEIGHTS_FILE) == PRETRAINED == embedder_folder(PRETRAINED)
     network, weights, about = read_weights(PRETRAINED)
     assert network.geometry.parts == ["scalars"] and len(weights) > 40 and "data" in about
     with pytest.raises(InputError, match="give a run's folder"):

@@ -130,18 +130,18 @@ def write_plans(folder: Path) -> dict[str, Path]:
 
 def write_embedder(folder: Path) -> dict[str, Path]:
     """A network that was not trained; nothing where torch is missing."""
-    if find_spec("torch") is None or find_spec("safetensors") is None:
+    if find_spec("torch_geometric") is None:
         return {}
     import torch
     from topomerge.models.embedder import Embedder
     from topomerge.models.weights import save_embedder
 
     from topomerge.embedding.network import Geometry, Network, Node
-    from topomerge.embedding.weights import SETTINGS, WEIGHTS
+    from topomerge.embedding.weights import SETTINGS_FILE, WEIGHTS_FILE
 
     torch.manual_seed(0)
     save_embedder(Embedder(Network(Geometry(width=8), Node("sage", 1), size=8)), folder)
-    return {name: folder / name for name in (SETTINGS, WEIGHTS)}
+    return {name: folder / name for name in (SETTINGS_FILE, WEIGHTS_FILE)}
 
 
 def write_atlas(folder: Path) -> dict[str, Path]:

@@ -164,7 +164,7 @@ def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch, parts):
     monkeypatch.setattr(loop.Run, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fit(replace(settings, name="cut"), quiet)
-    state = json.loads((tmp_path / "cut" / "last" / "state.json").read_text())["told"]
+    state = json.loads((tmp_path / "cut" / "last" / "state.json").read_text())["progress"]
     assert (state["epoch"], state["step"]) == (1, 2)
     monkeypatch.setattr(loop.Run, "step", step)
     fit(replace(settings, name="cut", resume=True), quiet)

@@ -8,17 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from topomerge.embedding.schema import LAYOUT_FEATURES
 from topomerge.types import Array
 
-REACH = 12.0  # m, seen from above
-LEVEL = 2.0  # m: doors of one storey
-LAYOUT_FEATURES = (
-    "distance",  # m, between the doors, seen from above
-    "climb",  # m
-    "angle_sin",  # of the angle from the way out of the room to the way to the other door, counter-clockwise
-    "angle_cos",
-    "same",  # 1: both lead out of one room
-)
+LAYOUT_REACH = 12.0  # m at most between two doors, seen from above
+LAYOUT_CLIMB = 2.0  # m at most between doors of one storey
 
 
 def door_layout(edge_index: Array, middle: Array, door: Array) -> tuple[Array, Array]:
@@ -38,7 +32,7 @@ def door_layout(edge_index: Array, middle: Array, door: Array) -> tuple[Array, A
     door, number = np.asarray(door, float), np.arange(count) % (count // 2)
     away = door[None] - door[:, None]
     distance = np.linalg.norm(away[..., :2], axis=2)
-    near = (distance <= REACH) & (abs(away[..., 2]) <= LEVEL) & (number[:, None] != number[None])
+    near = (distance <= LAYOUT_REACH) & (abs(away[..., 2]) <= LAYOUT_CLIMB) & (number[:, None] != number[None])
     first, second = np.nonzero(near)
     out = (door - np.asarray(middle, float)[edge_index[0]])[first, :2]
     to, apart = away[first, second], distance[first, second]

@@ -12,24 +12,11 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 from topomerge.embedding.room_cells import Descriptor, room_cells, rows_of
+from topomerge.embedding.schema import THESIS_FEATURES
 from topomerge.errors import InputError
 from topomerge.io.weight_files import read_weights_json
 from topomerge.types import Array, TopometricMap
 
-THESIS_FEATURES = (
-    "points",  # log of 1 + m2: occupied cells times the area of a cell's face
-    "planarity",  # (s2 - s3) / s1 of the singular values s
-    "box_volume",  # log of 1 + m3, of the smallest upright box
-    "height",  # m, of that box
-    "projection",  # log of 1 + m2, of the cells seen from above
-    "spread",  # m, mean distance to the centroid
-    "eigenvalues",  # smallest over largest eigenvalue of the covariance
-    "smallest",  # m, smallest singular value over the root of the number of cells
-    "s3_s12",  # s3 / (s1 + s2)
-    "s2_s1",  # s2 / s1, not s1 / s2: that of a line is not finite
-    "verticality",  # of the first principal axis: 0 level, 1 upright
-    "roughness",  # m, mean distance to the plane of the 32 nearest cells
-)
 GRAPH_FEATURES = (
     "area",  # log of 1 + m2 of floor
     "clear_height",  # m, floor to ceiling; that of the map's median room where none was seen

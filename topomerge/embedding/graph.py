@@ -5,12 +5,12 @@ known, so the sense of a turn is, too). Where rooms and doors lie in the map's f
 
 | tensor | shape | content |
 |---|---|---|
-| `x` | (R, 16) float32 | `ROOM_FEATURES` |
+| `x` | (R, F) float32 | `schema.ROOM_FEATURES` |
 | `room_points` | (R, P, 3) float32 | centres of occupied cells, m, about the room's middle; z = 0 is its floor |
 | `edge_index` | (2, 2E) int64 | from room, to room: every edge of the map in both directions |
-| `edge_attr` | (2E, 11) float32 | `EDGE_FEATURES`, seen from the first room |
+| `edge_attr` | (2E, G) float32 | `schema.EDGE_FEATURES`, seen from the first room |
 | `door_index` | (2, K) int64 | two different edges (columns of `edge_index`) that leave one room |
-| `door_attr` | (K, 3) float32 | `DOOR_FEATURES` |
+| `door_attr` | (K, 3) float32 | `schema.DOOR_FEATURES` |
 | `storey` | (R,) int64 | of the rooms; the number depends on what the map saw, so it is no feature |
 | `pos`, `edge_pos` | (R, 3), (2E, 3) float64 | middle of each room and door in the frame of the input, m |
 
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from topomerge.embedding.schema import KINDS
 from topomerge.errors import InputError
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import Array, TopometricMap
@@ -31,46 +32,11 @@ from topomerge.types import Array, TopometricMap
 if TYPE_CHECKING:
     from torch_geometric.data import Data
 
-FORMAT = 1  # of `graph_arrays`; part of the name of whatever is cached
-POINTS = 512  # a room
-KINDS = ("door", "opening", "stairs")
-ROOM_FEATURES = (
-    "area",  # m2
-    "height",  # m; 0: no ceiling seen
-    "volume",  # m3
-    "length",  # m, along the first principal axis seen from above: the side of a rectangle of the same spread
-    "width",  # m, along the second
-    "elongation",  # width / length
-    "fill",  # area / (length * width): 1 for a rectangle
-    "floor_spread",  # m, standard deviation of the floor's height: stairs, ramps
-    "degree",  # rooms that one can walk to
-    "doors",
-    "openings",
-    "stairs",
-    "door_width",  # m, mean over doors and openings; 0: none
-    "reach",  # m, from the middle to the farthest door; 0: none
-    "completeness",  # share of the outline that was seen
-    "glimpsed",  # 0 or 1
-)
-EDGE_FEATURES = (
-    "width",  # m
-    "height",  # m; 0: nothing seen above
-    *KINDS,  # one of them is 1
-    "distance",  # m, between the middles of the rooms, seen from above
-    "climb",  # m, from floor to floor
-    "from_middle",  # m, from the first room's middle to the door, seen from above
-    "to_middle",  # m, from the door to the second room's middle
-    "turn_sin",  # of the turn at the door, walking from middle to middle; to the left is positive
-    "turn_cos",
-)
-DOOR_FEATURES = (
-    "distance",  # m, between two doors of a room, seen from above
-    "angle_sin",  # of the angle at the room's middle from the first door to the second, counter-clockwise
-    "angle_cos",
-)
+GRAPH_FORMAT = 1  # of `graph_arrays`; part of the name of whatever is cached
+POINTS_PER_ROOM = 512
 
 
-def to_graph(map: TopometricMap, points_per_room: int = POINTS) -> Data:
+def to_graph(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> Data:
     """A map as a `torch_geometric.data.Data` with the tensors above. The same map gives the same tensors.
 
     Raises:
@@ -89,7 +55,7 @@ def from_arrays(arrays: Mapping[str, Array]) -> Data:
     return Data(**values, num_nodes=len(arrays["x"]))
 
 
-def graph_arrays(map: TopometricMap, points_per_room: int = POINTS) -> dict[str, Array]:
+def graph_arrays(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> dict[str, Array]:
     """The arrays of the graph, by name (see the top of this file).
 
     Raises:

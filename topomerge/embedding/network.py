@@ -8,18 +8,15 @@ from typing import Any
 
 from topomerge.errors import InputError
 
-GEOMETRY = {  # part -> width of the rows it reads; 0: it reads the points
-    "scalars": 16,
-    "engineered": 12,
-    "shapedna": 32,
-    "pointnet": 0,
-    "pointnet_local": 0,
-    "voxelcnn": 0,
-}
-TENSORS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> tensor of the graph that it reads
+TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> table of the graph that it reads
+POINT_PARTS = ("pointnet", "pointnet_local", "voxelcnn")  # these read the points
+GEOMETRY_PARTS = (*TABLE_PARTS, *POINT_PARTS)
 GRAPH = ("edge_index", "edge_attr")
-WIDEST = 4096  # more is a mistake, or a file that was made to take all memory
-FARTHEST = 100.0  # m
+LARGEST_WIDTH = 4096  # more is a mistake, or a file that was made to take all memory
+FARTHEST_AROUND = 100.0  # m
+DOOR_KNOTS, DOOR_KNOT_STEP = 24, 0.5  # bumps of the distance between two doors, and m between them
+ROOM_KNOTS = 11  # of that between two rooms, 1 m apart
+SCORE_BOUND = 30.0  # of attention
 NODES = ("none", "sage", "gat")
 JUMPS = ("last", "cat", "max")
 
@@ -29,7 +26,7 @@ class Geometry:
     """Room -> vector.
 
     Args:
-        parts: of `GEOMETRY`; several are concatenated.
+        parts: of `GEOMETRY_PARTS`; several are concatenated.
         width: of the vector.
         yaws: turns over which an encoder of points takes the mean.
         canonical: turn the longest axis into x first.
@@ -50,7 +47,8 @@ class Node:
         layers: 1 to 4.
         heads: of the attention.
         edges: use the features of edges.
-        told: attention sums them, too (`gat.GatLayer`).
+        edge_values: attention sums values of neighbours and of edges (`models.edge_value_conv`); False: as in the paper, edges
+            change the weights of the neighbours only (`torch_geometric.nn.GATv2Conv`).
         doors: layers over pairs of doors; needs `edges`.
         near: pairs are all doors within 12 m (`embedding.door_layout`), not only those of one room.
         around: m; rooms at most that far away are neighbours, too (`embedding.rooms_around`); 0: by doors only.
@@ -63,7 +61,7 @@ class Node:
     layers: int = 2
     heads: int = 4
     edges: bool = True
-    told: bool = True
+    edge_values: bool = True
     doors: int = 0
     near: bool = False
     around: float = 0.0
@@ -84,7 +82,7 @@ class Network:
 
 def needed(part: str) -> str:
     """The tensor of the graph that a part of the geometry reads."""
-    return TENSORS.get(part, "room_points")
+    return TABLE_PARTS.get(part, "room_points")
 
 
 def pair_tensors(node: Node) -> tuple[str, ...]:
@@ -109,8 +107,8 @@ def check(network: Network) -> None:
     if not geometry.parts or len(set(map(str, geometry.parts))) < len(geometry.parts):
         raise InputError("geometry.parts must be one or more, each once")
     for part in geometry.parts:
-        if not isinstance(part, str) or part not in GEOMETRY:
-            raise InputError(f"geometry.parts: unknown {part!r}; {', '.join(GEOMETRY)} are possible")
+        if not isinstance(part, str) or part not in GEOMETRY_PARTS:
+            raise InputError(f"geometry.parts: unknown {part!r}; {', '.join(GEOMETRY_PARTS)} are possible")
     if node.kind not in NODES:
         raise InputError(f"node.kind: unknown {node.kind!r}; {', '.join(NODES)} are possible")
     if node.jump not in JUMPS:
@@ -121,14 +119,14 @@ def check(network: Network) -> None:
         raise InputError("node.doors are features of edges: set node.edges=true")
     if node.doors and node.around:
         raise InputError("node.doors are of neighbours by doors: set node.around=0")
-    if not 0 <= node.around <= FARTHEST:
-        raise InputError(f"node.around must be 0 to {FARTHEST:g} m, not {node.around}")
+    if not 0 <= node.around <= FARTHEST_AROUND:
+        raise InputError(f"node.around must be 0 to {FARTHEST_AROUND:g} m, not {node.around}")
     if geometry.canonical and geometry.yaws % 2:
         raise InputError(f"geometry.yaws must be even where canonical is set (an axis has two ends), not {geometry.yaws}")
     least = {"geometry.width": geometry.width, "geometry.yaws": geometry.yaws, "node.heads": node.heads, "size": network.size}
     for key, value in least.items() | {("node.width", node.width)}:
-        if not 1 <= value <= WIDEST:
-            raise InputError(f"{key} must be 1 to {WIDEST}, not {value}")
+        if not 1 <= value <= LARGEST_WIDTH:
+            raise InputError(f"{key} must be 1 to {LARGEST_WIDTH}, not {value}")
     if not 0 <= node.doors <= 4:
         raise InputError(f"node.doors must be 0 to 4, not {node.doors}")
     if geometry.width % node.heads:
@@ -137,37 +135,37 @@ def check(network: Network) -> None:
         raise InputError(f"dropout must be 0 or more and below 1, not {network.dropout}")
 
 
-def network_from(told: Mapping[str, Any]) -> Network:
+def network_from(table: Mapping[str, Any]) -> Network:
     """From what `dataclasses.asdict` gave.
 
     Raises:
         InputError: an unknown key, a value of another type, or what can't be built.
     """
     network = Network(
-        geometry=_filled(Geometry, told.get("geometry", {}), "geometry."),
-        node=_filled(Node, told.get("node", {}), "node."),
-        **{k: v for k, v in _values(Network, told, "").items() if k not in ("geometry", "node")},
+        geometry=_filled(Geometry, table.get("geometry", {}), "geometry."),
+        node=_filled(Node, table.get("node", {}), "node."),
+        **{k: v for k, v in _values(Network, table, "").items() if k not in ("geometry", "node")},
     )
     check(network)
     return network
 
 
-def _filled(kind: type, told: Any, where: str) -> Any:
-    return kind(**_values(kind, told, where))
+def _filled(kind: type, table: Any, where: str) -> Any:
+    return kind(**_values(kind, table, where))
 
 
-def _values(kind: type, told: Any, where: str) -> dict[str, Any]:
+def _values(kind: type, table: Any, where: str) -> dict[str, Any]:
     """The values of a dataclass' fields, if each is of the type of its default."""
-    if not isinstance(told, Mapping):
-        raise InputError(f"{where.rstrip('.') or 'network'} must be a table of keys, not {told!r}")
+    if not isinstance(table, Mapping):
+        raise InputError(f"{where.rstrip('.') or 'network'} must be a table of keys, not {table!r}")
     defaults = asdict(kind())
-    known = {f.name for f in fields(kind)}
-    for key, value in told.items():
-        if key not in known:
-            raise InputError(f"unknown key {where}{key}; {', '.join(sorted(known))} are possible")
-        wanted = float if isinstance(defaults[key], float) and not isinstance(value, bool) else type(defaults[key])
-        if not (isinstance(value, wanted) or (wanted is float and isinstance(value, int))) or (
-            wanted is int and isinstance(value, bool)
+    keys = {f.name for f in fields(kind)}
+    for key, value in table.items():
+        if key not in keys:
+            raise InputError(f"unknown key {where}{key}; {', '.join(sorted(keys))} are possible")
+        expected = float if isinstance(defaults[key], float) and not isinstance(value, bool) else type(defaults[key])
+        if not (isinstance(value, expected) or (expected is float and isinstance(value, int))) or (
+            expected is int and isinstance(value, bool)
         ):
-            raise InputError(f"{where}{key} must be {wanted.__name__}, not {value!r}")
-    return dict(told)
+            raise InputError(f"{where}{key} must be {expected.__name__}, not {value!r}")
+    return dict(table)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.embedding.engineered import THESIS_FEATURES, thesis_features
+from topomerge.embedding.engineered import thesis_features
 from topomerge.embedding.laplacian import smallest_eigenvalues, surface_laplacian
+from topomerge.embedding.schema import SPECTRUM_FEATURES, THESIS_FEATURES
 from topomerge.embedding.shapedna import LEAST, thinned
 from topomerge.types import Array
 
-VALUES = 32
+VALUES = len(SPECTRUM_FEATURES)
 MOST = 256  # points: eigenvalues of more cost too much for tens of thousands of rooms
 EDGE = 0.05  # m: points are put into cells of this size; in cells of 0.1 m they would lie on borders
 SPACING = 0.251  # m: cells lie 0.1 m apart, and with 0.25 m every fifth one would fall on a border

@@ -10,11 +10,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from topomerge.embedding.schema import KINDS, column, width
 from topomerge.types import Array
 
-LEVEL = 2.0  # m: rooms of one storey
-WIDTH, DISTANCE, CLIMB, TURN_COS = 11, 5, 6, 10  # columns of `edge_attr` (`embedding.graph.EDGE_FEATURES`)
-KINDS = slice(2, 5)
+STOREY_CLIMB = 2.0  # m at most, between the middles of rooms of one storey
+DISTANCE, CLIMB, TURN_COS = (column("edge_attr", feature) for feature in ("distance", "climb", "turn_cos"))
+KIND_COLUMNS = [column("edge_attr", kind) for kind in KINDS]
 
 
 def with_rooms_around(graph: Mapping[str, Array], reach: float) -> dict[str, Array]:
@@ -25,8 +26,8 @@ def with_rooms_around(graph: Mapping[str, Array], reach: float) -> dict[str, Arr
     """
     pos = np.asarray(graph["pos"], float)
     away = np.linalg.norm(pos[:, None, :2] - pos[None, :, :2], axis=2)
-    here, there = np.nonzero(np.triu((away <= reach) & (abs(pos[:, None, 2] - pos[None, :, 2]) <= LEVEL), 1))
-    features = np.zeros((len(here), WIDTH), np.float32)
+    here, there = np.nonzero(np.triu((away <= reach) & (abs(pos[:, None, 2] - pos[None, :, 2]) <= STOREY_CLIMB), 1))
+    features = np.zeros((len(here), width("edge_attr")), np.float32)
     features[:, DISTANCE], features[:, CLIMB], features[:, TURN_COS] = away[here, there], pos[there, 2] - pos[here, 2], 1.0
     back = features.copy()
     back[:, CLIMB] *= -1
@@ -42,4 +43,4 @@ def with_rooms_around(graph: Mapping[str, Array], reach: float) -> dict[str, Arr
 
 def through_doors(graph: Mapping[str, Array]) -> Array:
     """(2E,) bool: which edges are doors, openings or stairs."""
-    return np.asarray(np.asarray(graph["edge_attr"])[:, KINDS].any(axis=1))
+    return np.asarray(np.asarray(graph["edge_attr"])[:, KIND_COLUMNS].any(axis=1))

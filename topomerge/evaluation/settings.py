@@ -160,7 +160,7 @@ def run_title(run: str) -> str:
     """
     network, _, about = read_weights(run)
     node = network.node
-    told = {"bare": not node.edges, "paper": not node.told, "doors": node.doors, "around": node.around}
+    told = {"bare": not node.edges, "paper": not node.edge_values, "doors": node.doors, "around": node.around}
     words = [node.kind, *(word for word, so in told.items() if so and node.kind != "none")]
     seed = f", seed {about['seed']}" if about.get("seed") else ""
     return f"{' + '.join(network.geometry.parts)}, {' '.join(words)}, {about.get('loss', 'infonce')}{seed}"

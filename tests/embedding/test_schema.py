@@ -1,0 +1,92 @@
+"""The schema of features: widths follow from it, in a copy of the program that has one feature more."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from topomerge.embedding import schema
+from topomerge.embedding.learned import load_embedder
+from topomerge.errors import InputError
+
+ROOT = Path(__file__).parent.parent.parent
+PRETRAINED = ROOT / "topomerge" / "embedding" / "pretrained"
+
+
+def test_columns_are_looked_up_by_name():
+    assert [schema.TABLES["x"][k] for k in schema.columns_of_power("x", 1)] == [
+        "height", "length", "width", "floor_spread", "door_width", "reach",
+    ]  # fmt: skip
+    assert schema.columns_of_power("x", 2) == [schema.column("x", "area")] and schema.column("edge_attr", "turn_cos") == 10
+    for name, powers in schema.LENGTH_POWERS.items():
+        assert set(powers) <= set(schema.TABLES[name])
+    for columns in schema.TABLES.values():
+        assert len(set(columns)) == len(columns)
+
+
+def test_a_feature_more_makes_everything_wider(tmp_path):
+    """One more feature of rooms and of edges, in front of all others: layers, examples and packed columns follow."""
+    pytest.importorskip("torch_geometric")
+    ignored = shutil.ignore_patterns("__pycache__")
+    for folder in ("topomerge", "models"):
+        shutil.copytree(
+            ROOT / folder, tmp_path / "topomerge" / ("" if folder == "topomerge" else folder), ignore=ignored, dirs_exist_ok=True
+        )
+    path = tmp_path / "topomerge" / "embedding" / "schema.py"
+    text = path.read_text()
+    for name in ("ROOM_FEATURES = (", "EDGE_FEATURES = ("):
+        text = text.replace(f"\n{name}", f"\n{name}\n    'brightness',")
+    path.write_text(text)
+    code = """
+import json, torch, topomerge
+from topomerge.embedding.learned import load_embedder
+from topomerge.embedding.network import Geometry, Network, Node
+from topomerge.embedding.rooms_around import CLIMB, KIND_COLUMNS
+from topomerge.errors import InputError
+from topomerge.models.embedder import Embedder
+from topomerge.models.onnx import sample
+network = Embedder(Network(Geometry(width=8), Node("gat", width=4), size=8))
+tensors = sample(network)
+try:
+    refused = load_embedder().network.size
+except InputError as error:
+    refused = str(error)
+print(json.dumps({"file": topomerge.__file__, "x": tensors["x"].shape[1], "edge_attr": tensors["edge_attr"].shape[1],
+    "rooms": network.geometry.parts["scalars"].each[0].in_features, "edges": network.node.edge[0].in_features,
+    "embedding": list(network(tensors)[0].shape), "columns": [CLIMB, *KIND_COLUMNS], "refused": refused}))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True
+    )
+    said = json.loads(done.stdout)
+    assert Path(said["file"]).is_relative_to(tmp_path)
+    rooms, edges = len(schema.ROOM_FEATURES) + 1, len(schema.EDGE_FEATURES) + 1
+    assert (said["x"], said["rooms"], said["edge_attr"], said["edges"]) == (rooms, rooms, edges, edges)
+    assert said["embedding"] == [6, 8] and said["columns"] == [7, 3, 4, 5]
+    assert (
+        "embedder.json: was trained on 16 columns of x, this version has 17 (other: brightness); train it again"
+        in said["refused"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f["x"].reverse(), r"16 columns of x, this version has 16 \(other: their order\)"),
+        (lambda f: f["edge_attr"].append("colour"), r"12 columns of edge_attr, this version has 11 \(other: colour\)"),
+        (lambda f: f.pop("x"), "0 columns of x"),
+        (lambda f: f.update(x=3), "0 columns of x"),
+    ],
+)
+def test_other_features_are_refused(change, message, tmp_path):
+    shutil.copytree(PRETRAINED, tmp_path, dirs_exist_ok=True)
+    settings = json.loads((tmp_path / "embedder.json").read_text())
+    change(settings["features"])
+    (tmp_path / "embedder.json").write_text(json.dumps(settings))
+    with pytest.raises(InputError, match=rf"embedder\.json: was trained on {message}.*; train it again$"):
+        load_embedder(tmp_path)
