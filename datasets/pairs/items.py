@@ -73,14 +73,14 @@ class Item:
 
         A set for evaluation (`maps`) takes minutes, and its numbers must be those of the code as it stands: the name has the
         digest of all code and data that make its files. A set for training takes hours, and an edit that changes no bytes must
-        not cost them: the name has the versions of the steps (`PAIR_FORMAT`, `graph.FORMAT`), which whoever changes their
+        not cost them: the name has the versions of the steps (`PAIR_FORMAT`, `graph.GRAPH_FORMAT`), which whoever changes their
         results raises, and the digest of the weights that the extraction reads, which change by training alone.
         """
         values = asdict(self)
         later = {"maps": False, "change": UNCHANGED}  # these came later: at their defaults older names hold
         values = {key: value for key, value in values.items() if key not in later or value != later[key]}
         maker = code_digest(MAKER) if self.maps else data_digest(EXTRACTION)
-        inputs = [PAIR_FORMAT, graph.FORMAT, maker, plain(values)]
+        inputs = [PAIR_FORMAT, graph.GRAPH_FORMAT, maker, plain(values)]
         return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:24]
 
 
