@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 from benchmarks.merging.pairs import GridPair, load
 from topomerge.fusion.judge import Judge
-from topomerge.fusion.registration import _order as order
+from topomerge.fusion.registration import registration_order as order
 from topomerge.fusion.scale import search_scaled
 from topomerge.fusion.search import search
 from topomerge.fusion.storey_plan import plans

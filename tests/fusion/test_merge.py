@@ -18,7 +18,7 @@ from tests.scenes import Scene
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.solve import solve
 from topomerge.fusion.fuse import room_of_rooms
-from topomerge.fusion.result import STEPS, MergeResult, merge_to_json
+from topomerge.fusion.result import MERGE_STEPS, MergeResult, merge_to_json
 from topomerge.matching.odds import match_probability
 from topomerge.types import Sim3, TopometricMap
 
@@ -59,7 +59,7 @@ def test_two_halves_are_merged(merged, halves):
     middle = tuple(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0])
     metres, degrees = off(merged.transforms[1], MOVE.inverse(), middle)
     assert metres < 0.06 and degrees < 0.2
-    assert set(merged.seconds) == set(STEPS) and merged.seconds["fuse"] > 0 and merged.seconds["embed"] > 0
+    assert set(merged.seconds) == set(MERGE_STEPS) and merged.seconds["fuse"] > 0 and merged.seconds["embed"] > 0
     assert merged.maps == halves
 
 
@@ -157,7 +157,7 @@ def test_json_has_the_schema(merged, refused):
     point = np.array([1.0, 2.0, 3.0, 1.0])
     assert np.allclose((np.array(entry["matrix"]) @ point)[:3], merged.transforms[1].apply(point[None, :3])[0])
     assert all(set(m) == {"maps", "rooms", "probability"} and m["maps"] == [0, 1] for m in listing["matches"])
-    assert set(listing["seconds"]) == set(STEPS)
+    assert set(listing["seconds"]) == set(MERGE_STEPS)
     assert merge_to_json(refused)["transforms"] == {} and merge_to_json(refused)["matches"] == []
     json.dumps(listing, allow_nan=False)
 
@@ -232,9 +232,9 @@ def test_maps_with_one_room_or_none_are_tried(halves):
     empty = replace(room, rooms=room.rooms[:0], edges=room.edges[:0], areas=room.areas[:0], narrows=room.narrows[:0],
                     room=np.full_like(room.room, -1), navigable_room=np.full_like(room.navigable_room, -1),
                     navigable_area=np.full_like(room.navigable_area, -1))  # fmt: skip
-    found = tm.merge([empty, halves[0]], force=True)
-    assert any("has no rooms" in w for w in found.warnings)
-    assert not found.merged
+    result = tm.merge([empty, halves[0]], force=True)
+    assert any("has no rooms" in w for w in result.warnings)
+    assert not result.merged
 
 
 @pytest.fixture(scope="module")

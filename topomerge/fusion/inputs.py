@@ -10,7 +10,7 @@ from topomerge.errors import InputError
 from topomerge.fusion.verify import model
 from topomerge.types import TopometricMap
 
-SCALES = ("fixed", "free")
+MERGE_SCALES = ("fixed", "free")
 POSE_SOURCES = ("search", "rooms")
 UNIT_SPAN = 300.0  # m, and
 UNIT_RATIO = 30.0  # times the other map: a map that spans this is in another unit
@@ -19,9 +19,9 @@ TALL_RATIO = 2.2  # times the height of the other's storeys: another unit, or a 
 
 
 def check_scale(scale: str) -> None:
-    """Raise InputError for another word than those of `SCALES`."""
-    if scale not in SCALES:
-        raise InputError(f"scale must be {' or '.join(SCALES)}, not {scale!r}")
+    """Raise InputError for another word than those of `MERGE_SCALES`."""
+    if scale not in MERGE_SCALES:
+        raise InputError(f"scale must be {' or '.join(MERGE_SCALES)}, not {scale!r}")
 
 
 def checked_threshold(threshold: float | None) -> float:

@@ -18,8 +18,8 @@ from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, sol
 from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import fuse, rooms_in_common
 from topomerge.fusion.inputs import check_pair, check_poses, check_scale, checked_threshold, pair_warnings
-from topomerge.fusion.registration import _order, register
-from topomerge.fusion.result import STEPS, MergeResult, RoomMatch
+from topomerge.fusion.registration import register, registration_order
+from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
 from topomerge.fusion.thesis.room_poses import room_poses
 from topomerge.matching.match import match
 from topomerge.matching.odds import match_probability
@@ -121,7 +121,7 @@ def _merge_several(maps: Sequence[TopometricMap], settings: _Settings) -> MergeR
         reason,
         transforms={k: atlas.transforms[k] for k in members[1:]},
         matches=tuple(matches),
-        seconds={**dict.fromkeys(STEPS, 0.0), "fuse": time.perf_counter() - began},
+        seconds={**dict.fromkeys(MERGE_STEPS, 0.0), "fuse": time.perf_counter() - began},
         map=joined,
         maps=tuple(maps),
         atlas=atlas,
@@ -150,7 +150,7 @@ class _Clock:
     """Seconds of embedding and matching; fusing is the rest."""
 
     def __init__(self) -> None:
-        self.seconds = dict.fromkeys(STEPS, 0.0)
+        self.seconds = dict.fromkeys(MERGE_STEPS, 0.0)
         self.began = time.perf_counter()
 
     @contextmanager
@@ -171,7 +171,7 @@ def _room_hypotheses(a: TopometricMap, b: TopometricMap, settings: _Settings, cl
     """Poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "rooms") of each by its surfaces."""
     if not len(a.rooms) or not len(b.rooms):
         return []
-    if _order(b) < _order(a):  # as registration: nothing may depend on which comes first
+    if registration_order(b) < registration_order(a):  # as registration: nothing may depend on which comes first
         return [h.inverse() for h in _room_hypotheses(b, a, settings, clock)]
     describe = _timed(settings.embedder, clock)
     with clock("match"):

@@ -84,7 +84,7 @@ def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
     """
     grid = _grid(map)
     storeys = tuple(PlanFields(p) for p in plans(map, free))
-    return Prepared(storeys, _order(map), cell_middles(grid).mean(axis=0), lambda: surface(grid))
+    return Prepared(storeys, registration_order(map), cell_middles(grid).mean(axis=0), lambda: surface(grid))
 
 
 def register(
@@ -174,7 +174,7 @@ def _grid(m: Map) -> VoxelGrid:
     return m.grid if isinstance(m, TopometricMap) else m
 
 
-def _order(m: Map) -> tuple[int, str]:
+def registration_order(m: Map) -> tuple[int, str]:
     """Larger maps come first; among equal ones the order is arbitrary, but always the same."""
     grid = _grid(m)
     digest = hashlib.sha256(np.ascontiguousarray(grid.cells).tobytes() + grid.origin.tobytes()).hexdigest()

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from topomerge.fusion.atlas.result import AtlasResult
 
 MERGE_FORMAT = 1
-STEPS = ("read", "extract", "embed", "match", "fuse")
+MERGE_STEPS = ("read", "extract", "embed", "match", "fuse")
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
         "maps": [{"source": m.source, "rooms": len(m.rooms), "storeys": len(m.storeys)} for m in result.maps],
         "transforms": transforms,
         "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],
-        "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in STEPS},
+        "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in MERGE_STEPS},
     }
     plain_listing: dict[str, Any] = plain(listing)
     return plain_listing

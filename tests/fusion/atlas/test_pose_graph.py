@@ -41,8 +41,8 @@ def started(poses: dict[int, Sim3], rng: np.random.Generator) -> dict[int, Sim3]
     return {k: near(p) if k else p for k, p in poses.items()}
 
 
-def worst(found: dict[int, Sim3], true: dict[int, Sim3]) -> tuple[float, float, float]:
-    gaps = np.array([pose_difference(found[k], true[k], PLACE[0]) for k in true])
+def worst(solved: dict[int, Sim3], true: dict[int, Sim3]) -> tuple[float, float, float]:
+    gaps = np.array([pose_difference(solved[k], true[k], PLACE[0]) for k in true])
     return tuple(gaps.max(axis=0).tolist())  # type: ignore[return-value]
 
 
@@ -55,10 +55,10 @@ def test_true_measurements_give_the_true_poses(scaled):
     start = started(true, np.random.default_rng(0))
     if not scaled:
         start = {k: Sim3(p.yaw, p.translation) for k, p in start.items()}
-    found = optimise(start, measured(true, CYCLE), scaled)
-    assert max(worst(found, true)) < 1e-5
-    assert found[0] == true[0]
-    assert all(residual(e, found) < 1e-5 for e in measured(true, CYCLE))
+    solved = optimise(start, measured(true, CYCLE), scaled)
+    assert max(worst(solved, true)) < 1e-5
+    assert solved[0] == true[0]
+    assert all(residual(e, solved) < 1e-5 for e in measured(true, CYCLE))
 
 
 def test_one_wrong_measurement_hardly_counts():
@@ -66,10 +66,10 @@ def test_one_wrong_measurement_hardly_counts():
     edges = measured(true, CYCLE, noise=0.01)
     wrong = Sim3(0.3, (2.0, -1.0, 0.0)) @ edges[-1].pose
     edges[-1] = Measured(edges[-1].maps, wrong, PLACE)
-    found = optimise(true, edges)
-    metres, radians, _ = worst(found, true)
+    solved = optimise(true, edges)
+    metres, radians, _ = worst(solved, true)
     assert metres < 0.1 and radians < 0.02
-    assert residual(edges[-1], found) > 1.0 > 0.1 > max(residual(e, found) for e in edges[:-1])
+    assert residual(edges[-1], solved) > 1.0 > 0.1 > max(residual(e, solved) for e in edges[:-1])
 
 
 def test_errors_are_shared_around_a_cycle():
@@ -79,13 +79,13 @@ def test_errors_are_shared_around_a_cycle():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     closing = Sim3(0.0, (0.04, 0.0, 0.0)) @ (poses[3].inverse() @ poses[0])
     edges = [Measured((k, k + 1), step, points) for k in range(3)] + [Measured((3, 0), closing, points)]
-    found = optimise(poses, edges)
-    off = [residual(e, found) for e in edges]
+    solved = optimise(poses, edges)
+    off = [residual(e, solved) for e in edges]
     assert max(off) < 0.01 and max(off) - min(off) < 1e-6 and min(off) > 1e-4
 
 
 def test_the_anchor_stays_and_nothing_is_needed():
     poses = ring(3)
     assert optimise(poses, [])[2] == poses[2]
-    found = optimise(poses, measured(poses, [(0, 1), (1, 2)], 0.05), anchor=2)
-    assert found[2] == poses[2]
+    solved = optimise(poses, measured(poses, [(0, 1), (1, 2)], 0.05), anchor=2)
+    assert solved[2] == poses[2]

@@ -1,4 +1,4 @@
-"""Poses of matched rooms: point features against a count by hand, sampling on exact partners, and a map fused by its rooms."""
+"""Poses of matched rooms: sampling on exact partners, and a map merged by its rooms."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import topomerge as tm
 from tests.fusion.plans_of import MOVE, off, office, part
 from tests.scenes import Scene
 from topomerge.errors import InputError
-from topomerge.fusion.thesis.fpfh import BINS, fpfh
 from topomerge.fusion.thesis.room_poses import room_poses, sampled, upright
 from topomerge.types import Sim3
 
@@ -32,39 +31,6 @@ def partners(halves):
     return rooms
 
 
-def test_two_points_by_hand():
-    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
-    found = fpfh(points, normals, 2.0)
-    # Both normals are across the line between them: the three angles are 0, in the middle bin of each.
-    expected = np.zeros(3 * BINS)
-    expected[[BINS // 2 + BINS * k for k in range(3)]] = 100
-    assert np.allclose(found, [expected, expected])
-
-
-def test_a_right_angle_by_hand():
-    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    normals = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
-    first = fpfh(points, normals, 2.0)[0]
-    # From the first point: across = z x x = y, so alpha = y . y = 1; from the second one: y x -x = z, alpha = z . z = 1.
-    assert first[BINS - 1] == pytest.approx(100) and first[:BINS].sum() == pytest.approx(100)
-
-
-def test_features_do_not_change_when_all_is_turned():
-    rng = np.random.default_rng(0)
-    points, normals = rng.uniform(0, 3, (300, 3)), rng.normal(size=(300, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    turn = Sim3(1.0, (3.0, -2.0, 1.0))
-    there = fpfh(turn.apply(points), Sim3(1.0).apply(normals), 0.8)
-    same = np.isclose(there, fpfh(points, normals, 0.8), atol=1e-6).all(axis=1)
-    assert same.mean() > 0.98  # an angle on the border of two bins may fall on either side
-
-
-def test_lonely_points_have_no_features():
-    assert not fpfh(np.array([[0.0, 0, 0], [9.0, 0, 0]]), np.eye(3)[:2], 1.0).any()
-    assert fpfh(np.zeros((0, 3)), np.zeros((0, 3)), 1.0).shape == (0, 3 * BINS)
-
-
 @pytest.mark.parametrize("yaw", [0.0, 1.0, 3.1, -3.1])
 def test_sampling_finds_the_pose_among_wrong_partners(yaw):
     rng = np.random.default_rng(1)
@@ -72,8 +38,8 @@ def test_sampling_finds_the_pose_among_wrong_partners(yaw):
     truth = Sim3(yaw, (4.0, -7.0, 0.5))
     to = truth.apply(points)
     to[:120] = rng.uniform(-9, 9, (120, 3))  # 60 % are wrong
-    found = sampled(to, points)
-    assert np.allclose(found.apply(points[120:]), to[120:], atol=1e-6)
+    pose = sampled(to, points)
+    assert np.allclose(pose.apply(points[120:]), to[120:], atol=1e-6)
 
 
 def test_upright_is_exact_for_many_at_once():
@@ -90,16 +56,16 @@ def test_no_triple_with_like_edges_is_no_pose():
 
 
 def test_rooms_that_match_agree_about_the_pose(halves, partners):
-    found = room_poses(*halves, partners, np.ones(len(partners)))
-    metres, degrees = off(found[0][0], MOVE.inverse(), tuple(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0]))
+    clusters = room_poses(*halves, partners, np.ones(len(partners)))
+    metres, degrees = off(clusters[0][0], MOVE.inverse(), tuple(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0]))
     assert metres < 0.1 and degrees < 0.5
-    assert [w for _, w in found] == sorted((w for _, w in found), reverse=True)
+    assert [w for _, w in clusters] == sorted((w for _, w in clusters), reverse=True)
 
 
 def test_one_wrong_match_is_outvoted(halves, partners):
     wrong = np.array([[partners[0, 0], partners[1, 1]]])
-    found = room_poses(*halves, np.concatenate([wrong, partners]), np.ones(len(partners) + 1))
-    assert off(found[0][0], MOVE.inverse(), (0.0, 0.0, 0.0))[1] < 0.5
+    clusters = room_poses(*halves, np.concatenate([wrong, partners]), np.ones(len(partners) + 1))
+    assert off(clusters[0][0], MOVE.inverse(), (0.0, 0.0, 0.0))[1] < 0.5
 
 
 def test_no_matches_give_no_pose(halves):
@@ -115,11 +81,11 @@ def flats():
 
 
 def test_merge_by_rooms_alone(flats):
-    found = tm.merge(flats, poses="rooms")
-    metres, degrees = off(found.registration.transform, MOVE.inverse(), tuple(MOVE.apply(np.array([[6.0, 4.0, 1.0]]))[0]))
+    result = tm.merge(flats, poses="rooms")
+    metres, degrees = off(result.registration.transform, MOVE.inverse(), tuple(MOVE.apply(np.array([[6.0, 4.0, 1.0]]))[0]))
     assert metres < 0.1 and degrees < 0.5
     back = tm.merge(flats[::-1], poses="rooms")
-    assert np.allclose((found.registration.transform @ back.registration.transform).matrix, np.eye(4), atol=1e-6)
+    assert np.allclose((result.registration.transform @ back.registration.transform).matrix, np.eye(4), atol=1e-6)
 
 
 def test_merge_by_rooms_is_for_two_maps_of_one_scale(halves):

@@ -26,9 +26,9 @@ DRIFT_LIMITS = (1.0, np.radians(4.0), 0.05)  # m, rad, log scale: poses of a pai
 CHECKED_ONCE = (0.08, np.radians(0.4), 0.005)  # m, rad, log scale: poses that are as near are judged once
 OVERLAP_FLOOR, OVERLAP_WALLS = 2.0, 0.3  # m2 in common, below both of which two maps do not overlap
 NOISE_CONFLICT = 0.3  # m2 of walls on free floor, below which it may be noise
-USUAL_CONFLICT = 0.12  # share of the walls on free floor that true poses seldom exceed
+POSE_USUAL_CONFLICT = 0.12  # share of the walls on free floor that true poses seldom exceed
 CONFLICT_ODDS = 30.0  # log odds against a pose, of each share of 1 above that
-LEAST_HALF_WIDTH = 1.0  # m, of the place by which a pose is measured
+PLACE_HALF_WIDTH = 1.0  # m, of the place by which a pose is measured
 SAMPLED_COLUMNS = 4000
 T = TypeVar("T")
 
@@ -144,10 +144,10 @@ def speaks(f: Mapping[str, float]) -> float:
     """Log odds for a pose that other maps propose. Little in common says little: only walls on free floor speak against it.
 
     Of hypotheses of simulated training pairs, nine in ten of the right ones have a plausibility above -4, one in twenty of the
-    wrong ones; walls on free floor are more than `USUAL_CONFLICT` of the walls in one of twenty right ones, in three of four
+    wrong ones; walls on free floor are more than `POSE_USUAL_CONFLICT` of the walls in one of twenty right ones, in three of four
     wrong ones.
     """
-    excess = max(f["conflict_share"] - USUAL_CONFLICT, 0.0) if f["conflict"] > NOISE_CONFLICT else 0.0
+    excess = max(f["conflict_share"] - POSE_USUAL_CONFLICT, 0.0) if f["conflict"] > NOISE_CONFLICT else 0.0
     return float(np.clip(plausibility(f) + 3.0, 0.0, 3.0)) - min(CONFLICT_ODDS * excess, 6.0)
 
 
@@ -174,6 +174,6 @@ def place(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Array
     points = common_points(a, b, pose)
     if not len(points):
         points = np.append(b[0].middle, 0.0)[None]
-    middle, (x, y, _) = points.mean(axis=0), np.maximum(points.std(axis=0), LEAST_HALF_WIDTH)
+    middle, (x, y, _) = points.mean(axis=0), np.maximum(points.std(axis=0), PLACE_HALF_WIDTH)
     spread: Array = middle + np.array([[0, 0, 0], [x, 0, 0], [-x, 0, 0], [0, y, 0], [0, -y, 0]])
     return spread

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from topomerge.types import Array
 
-BINS = 11  # of each of the three angles
+ANGLE_BINS = 11  # of each of the three angles
 
 
 def fpfh(points: Array, normals: Array, radius: float) -> Array:
@@ -19,24 +19,29 @@ def fpfh(points: Array, normals: Array, radius: float) -> Array:
         radius: of the neighbourhood, m.
     """
     pairs = cKDTree(points).query_pairs(radius, output_type="ndarray") if len(points) else np.zeros((0, 2), np.int64)
-    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T  # each pair is seen from both ends
-    gap = points[other] - points[one]
-    apart = np.linalg.norm(gap, axis=1)
-    kept = apart > 1e-9
-    one, other, gap, apart = one[kept], other[kept], gap[kept], apart[kept]
-    simple = _simple(normals[one], normals[other], gap / apart[:, None], one, len(points))
-    many = np.maximum(np.bincount(one, minlength=len(points)), 1)
-    near = np.zeros_like(simple)
+    point, neighbour = np.concatenate([pairs, pairs[:, ::-1]]).T  # each pair is seen from both ends
+    gap = points[neighbour] - points[point]
+    distance = np.linalg.norm(gap, axis=1)
+    distinct = distance > 1e-9
+    point, neighbour, gap, distance = point[distinct], neighbour[distinct], gap[distinct], distance[distinct]
+    simple = _simple_histograms(normals[point], normals[neighbour], gap / distance[:, None], point, len(points))
+    neighbours = np.maximum(np.bincount(point, minlength=len(points)), 1)
+    around = np.zeros_like(simple)
     for column in range(simple.shape[1]):
-        near[:, column] = np.bincount(one, simple[other, column] / apart, len(points))
-    full = simple + near / many[:, None]
-    parts = full.reshape(len(points), 3, BINS)
-    out: Array = (100 * parts / np.maximum(parts.sum(axis=2, keepdims=True), 1e-12)).reshape(len(points), 3 * BINS)
-    return out
+        around[:, column] = np.bincount(point, simple[neighbour, column] / distance, len(points))
+    thirds = (simple + around / neighbours[:, None]).reshape(len(points), 3, ANGLE_BINS)
+    histograms: Array = 100 * thirds / np.maximum(thirds.sum(axis=2, keepdims=True), 1e-12)
+    return histograms.reshape(len(points), 3 * ANGLE_BINS)
 
 
-def _simple(normal: Array, other: Array, towards: Array, owner: Array, count: int) -> Array:
-    """(count, 33): of each point, how the three angles of the Darboux frames with its neighbours are spread, as shares."""
+def _simple_histograms(normal: Array, other: Array, towards: Array, point: Array, count: int) -> Array:
+    """(count, 33): of each point, how the three angles of the Darboux frames with its neighbours are spread, as shares.
+
+    Args:
+        normal, other: (P, 3) of the point and of its neighbour, of each pair.
+        towards: (P, 3) unit vector from the point to the neighbour.
+        point: (P,) row of the point.
+    """
     across = np.cross(normal, towards)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
     third = np.cross(normal, across)
@@ -44,8 +49,8 @@ def _simple(normal: Array, other: Array, towards: Array, owner: Array, count: in
     phi = (normal * towards).sum(axis=1)
     theta = np.arctan2((third * other).sum(axis=1), (normal * other).sum(axis=1)) / np.pi
     angles = np.stack([alpha, phi, theta], axis=1)  # each in [-1, 1]
-    bins = np.clip(((angles + 1) / 2 * BINS).astype(np.int64), 0, BINS - 1) + np.arange(3) * BINS
-    flat = np.bincount((owner[:, None] * 3 * BINS + bins).ravel(), minlength=count * 3 * BINS)
-    many = np.maximum(np.bincount(owner, minlength=count), 1)
-    out: Array = flat.reshape(count, 3 * BINS) / many[:, None]
-    return out
+    bins = np.clip(((angles + 1) / 2 * ANGLE_BINS).astype(np.int64), 0, ANGLE_BINS - 1) + np.arange(3) * ANGLE_BINS
+    flat = np.bincount((point[:, None] * 3 * ANGLE_BINS + bins).ravel(), minlength=count * 3 * ANGLE_BINS)
+    neighbours = np.maximum(np.bincount(point, minlength=count), 1)
+    histograms: Array = flat.reshape(count, 3 * ANGLE_BINS) / neighbours[:, None]
+    return histograms
