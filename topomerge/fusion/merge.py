@@ -20,6 +20,7 @@ from topomerge.fusion.fuse import fuse, rooms_in_common
 from topomerge.fusion.inputs import check_pair, check_poses, check_scale, checked_threshold, pair_warnings
 from topomerge.fusion.registration import register, registration_order
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
+from topomerge.fusion.thesis.fpfh import check_open3d
 from topomerge.fusion.thesis.room_poses import room_poses
 from topomerge.matching.match import match
 from topomerge.matching.odds import match_probability
@@ -50,9 +51,11 @@ def merge(
 
     Raises:
         InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale
-            or the poses.
+            or the poses, or poses of rooms without Open3D (`pip install topomerge[open3d]`).
     """
     check_poses(poses, len(maps), scale)
+    if poses == "rooms":
+        check_open3d()
     if len(maps) < 2:
         raise InputError(f"merge takes two maps or more, {len(maps)} given; give another one")
     check_scale(scale)

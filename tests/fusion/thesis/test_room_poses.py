@@ -1,6 +1,8 @@
-"""Poses of matched rooms: sampling on exact partners, and a map merged by its rooms."""
+"""Poses of matched rooms: those that match agree, and a map is merged by its rooms."""
 
 from __future__ import annotations
+
+import sys
 
 import numpy as np
 import pytest
@@ -9,8 +11,9 @@ import topomerge as tm
 from tests.fusion.plans_of import MOVE, off, office, part
 from tests.scenes import Scene
 from topomerge.errors import InputError
-from topomerge.fusion.thesis.room_poses import room_poses, sampled, upright
-from topomerge.types import Sim3
+from topomerge.fusion.thesis.room_poses import room_poses
+
+pytest.importorskip("open3d", exc_type=ImportError)
 
 
 @pytest.fixture(scope="module")
@@ -29,30 +32,6 @@ def partners(halves):
     rooms = np.argwhere(apart < 0.3)
     assert len(rooms) >= 3
     return rooms
-
-
-@pytest.mark.parametrize("yaw", [0.0, 1.0, 3.1, -3.1])
-def test_sampling_finds_the_pose_among_wrong_partners(yaw):
-    rng = np.random.default_rng(1)
-    points = rng.uniform(0, 6, (200, 3))
-    truth = Sim3(yaw, (4.0, -7.0, 0.5))
-    to = truth.apply(points)
-    to[:120] = rng.uniform(-9, 9, (120, 3))  # 60 % are wrong
-    pose = sampled(to, points)
-    assert np.allclose(pose.apply(points[120:]), to[120:], atol=1e-6)
-
-
-def test_upright_is_exact_for_many_at_once():
-    rng = np.random.default_rng(2)
-    points, truths = rng.uniform(0, 5, (4, 3, 3)), [Sim3(y, (y, 2.0, 1.0)) for y in (-3.0, 0.0, 1.5, 3.0)]
-    yaw, shift = upright(np.array([t.apply(p) for t, p in zip(truths, points, strict=True)]), points)
-    assert np.allclose(yaw, [t.yaw for t in truths])
-    assert np.allclose(shift, [t.translation for t in truths])
-
-
-def test_no_triple_with_like_edges_is_no_pose():
-    points = np.random.default_rng(3).uniform(0, 6, (50, 3))
-    assert sampled(points * 3, points) is None
 
 
 def test_rooms_that_match_agree_about_the_pose(halves, partners):
@@ -95,3 +74,14 @@ def test_merge_by_rooms_is_for_two_maps_of_one_scale(halves):
         tm.merge([*halves, halves[0]], poses="rooms")
     with pytest.raises(InputError, match="search or rooms, not 'thesis'"):
         tm.merge(halves, poses="thesis")
+
+
+def test_the_same_maps_give_the_same_poses(halves, partners):
+    first, second = (room_poses(*halves, partners, np.ones(len(partners))) for _ in range(2))
+    assert first == second
+
+
+def test_without_open3d_the_message_says_what_to_install(flats, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(InputError, match=r"need Open3D: pip install topomerge\[open3d\]"):
+        tm.merge(flats, poses="rooms")

@@ -1,56 +1,96 @@
-"""Fast point feature histograms of oriented points (Rusu, Blodow and Beetz 2009): what a matched pair of rooms is aligned by."""
+"""Point features and their sample consensus through Open3D (Rusu, Blodow and Beetz 2009): the first pose of a pair of rooms."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
-from scipy.spatial import cKDTree
 
-from topomerge.types import Array
+from topomerge.errors import InputError
+from topomerge.types import Array, Sim3
 
-ANGLE_BINS = 11  # of each of the three angles
+FEATURE_RADIUS = 1.0  # m
+EDGE_RATIO = 0.8  # of the edges of two triples (method 3)
+INLIER_DISTANCE = 0.3  # m
+TRIPLES = 20_000  # that are drawn at most
+CONFIDENCE = 0.999  # that a better triple would have been drawn
+LEAST_UPRIGHT = 0.9  # cosine of the tilt: rooms look alike upside down, and floors are level
 
 
-def fpfh(points: Array, normals: Array, radius: float) -> Array:
-    """(N, 33) float64 histograms, each third sums to 100; 0 where a point has no neighbour.
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Points of a room with their histograms.
+
+    Args:
+        points: (N, 3) m.
+        cloud: the same as `open3d.geometry.PointCloud`, with normals.
+        histograms: `open3d.pipelines.registration.Feature`, 33 numbers a point.
+    """
+
+    points: Array
+    cloud: Any
+    histograms: Any
+
+
+def check_open3d() -> None:
+    """Raise InputError where Open3D is not installed."""
+    try:
+        import open3d  # noqa: F401
+    except ImportError as error:
+        raise InputError("poses of rooms (--poses rooms) need Open3D: pip install topomerge[open3d]") from error
+
+
+def fpfh(points: Array, normals: Array) -> Features:
+    """Fast point feature histograms of oriented points.
 
     Args:
         points: (N, 3) m.
         normals: (N, 3) unit vectors, pointing to the same side (into the room).
-        radius: of the neighbourhood, m.
     """
-    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray") if len(points) else np.zeros((0, 2), np.int64)
-    point, neighbour = np.concatenate([pairs, pairs[:, ::-1]]).T  # each pair is seen from both ends
-    gap = points[neighbour] - points[point]
-    distance = np.linalg.norm(gap, axis=1)
-    distinct = distance > 1e-9
-    point, neighbour, gap, distance = point[distinct], neighbour[distinct], gap[distinct], distance[distinct]
-    simple = _simple_histograms(normals[point], normals[neighbour], gap / distance[:, None], point, len(points))
-    neighbours = np.maximum(np.bincount(point, minlength=len(points)), 1)
-    around = np.zeros_like(simple)
-    for column in range(simple.shape[1]):
-        around[:, column] = np.bincount(point, simple[neighbour, column] / distance, len(points))
-    thirds = (simple + around / neighbours[:, None]).reshape(len(points), 3, ANGLE_BINS)
-    histograms: Array = 100 * thirds / np.maximum(thirds.sum(axis=2, keepdims=True), 1e-12)
-    return histograms.reshape(len(points), 3 * ANGLE_BINS)
+    import open3d
+
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    cloud.normals = open3d.utility.Vector3dVector(normals)
+    neighbours = open3d.geometry.KDTreeSearchParamRadius(FEATURE_RADIUS)
+    return Features(points, cloud, open3d.pipelines.registration.compute_fpfh_feature(cloud, neighbours))
 
 
-def _simple_histograms(normal: Array, other: Array, towards: Array, point: Array, count: int) -> Array:
-    """(count, 33): of each point, how the three angles of the Darboux frames with its neighbours are spread, as shares.
+def sampled_pose(a: Features, b: Features, seed: int = 0) -> Sim3 | None:
+    """T_ab that brings most points of b near those of a with the likest histograms, of triples with like edges; None where there
+    is none, or only one that tilts the floor. The same seed gives the same pose.
+
+    Open3D knows no gravity: of the pose that it gives the turn about the vertical is taken.
+    """
+    import open3d
+
+    registration = open3d.pipelines.registration
+    open3d.utility.random.seed(seed)
+    result = registration.registration_ransac_based_on_feature_matching(
+        b.cloud,
+        a.cloud,
+        b.histograms,
+        a.histograms,
+        mutual_filter=False,
+        max_correspondence_distance=INLIER_DISTANCE,
+        estimation_method=registration.TransformationEstimationPointToPoint(False),
+        ransac_n=3,
+        checkers=[registration.CorrespondenceCheckerBasedOnEdgeLength(EDGE_RATIO)],
+        criteria=registration.RANSACConvergenceCriteria(TRIPLES, CONFIDENCE),
+    )
+    matrix = np.asarray(result.transformation)
+    if result.fitness == 0 or matrix[2, 2] < LEAST_UPRIGHT:
+        return None
+    return upright(matrix, b.points.mean(axis=0))
+
+
+def upright(matrix: Array, anchor: Array) -> Sim3:
+    """The pose under gravity that is nearest to a rigid one in its turn, and places a point as it does.
 
     Args:
-        normal, other: (P, 3) of the point and of its neighbour, of each pair.
-        towards: (P, 3) unit vector from the point to the neighbour.
-        point: (P,) row of the point.
+        matrix: (4, 4).
+        anchor: (3,) m.
     """
-    across = np.cross(normal, towards)
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-    third = np.cross(normal, across)
-    alpha = (across * other).sum(axis=1)
-    phi = (normal * towards).sum(axis=1)
-    theta = np.arctan2((third * other).sum(axis=1), (normal * other).sum(axis=1)) / np.pi
-    angles = np.stack([alpha, phi, theta], axis=1)  # each in [-1, 1]
-    bins = np.clip(((angles + 1) / 2 * ANGLE_BINS).astype(np.int64), 0, ANGLE_BINS - 1) + np.arange(3) * ANGLE_BINS
-    flat = np.bincount((point[:, None] * 3 * ANGLE_BINS + bins).ravel(), minlength=count * 3 * ANGLE_BINS)
-    neighbours = np.maximum(np.bincount(point, minlength=count), 1)
-    histograms: Array = flat.reshape(count, 3 * ANGLE_BINS) / neighbours[:, None]
-    return histograms
+    yaw = float(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
+    x, y, z = (matrix[:3, :3] @ anchor + matrix[:3, 3] - Sim3(yaw).apply(anchor[None])[0]).tolist()
+    return Sim3(yaw, (x, y, z))
