@@ -40,8 +40,9 @@ def _figure(columns: int) -> tuple[Any, Any]:
 
 
 def _legend(ax: Any) -> None:
-    """Below the axes, where it hides nothing."""
-    ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2, frameon=False)
+    """Below the axes, where it hides nothing; none where nothing is drawn, as of merges that were not asked for."""
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2, frameon=False)
 
 
 def _of(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
