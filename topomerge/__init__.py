@@ -17,8 +17,8 @@ from topomerge.writers import WRITERS
 if TYPE_CHECKING:
     from topomerge.embedding.learned import load_embedder as load_embedder
     from topomerge.errors import InputError as InputError
-    from topomerge.extraction.extract import PRESETS as PRESETS
     from topomerge.extraction.extract import extract as extract
+    from topomerge.extraction.parameters import PRESETS as PRESETS
     from topomerge.extraction.voxels import voxelise as voxelise
     from topomerge.fusion.atlas.result import AtlasResult as AtlasResult
     from topomerge.fusion.atlas.solve import atlas as atlas
@@ -48,7 +48,7 @@ _HOMES = {
     "AtlasResult": "topomerge.fusion.atlas.result",
     "InputError": "topomerge.errors",
     "MergeResult": "topomerge.fusion.result",
-    "PRESETS": "topomerge.extraction.extract",
+    "PRESETS": "topomerge.extraction.parameters",
     "PointCloud": "topomerge.types",
     "Sim3": "topomerge.types",
     "TopometricMap": "topomerge.types",

@@ -33,7 +33,7 @@ MAKERS = tuple(f"topomerge.{name}" for name in ("extraction.extract", "metrics",
 
 def key_of(case: Case, preset: str, code: str) -> str:
     """What a line of results is found by."""
-    from topomerge.extraction.extract import PRESETS
+    from topomerge.extraction.parameters import PRESETS
 
     varied = [case.thin, case.turn, case.shuffle, case.voxel]
     inputs = [case.key, varied, asdict(PRESETS[preset]), code]

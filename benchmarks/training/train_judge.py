@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.training.training_plans import files_of, load
-from topomerge.extraction.plans.passages import FEATURES, clearance_of, features, find_passages, regions_of
-from topomerge.extraction.plans.plan_network import segment, without_furniture
+from topomerge.extraction.plans.passages import DOOR_FEATURES, clearance_of, door_features, find_passages, regions_of
+from topomerge.extraction.plans.plan_network import column_probabilities, without_furniture
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.types import Array
 
@@ -30,7 +30,7 @@ PURE = 0.7  # share of a region in its true room; regions between rooms are no e
 
 def regions_and_links(plan: StoreyPlan, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
     """Features and answers for the neighbouring regions of one plan, before and while those of one room are merged."""
-    chance = segment(plan)
+    chance = column_probabilities(plan)
     plan = without_furniture(plan, chance)
     clearance = clearance_of(plan)
     region = regions_of(plan, chance)
@@ -50,7 +50,7 @@ def regions_and_links(plan: StoreyPlan, truth: Array, visited: set[int]) -> tupl
     def tell(pairs: list[tuple[int, int]]) -> None:
         for a, b in pairs:
             if room[a] >= 0 and room[b] >= 0 and (room[a] in visited or room[b] in visited):
-                x.append(features(links[a, b], (peak[a], peak[b]), (area[a], area[b])))
+                x.append(door_features(links[a, b], (peak[a], peak[b]), (area[a], area[b])))
                 y.append(bool(room[a] != room[b]))
 
     tell(list(links))
@@ -72,7 +72,7 @@ def fit(hidden: int = 16) -> None:
     scans = [load(f) for f in files_of("judge")]
     found = [[regions_and_links(e.plan, e.room, set(e.visited.tolist())) for e in scan] for scan in scans]
     parts = [([x for xs, _ in of for x in xs], [y for _, ys in of for y in ys]) for of in found]
-    x = np.concatenate([np.array(xs).reshape(-1, len(FEATURES)) for xs, _ in parts])
+    x = np.concatenate([np.array(xs).reshape(-1, len(DOOR_FEATURES)) for xs, _ in parts])
     y = np.concatenate([ys for _, ys in parts]).astype(np.float32)
     scan_of = np.repeat(np.arange(len(parts)), [len(ys) for _, ys in parts])
     low, high = np.quantile(x, [0.005, 0.995], axis=0)
@@ -92,7 +92,7 @@ def fit(hidden: int = 16) -> None:
     about: dict[str, Any] = {name: values.round(4).tolist() for name, values in weights.items()}
     about["layers"] = [[w.round(4).tolist(), b.round(4).tolist()] for w, b in train(z, y, scan_of, hidden)]
     beside = WEIGHTS.with_suffix(".new")
-    beside.write_text(json.dumps({"features": FEATURES, **about}))
+    beside.write_text(json.dumps({"features": DOOR_FEATURES, **about}))
     os.replace(beside, WEIGHTS)
 
 

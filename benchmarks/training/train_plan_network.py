@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.training.training_plans import TRUTHS, Example, files_of, load
-from topomerge.extraction.plans.plan_network import CHANNELS, CLASSES, DOWN, FILE, UP, evidence
+from topomerge.extraction.classified_storey import COLUMN_CLASSES
+from topomerge.extraction.plans.plan_network import DOWN_LEVELS, EVIDENCE_CHANNELS, PLAN_NETWORK_FILE, UP_LEVELS, evidence
 from topomerge.types import Array
 
-WEIGHTS = Path("topomerge/extraction") / FILE
+WEIGHTS = Path("topomerge/extraction/plans") / PLAN_NETWORK_FILE
 WIDTHS = {"a": 16, "b": 32, "c": 40, "d": 40, "e": 40, "f": 32, "g": 16, "h": 12}
 CROP, BATCH = 128, 8
 WEIGHT = (1.0, 2.0, 4.0, 6.0, 1.0)  # of the classes
@@ -42,24 +43,24 @@ def network() -> Any:
         def __init__(self) -> None:
             super().__init__()
             self.layers = nn.ModuleDict()
-            wide, skips = CHANNELS, []
-            for name in DOWN:
+            wide, skips = EVIDENCE_CHANNELS, []
+            for name in DOWN_LEVELS:
                 skips.append(wide)
                 self.layers[f"{name}1"] = layer(wide, WIDTHS[name], 2)
                 self.layers[f"{name}2"] = layer(WIDTHS[name], WIDTHS[name])
                 wide = WIDTHS[name]
-            for name in UP:
+            for name in UP_LEVELS:
                 self.layers[f"{name}1"] = layer(wide + skips.pop(), WIDTHS[name])
                 wide = WIDTHS[name]
-            self.out = nn.Conv2d(wide, len(CLASSES), 1)
+            self.out = nn.Conv2d(wide, len(COLUMN_CLASSES), 1)
 
         def forward(self, x: Any) -> Any:
             skips = [x]
-            for name in DOWN:
+            for name in DOWN_LEVELS:
                 x = self.layers[f"{name}2"](self.layers[f"{name}1"](x))
                 skips.append(x)
             x = skips.pop()
-            for name in UP:
+            for name in UP_LEVELS:
                 x = torch.cat([nn.functional.interpolate(x, scale_factor=2.0), skips.pop()], dim=1)
                 x = self.layers[f"{name}1"](x)
             return self.out(x)
@@ -68,7 +69,7 @@ def network() -> Any:
 
 
 def exported(net: Any) -> dict[str, Array]:
-    """Weights for `segment.forward`: (9 c, k) with the normalisation in them."""
+    """Weights for `plan_network.forward`: (9 c, k) with the normalisation in them."""
     out: dict[str, Array] = {}
     for name, (conv, norm, _) in net.layers.items():
         scale = (norm.weight / (norm.running_var + norm.eps).sqrt()).detach()
@@ -170,19 +171,19 @@ def write(net: Any) -> None:
 
 def report(held: list[Example]) -> None:
     """Precision and recall of each class over known columns of the held-out scans."""
-    from topomerge.extraction.plans.plan_network import segment
+    from topomerge.extraction.plans.plan_network import column_probabilities
 
     count: dict[str, Array] = {}
     for e in held:
         known = e.plan.inside | e.plan.wall
-        answer = segment(e.plan).argmax(axis=-1)
+        answer = column_probabilities(e.plan).argmax(axis=-1)
         table = count.setdefault(e.source.split("/")[0], np.zeros((5, 5), np.int64))
         np.add.at(table, (e.truth[known], answer[known]), 1)
     for name, table in [*sorted(count.items()), ("all", sum(count.values()))]:
         right = np.diag(table)
         words = [
             f"{c} {r / max(p, 1):.2f}/{r / max(t, 1):.2f}"
-            for c, r, p, t in zip(CLASSES, right, table.sum(axis=0), table.sum(axis=1), strict=True)
+            for c, r, p, t in zip(COLUMN_CLASSES, right, table.sum(axis=0), table.sum(axis=1), strict=True)
         ]
         print(f"{name:8s} precision/recall: {', '.join(words)}", flush=True)
 

@@ -31,10 +31,12 @@ from topomerge.datasets.simulation.walk import part
 
 from benchmarks.extraction.sources import _drift_of, _exact, _spoilt
 from topomerge.errors import InputError
-from topomerge.extraction.extract import PRESETS, _grid, _standing, _upright
-from topomerge.extraction.noise import without_gaps
+from topomerge.extraction.navigable import navigable_volume
+from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.plan import columns_of, profile_bands, storey_plan
 from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.scan import read_scan
+from topomerge.extraction.slices import with_raised_slice
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.types import Array, PointCloud, Sim3
 
@@ -229,10 +231,9 @@ def near(mask: Array, reach: float) -> Array:
 def storeys_of(cloud: PointCloud, edge: float) -> list[tuple[StoreyPlan, Array]]:
     """The plans of a scan as the extraction makes them, and the places (nx, ny, 3) of their columns' floors."""
     p = PRESETS["default"]
-    known: dict[str, Any] = {"warnings": []}
-    grid = _upright(without_gaps(_grid(cloud, edge, known), p.sparse, []), known)
-    grid, navigable = _standing(grid, p, known)
-    storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, p.stem_height + p.body_height))
+    scan, navigable = navigable_volume(with_raised_slice(read_scan(cloud, edge, p.sparse)), p)
+    grid = scan.grid
+    storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, p.standing_height))
     out = []
     for k in range(len(storeys)):
         if (storey == k).any():

@@ -107,7 +107,7 @@ def test_help_has_an_example(run: Run, command: str) -> None:
 
 
 def test_presets_are_those_of_extract() -> None:
-    from topomerge.extraction.extract import PRESETS
+    from topomerge.extraction.parameters import PRESETS
 
     (preset,) = (s for c in COMMANDS if c.name == "extract" for f, s in c.arguments if "--preset" in f)
     assert set(preset["choices"]) == set(PRESETS)

@@ -7,7 +7,8 @@ import pytest
 
 from tests import scenes
 from topomerge.errors import InputError
-from topomerge.extraction.extract import PRESETS, Preset, extract
+from topomerge.extraction.extract import extract
+from topomerge.extraction.parameters import PRESETS, DefaultParameters, ThesisParameters
 from topomerge.extraction.voxels import voxelise
 from topomerge.types import PointCloud, TopometricMap
 
@@ -200,7 +201,7 @@ def test_parameters_are_checked_and_kept():
         extract(points, preset="these")
     with pytest.raises(InputError, match="unknown parameter 'rnge'"):
         extract(points, rnge=3)
-    result = extract(points, preset=Preset(range=4.0), voxel_size=0.1)
+    result = extract(points, preset=DefaultParameters(range=4.0), voxel_size=0.1)
     assert result.parameters["range"] == 4.0 and result.parameters["preset"] == "custom"
     for edge in (0.0, -0.1, float("nan"), 0.001, 0.5, "a"):
         with pytest.raises(InputError, match="voxel size must be between"):
@@ -210,12 +211,13 @@ def test_parameters_are_checked_and_kept():
 def test_the_thesis_preset_is_the_table_of_the_method():
     """method.md, section 1, the column of the finished thesis."""
     p = PRESETS["thesis"]
+    assert isinstance(p, ThesisParameters)
     assert (p.stem_height, p.body_width, p.body_height, p.dilation) == (0.25, 0.30, 0.75, 0.25)
     assert (p.view_radius, p.view_height, p.range, p.least_similarity) == (0.5, 1.6, 5.0, 0.3)
     assert (p.propagation_cells, p.propagation_rounds, p.least_volume) == (2.0, 10, 0.128)
     assert (min(p.inflations), max(p.inflations)) == (1.2, 2.5)
-    assert p.largest_only and p.ceilings and not p.absorb
-    assert (p.noise, p.bridge, p.view_spacing, p.view_clearance, p.tolerance, p.door) == (0, 0, 0, 0, 0, 0)
+    assert p.largest_only and p.ceilings and not p.assume and not p.carve
+    assert (p.noise, p.sparse, p.bridge) == (0, 0, 0)
 
 
 def test_cells_finer_than_the_points_still_give_the_rooms():

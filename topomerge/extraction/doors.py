@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from topomerge.extraction.components import connected_components
 from topomerge.extraction.convolution import sphere
-from topomerge.extraction.rooms import Floor
+from topomerge.extraction.floor import Floor
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import EDGE_DTYPE, Array, VoxelGrid
 
@@ -36,7 +36,7 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
     Returns:
         (E,) EDGE_DTYPE, sorted by rooms and place.
     """
-    navigable, body = floor.cells, floor.body
+    navigable, body = floor.cells, floor.body_width
     cells = navigable.cells.astype(np.int64)
     first, second = [], []
     for step in NEIGHBOURS:

@@ -5,62 +5,83 @@ from __future__ import annotations
 import numpy as np
 
 from topomerge.extraction.distance_field import horizontal_distance_field
-from topomerge.extraction.views.views import best_of_tiles, raise_views
+from topomerge.extraction.scan import Scan
 from topomerge.kernels.carve import carve, sweep
+from topomerge.kernels.columns import first_occupied
 from topomerge.types import Array, VoxelGrid
 
-COARSER = 2  # free cells are that many times longer than occupied ones: a wall is thinner than what it bounds
-MARGIN = 0.5  # of a free cell's length: a ray ends that far before what it met
-RAYS = 2000  # of a view: 0.25 m apart at 3.5 m
-SPACING = 2.0  # m between the views that carve where the sensor's places are unknown
-LARGEST = 400_000_000  # cells of the volume
+FREE_CELL = 2  # free cells are that many times longer than occupied ones: a wall is thinner than what it bounds
+RAY_MARGIN = 0.5  # of a free cell's length: a ray ends that far before what it met
+RAYS_OF_VIEW = 2000  # 0.25 m apart at 3.5 m
+VIEW_SPACING = 2.0  # m between the views that carve where the sensor's places are unknown
+VIEW_HEIGHT, VIEW_CLEARANCE = 1.5, 0.3  # m: above the floor, and below what is above
+LARGEST_VOLUME = 400_000_000  # free cells
 
 
-def carve_rays(grid: VoxelGrid, starts: Array, ends: Array) -> VoxelGrid | None:
-    """The cells, twice as long as those of the grid, that rays crossed and in which nothing is occupied.
+def free_space(scan: Scan, navigable: VoxelGrid, range: float) -> VoxelGrid | None:
+    """Cells that are empty: by the file, crossed by the sensor's rays, or where its places are unknown, seen through from views.
 
     Args:
-        grid: occupied cells.
-        starts, ends: (k, 3) m, places of the sensor and of what it saw.
+        scan: occupied cells, with the rays and the free cells that its file knows.
+        navigable: the navigable volume.
+        range: m, how far views see.
 
     Returns:
-        None where the volume is too large to be carved.
+        Cells twice as long as those of the grid; None where the volume is too large to be carved.
     """
-    crossed = _volume(grid)
-    if crossed is None:
+    if scan.free is not None:
+        return scan.free
+    crossed_shape = tuple(-(-s // FREE_CELL) for s in scan.grid.shape)
+    if int(np.prod(crossed_shape, dtype=np.float64)) > LARGEST_VOLUME:
         return None
-    edge = grid.edge * COARSER
+    crossed = np.zeros(crossed_shape, bool)
+    if scan.rays is not None:
+        _carve_rays(scan.grid, *scan.rays, crossed)
+    else:
+        _carve_views(scan.grid, navigable, range, crossed)
+    crossed[tuple((scan.grid.cells // FREE_CELL).T)] = False
+    return VoxelGrid.from_cells(np.argwhere(crossed), scan.grid.origin, scan.grid.edge * FREE_CELL, crossed.shape)
+
+
+def _carve_rays(grid: VoxelGrid, starts: Array, ends: Array, crossed: Array) -> None:
+    """Mark the free cells that rays crossed, from (k, 3) places of the sensor to (k, 3) of what it saw, m."""
+    edge = grid.edge * FREE_CELL
     at, to = (np.ascontiguousarray((np.asarray(p, np.float64) - grid.origin) / edge) for p in (starts, ends))
-    carve(at, to, MARGIN, crossed)
-    return _free(grid, crossed)
+    carve(at, to, RAY_MARGIN, crossed)
 
 
-def carve_views(grid: VoxelGrid, navigable: VoxelGrid, height: float, reach: float) -> VoxelGrid | None:
-    """The same for a map whose sensor's places are unknown: what lies between a view above the floor and the first thing in each
-    direction. A direction in which nothing is seen tells nothing.
-
-    Args:
-        height: of the views above the floor, m.
-        reach: how far they see, m.
-    """
-    crossed = _volume(grid)
-    if crossed is None:
-        return None
-    rows = best_of_tiles(navigable, horizontal_distance_field(navigable), SPACING)
-    views = raise_views(grid, navigable.cells[rows], height, 0.3)
+def _carve_views(grid: VoxelGrid, navigable: VoxelGrid, reach: float, crossed: Array) -> None:
+    """Mark what lies between views above the floor and the first thing in each direction. A direction in which nothing is seen
+    tells nothing."""
+    views = views_of_tiles(grid, navigable, VIEW_SPACING)
     starts = np.ascontiguousarray((views - grid.origin) / grid.edge)
-    sweep(*grid._bricks, starts, _sphere(RAYS), reach / grid.edge, COARSER, crossed)
-    return _free(grid, crossed)
+    sweep(*grid._bricks, starts, _sphere(RAYS_OF_VIEW), reach / grid.edge, FREE_CELL, crossed)
 
 
-def _volume(grid: VoxelGrid) -> Array | None:
-    shape = tuple(-(-s // COARSER) for s in grid.shape)
-    return np.zeros(shape, bool) if int(np.prod(shape, dtype=np.float64)) <= LARGEST else None
+def views_of_tiles(grid: VoxelGrid, navigable: VoxelGrid, spacing: float) -> Array:
+    """(v, 3) m, one view for each `spacing` x `spacing` m tile and storey-high layer: where it is farthest from the boundary.
+
+    A regular net of views sees rooms evenly, whatever the shape of their medial axis. None ends up in a ceiling.
+    """
+    cells = navigable.cells[_best_of_tiles(navigable, horizontal_distance_field(navigable), spacing)]
+    start = int(np.ceil(1.0 / grid.edge))
+    limit = int(np.ceil((VIEW_HEIGHT + VIEW_CLEARANCE) / grid.edge)) + 1
+    above = first_occupied(*grid._bricks, cells.astype(np.int64), start, 1, limit)
+    views = grid.centroids(cells)
+    views[:, 2] += np.where(above > 0, np.minimum(VIEW_HEIGHT, above * grid.edge - VIEW_CLEARANCE), VIEW_HEIGHT)
+    return views
 
 
-def _free(grid: VoxelGrid, crossed: Array) -> VoxelGrid:
-    crossed[tuple((grid.cells // COARSER).T)] = False
-    return VoxelGrid.from_cells(np.argwhere(crossed), grid.origin, grid.edge * COARSER, crossed.shape)
+def _best_of_tiles(grid: VoxelGrid, distance: Array, spacing: float) -> Array:
+    """Ascending rows of the cell of each tile with the largest distance."""
+    size = max(round(spacing / grid.edge), 1)
+    layer = max(round(2.0 / grid.edge), 1)
+    tile = grid.cells // (size, size, layer)
+    order = np.lexsort((grid.cells[:, 2], -np.asarray(distance), tile[:, 2], tile[:, 1], tile[:, 0]))
+    sorted_tiles = tile[order]
+    first = np.ones(len(order), bool)
+    first[1:] = (sorted_tiles[1:] != sorted_tiles[:-1]).any(axis=1)
+    return np.sort(order[first])
 
 
 def _sphere(count: int) -> Array:

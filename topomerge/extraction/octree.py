@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from topomerge.kernels import morton, octree
 from topomerge.types import VoxelGrid
 
 Array = NDArray[Any]
-SLACK = 1e-6  # cells: a cell that lies exactly at the radius counts, whatever the last bit of its distance says
+RADIUS_SLACK = 1e-6  # cells: a cell that lies exactly at the radius counts, whatever the last bit of its distance says
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,14 +20,15 @@ class SparseVoxelOctree:
     """The octree of a grid: its Morton order in buckets of 8 codes, those again, until one is left: the root (seeds 2.2.1).
 
     A query goes down from the root, leaves out octants outside and takes those inside whole: an octant is a range of rows.
-    Rows come out in ascending order.
+    Rows come out in ascending order. The thesis' views ask it: for the neighbours of a cell of the distance field within a
+    radius (seeds 2.4.1) and for the cells in range of a view (seeds 2.5).
     """
 
     grid: VoxelGrid
+    _nodes: octree.Nodes = field(init=False)
 
-    @cached_property
-    def _nodes(self) -> octree.Nodes:
-        return octree.build(self.grid.cells, self.grid.codes)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_nodes", octree.build(self.grid.cells, self.grid.codes))
 
     @property
     def depth(self) -> int:
@@ -57,7 +57,7 @@ class SparseVoxelOctree:
         return self.radius_many(centre[None], r)[1]
 
     def radius_many(self, centres: Array, r: float) -> tuple[Array, Array]:
-        """Radius queries around many centres at once, on all cores.
+        """Radius queries around many centres at once, on all cores; up to 64 stay on the core that asks.
 
         Args:
             centres: (q, 3); integers are cells, of which the centroid is meant, floats are points in metres.
@@ -78,7 +78,7 @@ class SparseVoxelOctree:
         if not np.issubdtype(centres.dtype, np.integer):
             centres = (centres.astype(np.float64) - self.grid.origin) / self.grid.edge - 0.5
         in_cells, table = np.ascontiguousarray(centres, np.float64), self.grid._bricks[0]
-        return octree.in_balls(self.grid.cells, self._nodes, table, in_cells, r / self.grid.edge + SLACK)
+        return octree.in_balls(self.grid.cells, self._nodes, table, in_cells, r / self.grid.edge + RADIUS_SLACK)
 
     def level_of_detail(self, k: int) -> VoxelGrid:
         """The grid k levels up, edge * 2**k, with the property ``count``: occupied cells in each octant; k in 0..21.

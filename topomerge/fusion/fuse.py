@@ -20,7 +20,9 @@ from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.extraction.convolution import convolve, moore
-from topomerge.extraction.extract import COARSEST, FINEST, PRESETS, extract
+from topomerge.extraction.extract import extract
+from topomerge.extraction.parameters import PRESETS
+from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.storey_levels import extruded
 from topomerge.kernels import morton
 from topomerge.matching.consistency import matches_under, storey_map
@@ -92,7 +94,7 @@ def _edge(parts: Sequence[_Part]) -> float:
     for part in parts:
         if not part.assumed and part.edge < ALIKE_EDGES * edge:
             edge = part.edge
-    return float(np.clip(edge, FINEST, COARSEST))
+    return float(np.clip(edge, FINEST_CELL, COARSEST_CELL))
 
 
 class _JoinedCells:

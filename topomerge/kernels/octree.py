@@ -174,7 +174,7 @@ def _in_ball(cells, child, span, box, centre, square, top, stack, out, fill):  #
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _task(tree, centres, reach, indptr, out, fill, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     cells, child, span, box, table, first_brick = tree
     root, stack = len(cells) + len(span) - 1, np.empty(DEPTH, np.int64)

@@ -14,18 +14,12 @@ FAR = 255  # the distance field is a byte
 
 
 @njit(cache=True, nogil=True)
-def distance_field(bricks, starts, cells, low, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(size) uint8 Chebyshev distance, in cells, to the nearest occupied cell of the window at `low`; at most 255.
-
-    `bricks` are those that may reach into the window; the rows of brick b are starts[b] .. starts[b + 1] - 1.
-    """
+def distance_field(cells, low, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(size) uint8 Chebyshev distance, in cells, to the nearest of (n, 3) occupied cells of the window at `low`; at most 255."""
     sx, sy, sz = size
     field = np.full((sx + 2, sy + 2, sz + 2), FAR, np.uint8)  # a border of one cell spares the tests for the edge
-    for b in bricks:
-        for i in range(starts[b], starts[b + 1]):
-            x, y, z = cells[i, 0] - low[0], cells[i, 1] - low[1], cells[i, 2] - low[2]
-            if 0 <= x < sx and 0 <= y < sy and 0 <= z < sz:
-                field[x + 1, y + 1, z + 1] = 0
+    for i in range(len(cells)):
+        field[cells[i, 0] - low[0] + 1, cells[i, 1] - low[1] + 1, cells[i, 2] - low[2] + 1] = 0
     for x in range(1, sx + 1):
         for y in range(1, sy + 1):
             for z in range(1, sz + 1):
@@ -50,11 +44,8 @@ def distance_field(bricks, starts, cells, low, size):  # type: ignore[no-untyped
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def reaches(field, ox, oy, oz, tx, ty, tz, tolerance):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Does the ray from (ox, oy, oz) meet no occupied cell before cell (tx, ty, tz)? Coordinates in cells of the window.
-
-    Occupied cells that the ray enters at most `tolerance` cells (along its main axis) before the target's centre don't count.
-    """
+def reaches(field, ox, oy, oz, tx, ty, tz):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Does the ray from (ox, oy, oz) meet no occupied cell before cell (tx, ty, tz)? Coordinates in cells of the window."""
     dx, dy, dz = tx + 0.5 - ox, ty + 0.5 - oy, tz + 0.5 - oz
     length = max(abs(dx), abs(dy), abs(dz))
     x, y, z = int(np.floor(ox)), int(np.floor(oy)), int(np.floor(oz))
@@ -66,14 +57,13 @@ def reaches(field, ox, oy, oz, tx, ty, tz, tolerance):  # type: ignore[no-untype
     px, py, pz = (1 if dx > 0 else 0), (1 if dy > 0 else 0), (1 if dz > 0 else 0)
     nx, ny, nz = abs(x + px - ox) * ix, abs(y + py - oy) * iy, abs(z + pz - oz) * iz
     s = 0.0
-    stop = length - tolerance
     near = field[x, y, z]
     if near == 0:
         near = 1  # the view itself may stand in an occupied cell
     while True:
         if near > 3:
             s += near - 1
-            if s >= stop:
+            if s >= length:
                 return True
             x, y, z = int(np.floor(ox + s * dx)), int(np.floor(oy + s * dy)), int(np.floor(oz + s * dz))
             nx, ny, nz = abs(x + px - ox) * ix, abs(y + py - oy) * iy, abs(z + pz - oz) * iz
@@ -89,7 +79,7 @@ def reaches(field, ox, oy, oz, tx, ty, tz, tolerance):  # type: ignore[no-untype
             s = nz
             nz += iz
             z += sz
-        if s >= stop or (x == tx and y == ty and z == tz):
+        if s >= length or (x == tx and y == ty and z == tz):
             return True
         near = field[x, y, z]
         if near == 0:
@@ -97,29 +87,28 @@ def reaches(field, ox, oy, oz, tx, ty, tz, tolerance):  # type: ignore[no-untype
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cast(field, low, views, radius, tolerance, cells, starts, table, indptr, words, masks):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def cast(field, low, views, radius, cells, near, rows, indptr, words, masks):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Seen rows of each view as words of 64 rows: word numbers and bit masks, from indptr[v] on; returns their count a view.
 
-    `views` are in cells of the whole grid, `field` covers a window at `low`; indptr must leave room for every word in range.
+    `views` are in cells of the whole grid, `field` covers a window at `low`; rows[near[v] : near[v + 1]] are ascending and hold
+    all cells in range of view v; indptr must leave room for their words.
     """
     counts = np.zeros(len(views), np.int64)
     for v in range(len(views)):
-        found = bricks_in_range(table, views[v], radius)
         ox, oy, oz = views[v, 0] - low[0], views[v, 1] - low[1], views[v, 2] - low[2]
         at = indptr[v]
         word, mask = np.int64(-1), np.uint64(0)
-        for b in found:
-            for i in range(starts[b], starts[b + 1]):
-                tx, ty, tz = cells[i, 0] - low[0], cells[i, 1] - low[1], cells[i, 2] - low[2]
-                if (tx + 0.5 - ox) ** 2 + (ty + 0.5 - oy) ** 2 + (tz + 0.5 - oz) ** 2 > radius * radius:
-                    continue
-                if reaches(field, ox, oy, oz, tx, ty, tz, tolerance):
-                    if i >> 6 != word:
-                        if mask != 0:
-                            words[at], masks[at] = word, mask
-                            at += 1
-                        word, mask = i >> 6, np.uint64(0)
-                    mask |= np.uint64(1) << np.uint64(i & 63)
+        for i in rows[near[v] : near[v + 1]]:
+            tx, ty, tz = cells[i, 0] - low[0], cells[i, 1] - low[1], cells[i, 2] - low[2]
+            if (tx + 0.5 - ox) ** 2 + (ty + 0.5 - oy) ** 2 + (tz + 0.5 - oz) ** 2 > radius * radius:
+                continue
+            if reaches(field, ox, oy, oz, tx, ty, tz):
+                if i >> 6 != word:
+                    if mask != 0:
+                        words[at], masks[at] = word, mask
+                        at += 1
+                    word, mask = i >> 6, np.uint64(0)
+                mask |= np.uint64(1) << np.uint64(i & 63)
         if mask != 0:
             words[at], masks[at] = word, mask
             at += 1
@@ -128,33 +117,11 @@ def cast(field, low, views, radius, tolerance, cells, starts, table, indptr, wor
 
 
 @njit(cache=True, nogil=True)
-def bricks_in_range(table, view, radius):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Ascending numbers of the bricks that reach within `radius` cells of a view."""
-    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
-    for a in range(3):
-        low[a] = max(np.int64(np.floor((view[a] - radius) / 8)), 0)
-        high[a] = min(np.int64(np.floor((view[a] + radius) / 8)) + 1, table.shape[a])
-    found = np.empty(max(high[0] - low[0], 0) * max(high[1] - low[1], 0) * max(high[2] - low[2], 0), np.int64)
-    n = 0
-    for x in range(low[0], high[0]):
-        gx = max(8 * x - view[0], view[0] - 8 * (x + 1), 0.0)
-        for y in range(low[1], high[1]):
-            gy = max(8 * y - view[1], view[1] - 8 * (y + 1), 0.0)
-            for z in range(low[2], high[2]):
-                gz = max(8 * z - view[2], view[2] - 8 * (z + 1), 0.0)
-                if table[x, y, z] >= 0 and gx * gx + gy * gy + gz * gz <= radius * radius:
-                    found[n] = table[x, y, z]
-                    n += 1
-    return np.sort(found[:n])
-
-
-@njit(cache=True, nogil=True)
-def room_for_words(views, radius, starts, table):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """(v,) how many words of 64 rows each view may touch."""
-    room = np.zeros(len(views), np.int64)
-    for v in range(len(views)):
-        total = np.int64(0)
-        for b in bricks_in_range(table, views[v], radius):
-            total += ((starts[b + 1] - 1) >> 6) - (starts[b] >> 6) + 1
-        room[v] = total
-    return room
+def words_of(near, rows):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(v,) in how many words of 64 rows the ascending rows[near[v] : near[v + 1]] lie."""
+    count = np.zeros(len(near) - 1, np.int64)
+    for v in range(len(count)):
+        for k in range(near[v], near[v + 1]):
+            if k == near[v] or rows[k] >> 6 != rows[k - 1] >> 6:
+                count[v] += 1
+    return count

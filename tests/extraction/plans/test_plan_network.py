@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
+from topomerge.extraction.classified_storey import COLUMN_CLASSES, ClassifiedStorey, leads_through_wall
 from topomerge.extraction.plans.plan import BELOW, profile_bands
 from topomerge.extraction.plans.plan_network import (
-    CHANNELS,
-    CLASSES,
-    Told,
+    EVIDENCE_CHANNELS,
+    column_probabilities,
     evidence,
     forward,
     read_weights,
-    segment,
-    through_wall,
     weights,
     without_furniture,
 )
@@ -54,63 +52,65 @@ def test_numpy_as_torch() -> None:
     torch.manual_seed(0)
     net = network()
     net.train()
-    net(torch.rand(4, CHANNELS, 64, 64))  # gives the normalisation something to know
+    net(torch.rand(4, EVIDENCE_CHANNELS, 64, 64))  # gives the normalisation something to know
     net.eval()
-    x = np.random.default_rng(0).random((80, 144, CHANNELS)).astype(np.float32)
+    x = np.random.default_rng(0).random((80, 144, EVIDENCE_CHANNELS)).astype(np.float32)
     with torch.no_grad():
         wanted = net(torch.from_numpy(x.transpose(2, 0, 1)[None].copy()))[0].numpy().transpose(1, 2, 0)
     assert np.abs(forward(x, exported(net)) - wanted).max() < 1e-4
 
 
 def test_what_it_sees(two_rooms: StoreyPlan) -> None:
-    chance = segment(two_rooms)
-    assert chance.shape == (106, 46, len(CLASSES)) and np.allclose(chance.sum(axis=-1), 1, atol=1e-5)
-    answer = chance.argmax(axis=-1)
-    assert (answer[5:50, 5:41] == CLASSES.index("inside")).mean() > 0.95
-    boundary = chance[..., 1:4].sum(axis=-1)  # a wall, or a door that is shut
+    probability = column_probabilities(two_rooms)
+    assert probability.shape == (106, 46, len(COLUMN_CLASSES)) and np.allclose(probability.sum(axis=-1), 1, atol=1e-5)
+    answer = probability.argmax(axis=-1)
+    assert (answer[5:50, 5:41] == COLUMN_CLASSES.index("inside")).mean() > 0.95
+    boundary = probability[..., 1:4].sum(axis=-1)  # a wall, or a door that is shut
     assert boundary[52:54, 5:15].max(axis=0).min() > 0.4 > boundary[20:40, 10:35].max()
-    assert chance[52:54, 20:25, CLASSES.index("doorway")].mean() > 0.5
+    assert probability[52:54, 20:25, COLUMN_CLASSES.index("doorway")].mean() > 0.5
 
 
 def test_furniture_is_no_wall(two_rooms: StoreyPlan) -> None:
-    plan = without_furniture(two_rooms, segment(two_rooms))
+    plan = without_furniture(two_rooms, column_probabilities(two_rooms))
     assert not plan.wall[65:90, 10:30].any() and plan.inside[65:90, 10:30].all()
     assert plan.wall[52:54, 5:15].any(axis=0).all() and not (plan.wall & plan.inside).any()
 
 
 def test_through_a_wall(two_rooms: StoreyPlan) -> None:
-    told = [Told(segment(two_rooms), np.zeros(2), 0.1, 0.0), Told(np.zeros((106, 46, 5)), np.zeros(2), 0.1, 3.0)]
-    assert not through_wall(told, np.array([5.3, 2.25, 0.1])) and not through_wall(told, np.array([2.5, 2.0, 0.0]))
-    assert through_wall(told, np.array([5.3, 0.8, 0.1])) and not through_wall(told, np.array([5.3, 0.8, 2.9]))
-    assert not through_wall(told, np.array([50.0, -20.0, 0.0])) and not through_wall([], np.zeros(3))
+    drawn_storey = ClassifiedStorey(column_probabilities(two_rooms), np.zeros(2), 0.1, 0.0)
+    storeys = [drawn_storey, ClassifiedStorey(np.zeros((106, 46, 5)), np.zeros(2), 0.1, 3.0)]
+    assert not leads_through_wall(storeys, np.array([5.3, 2.25, 0.1]))
+    assert not leads_through_wall(storeys, np.array([2.5, 2.0, 0.0]))
+    assert leads_through_wall(storeys, np.array([5.3, 0.8, 0.1])) and not leads_through_wall(storeys, np.array([5.3, 0.8, 2.9]))
+    assert not leads_through_wall(storeys, np.array([50.0, -20.0, 0.0])) and not leads_through_wall([], np.zeros(3))
 
 
 @pytest.mark.parametrize("turn", [1, 2, 3])
 def test_turned_and_shifted(two_rooms: StoreyPlan, turn: int) -> None:
-    """A plan that is turned, mirrored and shifted by a few columns is told alike."""
+    """A plan that is turned, mirrored and shifted by a few columns is classified alike."""
     wall = np.pad(two_rooms.wall, ((turn, 7), (3, turn)))
-    there = segment(drawn(np.rot90(wall, turn)[::-1])).argmax(axis=-1)[::-1]
+    there = column_probabilities(drawn(np.rot90(wall, turn)[::-1])).argmax(axis=-1)[::-1]
     back = np.rot90(there, -turn)[turn : turn + 106, 3 : 3 + 46]
-    same = back == segment(two_rooms).argmax(axis=-1)
+    same = back == column_probabilities(two_rooms).argmax(axis=-1)
     assert same[4:-4, 4:-4].mean() > 0.97
 
 
 def test_evidence(two_rooms: StoreyPlan) -> None:
     x = evidence(two_rooms)
-    assert x.shape == (106, 46, CHANNELS) and x.dtype == np.float32 and np.isfinite(x).all()
+    assert x.shape == (106, 46, EVIDENCE_CHANNELS) and x.dtype == np.float32 and np.isfinite(x).all()
     assert x[52, 5].tolist() == pytest.approx([0, 1, 1, 1, 1, 1, 1, 0, 1, -0.6, 0.5])
     assert x[20, 20].tolist() == pytest.approx([1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0.5])
 
 
 def test_damaged_weights(tmp_path: Path) -> None:
-    known = dict(weights())
-    for change in ({"a1.w": known["a1.w"][:-9]}, {"h1.b": known["h1.b"][:-1]}, {"out.b": known["out.b"] * np.nan}):
+    shipped = dict(weights())
+    for change in ({"a1.w": shipped["a1.w"][:-9]}, {"h1.b": shipped["h1.b"][:-1]}, {"out.b": shipped["out.b"] * np.nan}):
         path = tmp_path / "other.npz"
-        np.savez(path, **{**known, **change})
+        np.savez(path, **{**shipped, **change})
         read_weights.cache_clear()
         with pytest.raises(InputError, match=r"other\.npz"):
             read_weights(path)
-    np.savez(path, **{k: v for k, v in known.items() if k != "e1.w"})
+    np.savez(path, **{k: v for k, v in shipped.items() if k != "e1.w"})
     with pytest.raises(InputError, match="e1"):
         read_weights(path)
     whole = path.read_bytes()
@@ -118,6 +118,6 @@ def test_damaged_weights(tmp_path: Path) -> None:
         path.write_bytes(broken)
         with pytest.raises(InputError):
             read_weights(path)
-    np.savez(path, **{**known, "a1.w": np.array([{"no": 1}], object)})
+    np.savez(path, **{**shipped, "a1.w": np.array([{"no": 1}], object)})
     with pytest.raises(InputError):
         read_weights(path)

@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 
 from tests import scenes
-from topomerge.extraction.assumed import has_floor, is_slice
-from topomerge.extraction.extract import PRESETS, extract, navigable_volume
+from topomerge.extraction.assumed_floor import has_floor
+from topomerge.extraction.extract import extract
+from topomerge.extraction.navigable import navigable_volume
+from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.partition import merge_regions
-from topomerge.extraction.plans.passages import FEATURES, clearance_of, features, find_passages, regions_of
+from topomerge.extraction.plans.passages import DOOR_FEATURES, clearance_of, door_features, find_passages, regions_of
 from topomerge.extraction.plans.plan import storey_plan
-from topomerge.extraction.plans.plan_network import segment
-from topomerge.extraction.plans.plan_rooms import _floor, _upper_side
+from topomerge.extraction.plans.plan_network import column_probabilities
+from topomerge.extraction.plans.plan_rooms import _is_upper_side
+from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, joined_floor
+from topomerge.extraction.scan import Scan
+from topomerge.extraction.slices import is_slice
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
 from topomerge.types import STOREY_DTYPE, Array, PointCloud, TopometricMap, VoxelGrid
@@ -111,12 +116,13 @@ def test_a_slice_gets_walls_and_a_floor(corridor: Array, poses: bool) -> None:
 def test_the_upper_half_gets_a_floor(corridor: Array) -> None:
     upper = corridor[corridor[:, 2] > 1.0]
     grid = voxelise(upper, 0.1, [])
-    assert not has_floor(grid, navigable_volume(grid, PRESETS["default"]), 1.75)
+    _, navigable = navigable_volume(Scan(grid), DefaultParameters(assume=False))
+    assert not has_floor(grid, navigable, 1.75)
     result = extract(upper)
     assert any("no floor was seen" in w for w in result.warnings)
     is_the_corridor(result, float(result.storeys["floor"][0]))
     whole = voxelise(corridor, 0.1, [])
-    assert has_floor(whole, navigable_volume(whole, PRESETS["default"]), 1.75)
+    assert has_floor(whole, navigable_volume(Scan(whole), PRESETS["default"])[1], 1.75)
 
 
 def test_turning_shuffling_and_other_cells_change_little(corridor: Array) -> None:
@@ -165,24 +171,24 @@ def test_the_upper_side_of_a_ceiling_is_no_storey() -> None:
 
 def test_passages_measure_the_door() -> None:
     grid = voxelise(scenes.two_rooms().points(0.005), 0.1, [])
-    navigable = navigable_volume(grid, PRESETS["default"])
+    _, navigable = navigable_volume(Scan(grid), PRESETS["default"])
     _, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, 1.75))
     plan = storey_plan(grid, navigable, storey, 0)
     clearance = clearance_of(plan)
-    chance = segment(plan)
-    region = regions_of(plan, chance)
-    found = find_passages(plan, clearance, region, chance)
+    probability = column_probabilities(plan)
+    region = regions_of(plan, probability)
+    passages = find_passages(plan, clearance, region, probability)
     x = plan.origin[0] + 0.5 * grid.edge
-    at_the_door = [p for p in found.values() if abs(x + p.place[0] * grid.edge - 4.0) < 0.3]
+    at_the_door = [p for p in passages.values() if abs(x + p.place[0] * grid.edge - 4.0) < 0.3]
     assert len(at_the_door) == 1
-    values = dict(zip(FEATURES, features(at_the_door[0], (2.0, 1.5), (20.0, 15.0)), strict=True))
+    values = dict(zip(DOOR_FEATURES, door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0)), strict=True))
     assert values["width"] == pytest.approx(scenes.DOOR[0], abs=0.25)
     assert values["lintel"] == pytest.approx(scenes.HEIGHT - scenes.DOOR[1], abs=0.15) and values["lintel_cover"] > 0.8
     assert values["jamb"] > 0.8 and values["opens"] > 1.0 and values["length"] < 0.5
-    assert door_probability(features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
-    parted = merge_regions(region, clearance, found, plan.edge, door_probability, 0.5, 0.2, 0.8)
-    never = merge_regions(region, clearance, found, plan.edge, lambda x: np.zeros(len(x)), 0.5, 0.2, 0.8)
-    always = merge_regions(region, clearance, found, plan.edge, lambda x: np.ones(len(x)), 0.5, 0.2, 0.0)
+    assert door_probability(door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
+    parted = merge_regions(region, clearance, passages, plan.edge, door_probability, 0.5, 0.2, 0.8)
+    never = merge_regions(region, clearance, passages, plan.edge, lambda x: np.zeros(len(x)), 0.5, 0.2, 0.8)
+    always = merge_regions(region, clearance, passages, plan.edge, lambda x: np.ones(len(x)), 0.5, 0.2, 0.0)
     sizes = np.bincount(region[region >= 0])
     assert len(np.unique(parted.room[sizes * 0.01 > 1])) == 2
     assert len(np.unique(never.room)) == 1 and len(np.unique(always.room)) == len(sizes)
@@ -190,11 +196,11 @@ def test_passages_measure_the_door() -> None:
 
 def test_what_nothing_is_above_at_the_height_of_a_ceiling_is_no_storey() -> None:
     levels = np.array([(0.0, 2.6, 90.0), (2.5, np.nan, 20.0)], STOREY_DTYPE)
-    assert _upper_side(levels[1], levels[:1])
+    assert _is_upper_side(levels[1], levels[:1])
     for floor, ceiling in ((2.9, np.nan), (2.5, 5.1)):  # a slab above it; something above it
         levels[1] = (floor, ceiling, 20.0)
-        assert not _upper_side(levels[1], levels[:1])
-    assert not _upper_side(levels[0], levels[:0])
+        assert not _is_upper_side(levels[1], levels[:1])
+    assert not _is_upper_side(levels[0], levels[:0])
 
 
 def test_a_storey_without_a_room_of_its_own_is_none() -> None:
@@ -203,10 +209,9 @@ def test_a_storey_without_a_room_of_its_own_is_none() -> None:
     stray = floor[-3:] + (1, 0, 0)
     grid = VoxelGrid.from_cells(np.concatenate([floor, stray]), np.zeros(3), 0.1, (21, 20, 2))
     storeys = np.array([(0.05, 0.35, 0.0), (0.15, np.nan, 0.0)], STOREY_DTYPE)
-    parts = [
-        (cells, np.ones(len(cells), bool), np.full(len(cells), k), np.full(len(cells), -k), np.full(len(cells), -k))
-        for k, cells in enumerate((floor, stray))
-    ]
-    found = _floor(grid, storeys, parts, [np.zeros(1, np.int32)], np.full(len(grid), -1, np.int32), {})
-    assert len(found.storeys) == 1 and found.storeys["area"][0] == pytest.approx(4.0, abs=0.05)
-    assert (found.storey == 0).all() and (found.room == 0).all()
+    cells = np.concatenate([floor, stray])
+    number = np.repeat([0, 1], [len(floor), len(stray)])  # of the storey; the stray cells have no room
+    tables = dict(zip(FLOOR_PROPERTIES, (np.ones(len(cells), bool), number, -number, -number), strict=True))
+    _, used, of_cell = joined_floor(grid, storeys, cells, tables)
+    assert len(used) == 1 and used["area"][0] == pytest.approx(4.0, abs=0.05)
+    assert (of_cell["storey"] == 0).all() and (of_cell["room"] == 0).all()

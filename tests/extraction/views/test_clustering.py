@@ -7,9 +7,11 @@ import pytest
 from scipy import sparse
 
 from topomerge.extraction.convolution import sphere
-from topomerge.extraction.rooms import navigable_floor, split_rooms
+from topomerge.extraction.parameters import ThesisParameters
 from topomerge.extraction.views.clustering import cluster_views, markov_clusters, modularity
+from topomerge.extraction.views.navigable_floor import navigable_floor
 from topomerge.extraction.views.propagation import propagate_labels
+from topomerge.extraction.views.room_pieces import split_rooms
 from topomerge.types import VoxelGrid
 
 
@@ -57,7 +59,7 @@ def test_order_of_nodes_does_not_matter():
 
 def test_nodes_without_neighbours_stay_alone():
     assert markov_clusters(sparse.csr_array(np.eye(4)), 1.5).tolist() == [0, 1, 2, 3]
-    assert cluster_views(sparse.csr_array((0, 0)))[0].tolist() == []
+    assert cluster_views(sparse.csr_array((0, 0)), (1.5,))[0].tolist() == []
 
 
 def test_stored_zeros_are_no_neighbours():
@@ -91,7 +93,7 @@ def test_modularity_is_its_definition():
 
 def test_inflation_of_highest_modularity():
     similarity, truth = planted(sizes=(9, 9, 9, 9))
-    cluster, inflation = cluster_views(similarity)
+    cluster, inflation = cluster_views(similarity, ThesisParameters().inflations)
     assert same_partition(cluster, truth) and 1.2 <= inflation <= 2.5
 
 
@@ -119,8 +121,6 @@ def test_rooms_are_connected_pieces_of_enough_volume():
     room = split_rooms(grid, label, 0.1)
     assert sorted(np.bincount(room[room >= 0]).tolist()) == [120, 160]
     assert (room[label == 1] == -1).all()
-    absorbed = split_rooms(grid, label, 0.1, absorb=True)
-    assert (absorbed >= 0).all() and absorbed.max() == 1
 
 
 def test_navigable_cells_take_the_nearest_room():

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.extraction.plans.passages import FEATURES
+from topomerge.extraction.plans.passages import DOOR_FEATURES
 from topomerge.io.weight_files import weights_file
 from topomerge.numpy_nn import perceptron, sigmoid
 from topomerge.types import Array
 
-FILE = "door_classifier.json"
+DOOR_CLASSIFIER_FILE = "door_classifier.json"
 
 
 def door_probability(x: Array) -> Array:
     """(n,) probability that a door parts the two sides of each narrowing, from its (n, 17) features."""
-    weights = read_classifier(weights_file("topomerge.extraction.plans", FILE))
+    weights = read_classifier(weights_file("topomerge.extraction.plans", DOOR_CLASSIFIER_FILE))
     h = (np.clip(x, weights["low"], weights["high"]) - weights["mean"]) / weights["scale"]
     return sigmoid(perceptron(h, weights["layers"])[:, 0])
 
@@ -45,6 +45,6 @@ def read_classifier(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split())[:100]
         raise InputError(f"{path}: is no door classifier ({reason}); install topomerge again") from error
-    if tuple(values["features"]) != FEATURES:
+    if tuple(values["features"]) != DOOR_FEATURES:
         raise InputError(f"{path}: was trained with other features: run train.py task=door_classification export=package")
     return {**arrays, "layers": layers}

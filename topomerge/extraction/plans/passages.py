@@ -1,28 +1,30 @@
 """Where two regions of a storey meet, and what speaks for a door there (beyond the thesis: findings.md, "What worked").
 
-The regions are the basins of a watershed of the clearance: they part at every narrowing. Whether a narrowing is a door is judged
-by its width, what is on both sides of it, what is above it and how the walls beside it stand.
+The regions are the basins of a watershed of the clearance: they part at every narrowing. Its width, what is on both sides of
+it, what is above it and how the walls beside it stand tell whether it is a door (`door_classifier`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import edt
 import numpy as np
 from scipy import ndimage
 
+from topomerge.extraction.classified_storey import DOORWAY, SHUT, WALL
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.kernels import crossing
 from topomerge.kernels.watershed import contacts, watershed
 from topomerge.types import Array
 
-PROMINENCE = 0.1  # m: lower peaks of the clearance are noise of the walls
-AROUND = 1.2  # m: what lies so near to a narrowing is looked at
-LINTEL = 0.2  # m below the ceiling
-BARRIER = 0.5  # probability of a wall, a doorway or a shut door: what is more likely one parts regions
+PEAK_PROMINENCE = 0.1  # m: lower peaks of the clearance are noise of the walls
+LINTEL_REACH = 1.2  # m: what lies so near to a narrowing is looked at
+LINTEL_DROP = 0.2  # m below the ceiling
+BARRIER_CHANCE = 0.5  # probability of a wall, a doorway or a shut door: what is more likely one parts regions
 
-FEATURES = (
+DOOR_FEATURES = (
     "width",  # m, at the narrowest
     "share",  # of the narrower side's greatest width
     "wider",  # of the wider side's
@@ -36,7 +38,7 @@ FEATURES = (
     "step",  # m between the two ceilings
     "jamb",  # m by which the wall goes on in line with the narrowing, on the shorter side, up to 1
     "longer_jamb",
-    "doorway",  # probability of a doorway along the opening, by the network of the plans (segment.py)
+    "doorway",  # probability of a doorway along the opening (`plan_network`)
     "boundary",  # of a wall, a doorway or a shut door
     "small",  # log of the smaller side's area, m2
     "large",
@@ -58,31 +60,33 @@ def clearance_of(plan: StoreyPlan) -> Array:
     return np.asarray(edt.edt(plan.inside.view(np.uint8), black_border=True, parallel=1), np.float64) * plan.edge
 
 
-def regions_of(plan: StoreyPlan, chance: Array) -> Array:
+def regions_of(plan: StoreyPlan, probability: Array) -> Array:
     """(nx, ny) int64 basin of each open column, -1 elsewhere.
 
     What the network takes for a wall or a doorway parts basins as walls do: openings as wide as the room have no narrowing, and
     sparse scans have holes in their walls. Its columns then go to the nearest basin.
 
     Args:
-        chance: (nx, ny, 5) what probably stands in each column, see `segment.CLASSES`.
+        probability: (nx, ny, 5) what probably stands in each column, see `COLUMN_CLASSES`.
     """
-    barrier = plan.inside & (chance[..., 1:4].sum(axis=-1) > BARRIER)
+    barrier = plan.inside & (probability[..., WALL : SHUT + 1].sum(axis=-1) > BARRIER_CHANCE)
     clearance = edt.edt((plan.inside & ~barrier).view(np.uint8), black_border=True, parallel=1) * plan.edge
     order = np.argsort(-clearance, axis=None, kind="stable")
     order = order[clearance.ravel()[order] > 0]
-    region = np.asarray(watershed(np.asarray(clearance, np.float64), order, PROMINENCE))
+    region = np.asarray(watershed(np.asarray(clearance, np.float64), order, PEAK_PROMINENCE))
     if not barrier.any() or not (region >= 0).any():
         return region
     nearest = ndimage.distance_transform_edt(region < 0, return_distances=False, return_indices=True)
     return np.where(barrier, region[tuple(nearest)], region)
 
 
-def find_passages(plan: StoreyPlan, clearance: Array, region: Array, chance: Array) -> dict[tuple[int, int], Passage]:
+def find_passages(plan: StoreyPlan, clearance: Array, region: Array, probability: Array) -> dict[tuple[int, int], Passage]:
     """The widest connection of each pair of neighbouring regions.
 
     Args:
-        chance: (nx, ny, 5) what probably stands in each column, see `segment.CLASSES`.
+        clearance: (nx, ny) m, of each column to the next wall.
+        region: (nx, ny) of each column, -1 none.
+        probability: (nx, ny, 5) what probably stands in each column, see `COLUMN_CLASSES`.
     """
     meet = contacts(region, clearance)
     if not len(meet):
@@ -92,73 +96,76 @@ def find_passages(plan: StoreyPlan, clearance: Array, region: Array, chance: Arr
     meet = meet[order]
     first = np.ones(len(meet), bool)
     first[1:] = (meet[1:, :2] != meet[:-1, :2]).any(axis=1)
-    thick = ndimage.binary_dilation(plan.wall, np.ones((3, 3)))  # walls are not quite straight
-    nearest = ndimage.distance_transform_edt(plan.inside, return_distances=False, return_indices=True)
-    low = plan.clear < plan.ceiling - LINTEL  # nan: no
-    layers = low, np.ascontiguousarray(chance[..., 2]), chance[..., 1:4].sum(axis=-1)
-    return {
-        (int(a), int(b)): _passage(plan, clearance, region, nearest, thick, layers, int(a), int(b), int(at))
-        for a, b, at in meet[first]
-    }
+    measure = _Measure(plan, clearance, region, probability)
+    return {(int(a), int(b)): measure.passage(int(a), int(b), int(at)) for a, b, at in meet[first]}
 
 
-def _passage(
-    plan: StoreyPlan,
-    clearance: Array,
-    region: Array,
-    nearest: Array,
-    thick: Array,
-    layers: tuple[Array, Array, Array],
-    a: int,
-    b: int,
-    at: int,
-) -> Passage:
-    x, y = divmod(at, plan.wall.shape[1])
-    e, here = plan.edge, float(clearance[x, y])
-    wall = nearest[:, x, y] - (x, y)
-    dx, dy = (wall / max(float(np.hypot(*wall)), 1e-9)).tolist()
-    limit = 3.0 / e
-    ahead, behind = crossing.run(plan.inside, x, y, dx, dy, limit), crossing.run(plan.inside, x, y, -dx, -dy, limit)
-    mx, my, half = x + dx * (ahead - behind) / 2, y + dy * (ahead - behind) / 2, (ahead + behind) / 2
-    jambs = sorted(
-        crossing.run(thick, mx + s * (half + 1) * dx, my + s * (half + 1) * dy, s * dx, s * dy, 1.0 / e) * e for s in (1, -1)
-    )
-    steps = int(0.6 / e)
-    across = crossing.widths(plan.inside, mx, my, dx, dy, steps, limit) * e
-    narrow = max(float(across[steps]), e)
-    opens = sorted(max(float(side.max(initial=narrow)), narrow) - narrow for side in (across[:steps], across[steps + 1 :]))
-    length = float(((across > 0) & (across <= narrow + 0.15)).sum()) * e
-    lintel, seen, step, growth = _above(plan, clearance, region, a, b, x, y)
-    cover, doorway, boundary = (float(crossing.cover(v, mx, my, dx, dy, half, half, int(0.3 / e))) for v in layers)
-    width = min((2 * half + 1) * e, 2 * here + 2 * e)
-    return Passage((x, y), width, (dx, dy), (growth, *opens, length, lintel, cover, seen, step, *jambs, doorway, boundary))
+class _Measure:
+    """Measures passages of one plan."""
+
+    def __init__(self, plan: StoreyPlan, clearance: Array, region: Array, probability: Array) -> None:
+        self.plan, self.clearance, self.region = plan, clearance, region
+        self.thick_wall = ndimage.binary_dilation(plan.wall, np.ones((3, 3)))  # walls are not quite straight
+        self.nearest_wall = ndimage.distance_transform_edt(plan.inside, return_distances=False, return_indices=True)
+        low = plan.clear < plan.ceiling - LINTEL_DROP  # nan: no
+        doorway, boundary = np.ascontiguousarray(probability[..., DOORWAY]), probability[..., WALL : SHUT + 1].sum(axis=-1)
+        self.layers = low, doorway, boundary
+
+    def passage(self, a: int, b: int, at: int) -> Passage:
+        """The passage between two regions at a flat index of the plan."""
+        x, y = divmod(at, self.plan.wall.shape[1])
+        inside, e = self.plan.inside, self.plan.edge
+        wall = self.nearest_wall[:, x, y] - (x, y)
+        dx, dy = (wall / max(float(np.hypot(*wall)), 1e-9)).tolist()
+        limit = 3.0 / e
+        ahead, behind = crossing.run(inside, x, y, dx, dy, limit), crossing.run(inside, x, y, -dx, -dy, limit)
+        mx, my, half = x + dx * (ahead - behind) / 2, y + dy * (ahead - behind) / 2, (ahead + behind) / 2
+        jambs = sorted(
+            crossing.run(self.thick_wall, mx + s * (half + 1) * dx, my + s * (half + 1) * dy, s * dx, s * dy, 1.0 / e) * e
+            for s in (1, -1)
+        )
+        steps = int(0.6 / e)
+        across = crossing.widths(inside, mx, my, dx, dy, steps, limit) * e
+        narrow = max(float(across[steps]), e)
+        opens = sorted(max(float(side.max(initial=narrow)), narrow) - narrow for side in (across[:steps], across[steps + 1 :]))
+        length = float(((across > 0) & (across <= narrow + 0.15)).sum()) * e
+        lintel, seen, step, growth = self._above(a, b, x, y)
+        cover, doorway, boundary = (
+            float(crossing.cover(layer, mx, my, dx, dy, half, half, int(0.3 / e))) for layer in self.layers
+        )
+        width = min((2 * half + 1) * e, 2 * float(self.clearance[x, y]) + 2 * e)
+        return Passage((x, y), width, (dx, dy), (growth, *opens, length, lintel, cover, seen, step, *jambs, doorway, boundary))
+
+    def _above(self, a: int, b: int, x: int, y: int) -> tuple[float, float, float, float]:
+        """Depth of a lintel below both ceilings, was it seen, step between the ceilings, and growth of the clearance."""
+        plan, clearance = self.plan, self.clearance
+        reach = int(np.ceil(LINTEL_REACH / plan.edge))
+        box = slice(max(x - reach, 0), x + reach + 1), slice(max(y - reach, 0), y + reach + 1)
+        near, c, clear = self.region[box], clearance[box], plan.clear[box]
+        u, v = np.ogrid[: near.shape[0], : near.shape[1]]
+        distance = np.hypot(u - (x - box[0].start), v - (y - box[1].start)) * plan.edge
+        growth, ceilings = [], []
+        for side in (near == a, near == b):
+            growth.append(float(c[side & (distance <= 0.6)].max(initial=clearance[x, y])) - float(clearance[x, y]))
+            heights = clear[side & (distance > 0.4)]
+            heights = heights[~np.isnan(heights)]
+            ceilings.append(float(np.median(heights)) if len(heights) >= 5 else np.nan)
+        strip = clear[(distance <= 0.35) & (near >= 0)]
+        strip = strip[~np.isnan(strip)]
+        if len(strip) < 3 or np.isnan(sum(ceilings)):
+            return 0.0, 0.0, 0.0, min(growth)
+        # A lintel is as deep as the wall, a fifth of the window; single low points are none.
+        return min(ceilings) - float(np.quantile(strip, 0.2)), 1.0, abs(ceilings[0] - ceilings[1]), min(growth)
 
 
-def _above(
-    plan: StoreyPlan, clearance: Array, region: Array, a: int, b: int, x: int, y: int
-) -> tuple[float, float, float, float]:
-    """Depth of a lintel below both ceilings, was it seen, step between the ceilings, and growth of the clearance."""
-    reach = int(np.ceil(AROUND / plan.edge))
-    box = slice(max(x - reach, 0), x + reach + 1), slice(max(y - reach, 0), y + reach + 1)
-    near, c, clear = region[box], clearance[box], plan.clear[box]
-    u, v = np.ogrid[: near.shape[0], : near.shape[1]]
-    distance = np.hypot(u - (x - box[0].start), v - (y - box[1].start)) * plan.edge
-    growth, ceilings = [], []
-    for side in (near == a, near == b):
-        growth.append(float(c[side & (distance <= 0.6)].max(initial=clearance[x, y])) - float(clearance[x, y]))
-        heights = clear[side & (distance > 0.4)]
-        heights = heights[~np.isnan(heights)]
-        ceilings.append(float(np.median(heights)) if len(heights) >= 5 else np.nan)
-    strip = clear[(distance <= 0.35) & (near >= 0)]
-    strip = strip[~np.isnan(strip)]
-    if len(strip) < 3 or np.isnan(sum(ceilings)):
-        return 0.0, 0.0, 0.0, min(growth)
-    # A lintel is as deep as the wall, a fifth of the window; single low points are none.
-    return min(ceilings) - float(np.quantile(strip, 0.2)), 1.0, abs(ceilings[0] - ceilings[1]), min(growth)
+def door_features(passage: Passage, peaks: Sequence[float] | Array, areas: Sequence[float] | Array) -> Array:
+    """(17,) what speaks for a door, see `DOOR_FEATURES`.
 
-
-def features(passage: Passage, peaks: tuple[float, float], areas: tuple[float, float]) -> Array:
-    """(17,) what speaks for a door, see `FEATURES`; the sides are given by their greatest clearance (m) and their area (m2)."""
+    Args:
+        passage: between two sides.
+        peaks: m, the greatest clearance of each side.
+        areas: m2 of each.
+    """
     half = passage.width / 2
     sides = half / max(min(peaks), half), half / max(max(peaks), half)
     small, large = (float(np.log(max(a, 0.1))) for a in sorted(areas))

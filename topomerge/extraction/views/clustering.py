@@ -13,8 +13,6 @@ from scipy.sparse import csgraph
 from topomerge.kernels import mcl as kernel
 from topomerge.types import Array
 
-INFLATIONS = (1.2, 1.35, 1.5, 1.7, 1.9, 2.2, 2.5)
-
 
 def markov_clusters(
     similarity: sparse.csr_array, inflation: float, threshold: float = 1e-4, most: int = 64, rounds: int = 100
@@ -69,8 +67,13 @@ def modularity(similarity: sparse.csr_array, cluster: Array) -> float:
     return float(inside - (degree**2).sum())
 
 
-def cluster_views(similarity: sparse.csr_array, inflations: Sequence[float] = INFLATIONS) -> tuple[Array, float]:
-    """Clusters at the inflation of highest modularity, and that inflation; the smaller one of equals."""
+def cluster_views(similarity: sparse.csr_array, inflations: Sequence[float]) -> tuple[Array, float]:
+    """Clusters at the inflation of highest modularity, and that inflation; the smaller one of equals (seeds 2.6).
+
+    Args:
+        similarity: (V, V) symmetric, with ones on the diagonal.
+        inflations: that are tried, ascending; the seeds' range is 1.2 to 2.5.
+    """
     if not similarity.shape[0]:
         return np.zeros(0, np.int64), float(inflations[0])
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # the compiled step lets go of the interpreter

@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from topomerge.extraction.octree import SparseVoxelOctree
 from topomerge.kernels import raycast
 from topomerge.types import Array, VoxelGrid
 
-TILE = 10.0  # m: views of one tile share a distance field, tiles are shared among the cores
+VIEW_TILE = 10.0  # m: views of one tile share a distance field, tiles are shared among the cores
+VIEWS_AT_ONCE = 64  # whose cells in range are held at a time: some 20,000 each
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,67 +54,61 @@ class Visibility:
 
 
 def visible_cells(
-    grid: VoxelGrid,
-    views: Array,
-    radius: float,
-    tolerance: float = 0.0,
-    progress: Callable[[float, str], None] | None = None,
+    grid: VoxelGrid, views: Array, radius: float, progress: Callable[[float, str], None] | None = None
 ) -> Visibility:
     """Cast a ray from every view to the centroid of every occupied cell within `radius` m (seeds 2.5).
 
-    A cell is seen if the ray enters no other occupied cell before it. The cell that a view stands in never blocks.
+    A cell is seen if the ray enters no other occupied cell before it. The cell that a view stands in never blocks. The octree
+    finds the cells in range (seeds 2.2.1).
 
     Args:
         grid: occupied cells.
         views: (V, 3) positions, m.
         radius: range of the theoretical scanner, m.
-        tolerance: occupied cells entered at most this far (m, along the ray's main axis) before the target's centre don't
-            block it. A noisy wall is several cells thick: without this its far side is never seen.
         progress: called with the share done and a text.
     """
-    at = (np.asarray(views, np.float64).reshape(-1, 3) - grid.origin) / grid.edge
-    reach, slack = radius / grid.edge, tolerance / grid.edge
-    table = grid._bricks[0]
-    starts = np.concatenate([np.flatnonzero(np.diff(grid.codes >> np.uint64(9), prepend=~np.uint64(0))), [len(grid)]])
-    tile = np.floor(at / (TILE / grid.edge)).astype(np.int64)
-    tiles, of_view = np.unique(tile, axis=0, return_inverse=True)
-    of_view = of_view.ravel()
+    octree = SparseVoxelOctree(grid)
+    views = np.asarray(views, np.float64).reshape(-1, 3)
+    tile = np.floor((views - grid.origin) / grid.edge / (VIEW_TILE / grid.edge)).astype(np.int64)
+    tiles, tile_of = np.unique(tile, axis=0, return_inverse=True)
+    groups = [np.flatnonzero(tile_of.ravel() == t) for t in range(len(tiles))]
     parts: list[tuple[Array, Array, Array, Array]] = []
     done = 0
-    groups = [np.flatnonzero(of_view == t) for t in range(len(tiles))]
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # the compiled loops let go of the interpreter
-        cast = pool.map(lambda group: _cast_tile(grid.cells, table, starts, at[group], reach, slack), groups)
+        cast = pool.map(lambda group: _cast_tile(octree, views[group], radius), groups)
         for group, part in zip(groups, cast, strict=True):
             parts.append((group, *part))
             done += len(group)
             if progress is not None:
-                progress(done / len(at), "visibility")
-    return _joined(parts, len(at), len(grid))
+                progress(done / len(views), "visibility")
+    return _joined(parts, len(views), len(grid))
 
 
-def _cast_tile(cells: Array, table: Array, starts: Array, views: Array, reach: float, slack: float) -> tuple[Array, Array, Array]:
+def _cast_tile(octree: SparseVoxelOctree, views: Array, radius: float) -> tuple[Array, Array, Array]:
     """Counts a view, words and masks for the views of one tile."""
+    grid = octree.grid
+    at, reach = (views - grid.origin) / grid.edge, radius / grid.edge
     margin = int(np.ceil(reach)) + 1
-    view_cells = np.floor(views).astype(np.int64)
-    low = view_cells.min(axis=0) - margin
-    high = view_cells.max(axis=0) + margin + 1
-    middle = (low + high) / 2
-    found = raycast.bricks_in_range(table, middle, float(np.linalg.norm(high - low) / 2))
-    if len(found):
-        rows = np.concatenate([np.arange(starts[b], starts[b + 1]) for b in found])
-        near = cells[rows]
-        near = near[((near >= low) & (near < high)).all(axis=1)]
-        if len(near):  # the window need not be higher or wider than what is in it
-            low = np.maximum(low, np.minimum(near.min(axis=0), view_cells.min(axis=0)))
-            high = np.minimum(high, np.maximum(near.max(axis=0), view_cells.max(axis=0)) + 1)
-    size = (int(high[0] - low[0]), int(high[1] - low[1]), int(high[2] - low[2]))
-    field = raycast.distance_field(found, starts, cells, low, size)
-    room = raycast.room_for_words(views, reach, starts, table)
-    indptr = np.concatenate([[0], np.cumsum(room)])
-    words, masks = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.uint64)
-    counts = raycast.cast(field, low, views, reach, slack, cells, starts, table, indptr, words, masks)
-    used = np.arange(indptr[-1]) < np.repeat(indptr[:-1] + counts, room)
-    return counts, words[used], masks[used]
+    view_cells = np.floor(at).astype(np.int64)
+    low, high = view_cells.min(axis=0) - margin, view_cells.max(axis=0) + margin + 1
+    window = grid.cells[octree.range(low, high)]
+    if len(window):  # it need not be higher or wider than what is in it
+        low = np.maximum(low, np.minimum(window.min(axis=0), view_cells.min(axis=0)))
+        high = np.minimum(high, np.maximum(window.max(axis=0), view_cells.max(axis=0)) + 1)
+    field = raycast.distance_field(window, low, (int(high[0] - low[0]), int(high[1] - low[1]), int(high[2] - low[2])))
+    counts, words, masks = [], [], []
+    for begin in range(0, len(at), VIEWS_AT_ONCE):
+        block = slice(begin, begin + VIEWS_AT_ONCE)
+        near, rows = octree.radius_many(views[block], radius)
+        room = raycast.words_of(near, rows)
+        indptr = np.concatenate([[0], np.cumsum(room)])
+        word, mask = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.uint64)
+        count = raycast.cast(field, low, at[block], reach, grid.cells, near, rows, indptr, word, mask)
+        used = np.arange(indptr[-1]) < np.repeat(indptr[:-1] + count, room)
+        counts.append(count)
+        words.append(word[used])
+        masks.append(mask[used])
+    return np.concatenate(counts), np.concatenate(words), np.concatenate(masks)
 
 
 def _joined(parts: list[tuple[Array, Array, Array, Array]], views: int, cells: int) -> Visibility:

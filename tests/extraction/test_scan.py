@@ -1,0 +1,50 @@
+"""A scan: what a file knows beside its points goes with the cells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from topomerge.errors import InputError
+from topomerge.extraction.scan import read_scan, reasons
+from topomerge.types import PointCloud, VoxelGrid
+
+POINTS = np.array([(x / 10 + 0.05, y / 10 + 0.05, 0.05) for x in range(8) for y in range(8)], np.float32)
+
+
+def test_rays_of_points_whose_place_is_known() -> None:
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, 3] = 3, 4, 1
+    pose_of = np.full(len(POINTS), -1, np.int32)
+    pose_of[:5] = 1
+    chunks = [PointCloud(POINTS, np.array([10.0, 0, 0]), poses=poses, pose_of=pose_of), PointCloud(POINTS + 1, source="b.las")]
+    scan = read_scan(chunks, 0.1)
+    assert scan.rays is not None and scan.source == "b.las" and scan.free is None
+    starts, ends = scan.rays
+    assert (starts == (3, 4, 1)).all() and np.allclose(ends, POINTS[:5] + (10, 0, 0))
+    assert read_scan(POINTS, 0.1).rays is None
+
+
+def test_empty_space_and_warnings_of_all_chunks() -> None:
+    free = VoxelGrid.from_cells(np.array([(1, 2, 3)]))
+    chunks = [PointCloud(POINTS, free=free, warnings=("odd",)), PointCloud(POINTS + 1, warnings=("odd", "odder"))]
+    scan = read_scan(iter(chunks), 0.1)
+    assert scan.free is free and scan.warnings == ("odd", "odder") and len(scan.grid) == 128
+
+
+def test_a_grid_is_taken_as_it_is() -> None:
+    grid = VoxelGrid.from_cells(np.array([(1, 2, 3)]), edge=0.2)
+    assert read_scan(grid, 0.1, least_neighbours=3.5).grid is grid
+
+
+def test_sparse_points_get_larger_cells() -> None:
+    scan = read_scan(POINTS[::4] * 2, 0.1, least_neighbours=3.5)
+    assert scan.grid.edge > 0.1 and "sparse" in scan.warnings[0]
+    assert read_scan(POINTS[::4] * 2, 0.1).grid.edge == 0.1
+
+
+def test_what_looked_wrong_is_told_with_the_error() -> None:
+    with pytest.raises(InputError, match=r"^no finite point: nothing to voxelise \(and all points were NaN\)$"):
+        read_scan(PointCloud(np.zeros((0, 3), np.float32), warnings=("all points were NaN",)), 0.1)
+    with pytest.raises(InputError, match="^why$"), reasons(()):
+        raise InputError("why")

@@ -1,0 +1,136 @@
+"""From the columns of plans back to cells: the floor of all storeys, cut into rooms (beyond the thesis)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.extraction.completeness import outline_seen
+from topomerge.extraction.components import spread_labels
+from topomerge.extraction.floor import Floor
+from topomerge.extraction.plans.plan import columns_of
+from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.storey_rooms import StoreyRooms
+from topomerge.extraction.storeys import lowest_of_column
+from topomerge.types import Array, VoxelGrid
+
+WALL_REACH = 0.5  # m: so far into walls and what stands before them the cells of a room go
+OVER_CEILING = 0.4  # m
+UNDER_FLOOR = 0.25  # m
+DOORWAY_REACH = 0.5  # m: so far the navigable volume goes on into what looks like wall: the openings of noisy scans
+FLOOR_PROPERTIES = ("standing", "storey", "room", "area")
+
+
+def floor_of_storeys(
+    grid: VoxelGrid, navigable: VoxelGrid, storey: Array, storeys: Array, cut: Sequence[StoreyRooms], factor: int
+) -> Floor:
+    """The floor of all storeys, its rooms and areas numbered from storey to storey.
+
+    Args:
+        grid: occupied cells.
+        navigable: the navigable volume.
+        storey: (m,) storey of each of its cells.
+        storeys: (S,) STOREY_DTYPE; gets the areas, and loses those without a room.
+        cut: the storeys that were cut into rooms, lowest first.
+        factor: how many times longer the columns of their plans are than the cells.
+    """
+    label = np.full(len(grid), -1, np.int32)
+    cells, properties, room_of_area, seen = [], [], [], []
+    probability = {}
+    rooms = areas = 0
+    for part in cut:
+        room = np.where(part.room >= 0, part.room + rooms, -1)
+        area = np.where(part.area >= 0, part.area + areas, -1)
+        _label_cells(label, grid, part.plan, room, factor)
+        places, at, standing = _floor_cells(part, navigable, storey == part.number, factor)
+        cells.append(places)
+        properties.append((standing, np.full(len(places), part.number), room[tuple(at.T)], area[tuple(at.T)]))
+        probability |= {(a + rooms, b + rooms): p for (a, b), p in part.door_probability.items()}
+        room_of_area.append(part.room_of_area + rooms)
+        seen.append(outline_seen(part.room, part.plan.inside, part.plan.wall, part.plan.edge))
+        rooms, areas = rooms + int(part.room.max(initial=-1)) + 1, areas + len(part.room_of_area)
+    if not cut:
+        empty = np.zeros(0, np.int32)
+        return Floor(grid.with_cells(np.zeros((0, 3), np.int32)), storeys, empty, empty, empty, empty, label)
+    tables = dict(zip(FLOOR_PROPERTIES, map(np.concatenate, zip(*properties, strict=True)), strict=True))
+    floor, storeys, of_cell = joined_floor(grid, storeys, np.concatenate(cells), tables)
+    return Floor(
+        floor,
+        storeys,
+        of_cell["storey"],
+        of_cell["room"],
+        of_cell["area"],
+        np.concatenate(room_of_area).astype(np.int32),
+        label,
+        door_probability=probability,
+        completeness=np.concatenate(seen),
+        classified_storeys=tuple(part.classes for part in cut),
+    )
+
+
+def _label_cells(label: Array, grid: VoxelGrid, plan: StoreyPlan, room: Array, factor: int) -> None:
+    """Give the occupied cells of a storey the room of their column; walls go to the nearest room."""
+    far, nearest = ndimage.distance_transform_edt(room < 0, return_indices=True)
+    room = np.where(far * plan.edge <= WALL_REACH, room[tuple(nearest)], -1)
+    low, base = columns_of(plan, grid)
+    at = (grid.cells // factor if factor > 1 else grid.cells)[:, :2].astype(np.int64) - low
+    rows = np.flatnonzero(((at >= 0) & (at < room.shape)).all(axis=1))
+    at = at[rows]
+    ceiling, above = (np.broadcast_to(height, room.shape)[tuple(at.T)] for height in (plan.ceiling, plan.top))
+    z = (grid.cells[rows, 2] // factor - base[tuple(at.T)]) * plan.edge
+    top = np.minimum(np.where(np.isnan(ceiling), np.inf, ceiling + OVER_CEILING), above + 0.5 * plan.edge)
+    in_storey = (z >= -UNDER_FLOOR) & (z <= top) & (room[tuple(at.T)] >= 0)
+    label[rows[in_storey]] = room[tuple(at[in_storey].T)]
+
+
+def _floor_cells(part: StoreyRooms, navigable: VoxelGrid, in_storey: Array, factor: int) -> tuple[Array, Array, Array]:
+    """Cells of a storey's floor, the column of the plan in which each lies, and whether somebody can stand there.
+
+    These are its navigable cells, and below furniture all cells of a column of the plan at the level of its floor.
+    """
+    room = part.room
+    low, base = columns_of(part.plan, navigable)
+    cells = navigable.cells[in_storey]
+    at = (cells // factor)[:, :2].astype(np.int64) - low
+    in_plan = ((at >= 0) & (at < room.shape)).all(axis=1)
+    at, cells = at[in_plan], cells[in_plan]
+    columns = np.argwhere(room >= 0)
+    walked = np.zeros(room.shape, bool)
+    walked[tuple(at.T)] = True
+    hidden = columns[~walked[tuple(columns.T)]]
+    corners = np.column_stack([hidden + low, base[tuple(hidden.T)]]) * factor
+    steps = np.argwhere(np.ones((factor, factor, 1), bool))
+    standing = np.repeat([True, False], [len(cells), len(corners) * len(steps)])
+    cells = np.concatenate([cells, (corners[:, None] + steps).reshape(-1, 3)])
+    return cells, np.concatenate([at, np.repeat(hidden, len(steps), axis=0)]), standing
+
+
+def joined_floor(
+    grid: VoxelGrid, storeys: Array, cells: Array, tables: dict[str, Array]
+) -> tuple[VoxelGrid, Array, dict[str, Array]]:
+    """The floor cells of all storeys as one grid; rooms go on into doorways that look like wall.
+
+    Args:
+        storeys: (S,) STOREY_DTYPE; the areas are written.
+        cells: (m, 3) of all storeys' floors.
+        tables: `FLOOR_PROPERTIES`, (m,) each.
+
+    Returns:
+        The cells with the property `standing`, the storeys that have a room, and storey, room and area of each cell.
+    """
+    in_grid = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
+    floor = grid.with_cells(cells[in_grid], {name: values[in_grid] for name, values in tables.items()})
+    of_cell = {name: values.astype(np.int32) for name, values in floor.properties.items()}
+    in_a_room = of_cell["room"] >= 0
+    for name in ("room", "area"):
+        of_cell[name] = spread_labels(floor, of_cell[name], round(DOORWAY_REACH / grid.edge)).astype(np.int32)
+    of_rooms = (of_cell["room"] >= 0) & (in_a_room | of_cell["standing"].astype(bool))
+    of_cell = {name: values[of_rooms] for name, values in of_cell.items()}
+    floor = grid.with_cells(floor.cells[of_rooms], {"standing": of_cell["standing"].astype(bool)})
+    storeys["area"] = np.bincount(of_cell["storey"][lowest_of_column(floor)], minlength=len(storeys)) * floor.edge**2
+    # What has no room of its own is no storey: the upper side of a ceiling, or stray cells that a room below reaches.
+    used = np.bincount(of_cell["storey"][in_a_room[of_rooms]], minlength=len(storeys)) > 0
+    of_cell["storey"] = np.maximum(np.cumsum(used) - 1, 0)[of_cell["storey"]].astype(np.int32)
+    return floor, storeys[used], of_cell

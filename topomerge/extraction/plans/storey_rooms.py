@@ -1,0 +1,90 @@
+"""One storey: from its plan to its rooms, parted where a door probably is (beyond the thesis: docs/adr/0004)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from topomerge.extraction.classified_storey import ClassifiedStorey
+from topomerge.extraction.plans.door_classifier import door_probability
+from topomerge.extraction.plans.partition import Pair, Partition, merge_regions
+from topomerge.extraction.plans.passages import clearance_of, find_passages, regions_of
+from topomerge.extraction.plans.plan import columns_of, storey_plan
+from topomerge.extraction.plans.plan_network import column_probabilities, without_furniture
+from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.upper_sides import without_upper_sides
+from topomerge.types import Array, VoxelGrid
+
+ROOM_LEAST_AREA = 0.8  # m2
+ROOM_LEAST_HALF_WIDTH = 0.35  # m: what is nowhere wider is the edge of a facade or of a slab
+
+
+@dataclass(frozen=True, eq=False)
+class StoreyRooms:
+    """A storey cut into rooms and areas, both numbered from 0 in the storey.
+
+    Args:
+        number: of the storey.
+        plan: the storey seen from above, without furniture.
+        classes: what probably stands in its columns.
+        room, area: (nx, ny) of each column, -1 none.
+        room_of_area: (A,).
+        door_probability: that a door parts two neighbouring rooms.
+    """
+
+    number: int
+    plan: StoreyPlan
+    classes: ClassifiedStorey
+    room: Array
+    area: Array
+    room_of_area: Array
+    door_probability: dict[Pair, float]
+
+
+def cut_storey(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, door: float, narrow: float) -> StoreyRooms:
+    """Cut storey `k` into rooms: regions between all narrowings, merged until only likely doors part them.
+
+    Args:
+        grid: occupied cells.
+        navigable: the navigable volume.
+        storey: (m,) storey of each of its cells.
+        door, narrow: probabilities of a door from which on a narrowing parts rooms, and areas of a room.
+    """
+    plan = storey_plan(grid, navigable, storey, k)
+    probability = column_probabilities(plan)
+    plan = without_furniture(plan, probability)
+    clearance = clearance_of(plan)
+    region = regions_of(plan, probability)
+    if k > 0:
+        region = without_upper_sides(grid, plan, region)
+    passages = find_passages(plan, clearance, region, probability)
+    partition = merge_regions(region, clearance, passages, plan.edge, door_probability, door, narrow, ROOM_LEAST_AREA)
+    low, base = columns_of(plan, grid)
+    corner = grid.origin + np.append(low, np.median(base)) * plan.edge
+    classes = ClassifiedStorey(probability, corner[:2], plan.edge, float(corner[2]))
+    return StoreyRooms(k, plan, classes, *_numbered(partition, region, clearance, plan.edge))
+
+
+def _numbered(
+    partition: Partition, region: Array, clearance: Array, edge: float
+) -> tuple[Array, Array, Array, dict[Pair, float]]:
+    """Room and area of each column, room of each area and the probabilities of doors, of rooms that are large enough."""
+    in_region = region >= 0
+    room = partition.room[region[in_region]]
+    size = np.bincount(room, minlength=len(partition.room)) * edge**2
+    widest = np.zeros(len(size))
+    np.maximum.at(widest, room, clearance[in_region])
+    large = np.flatnonzero((size >= ROOM_LEAST_AREA) & (widest >= ROOM_LEAST_HALF_WIDTH))
+    number = np.full(len(size) + 1, -1)
+    number[large] = np.arange(len(large))
+    room_of_region = np.append(number[partition.room], -1)
+    areas, area_of_region = np.unique(np.where(room_of_region[:-1] >= 0, partition.area, -1), return_inverse=True)
+    if len(areas) and areas[0] < 0:
+        areas, area_of_region = areas[1:], area_of_region - 1
+    doors = {}
+    for pair, probability in partition.door_probability.items():
+        a, b = number[list(pair)].tolist()
+        if a >= 0 and b >= 0:
+            doors[min(a, b), max(a, b)] = probability
+    return room_of_region[region], np.append(area_of_region, -1)[region], room_of_region[areas], doors

@@ -1,0 +1,45 @@
+"""The upper sides of ceilings that look like the floor of an upper storey (beyond the thesis)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.extraction.plans.plan import columns_of
+from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.kernels.columns import hollow_below
+from topomerge.types import Array, VoxelGrid
+
+SHEET_THICKNESS = 0.2  # m: thinner than a floor that carries somebody
+STOREY_BELOW = 1.2, 8.0  # m of empty space under a ceiling: at least, at most
+OPEN_SHARE = 0.25  # of the outline with walls, and of the floor with a ceiling: less, and a floor may be a ceiling
+
+
+def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array) -> Array:
+    """The regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls around
+    or so thin that nobody is carried, with a storey right below.
+
+    Args:
+        grid: occupied cells.
+        plan: of the upper storey.
+        region: (nx, ny) region of each column, -1 none.
+    """
+    count = int(region.max(initial=-1)) + 1
+    in_region = region >= 0
+    size = np.maximum(np.bincount(region[in_region], minlength=count), 1)
+    covered = np.bincount(region[in_region], ~np.isnan(plan.clear[in_region]), minlength=count) / size
+    walled = ndimage.binary_dilation(plan.wall, np.ones((5, 5)))
+    outline = in_region & ndimage.binary_dilation(~plan.inside, np.ones((3, 3)))
+    length = np.maximum(np.bincount(region[outline], minlength=count), 1)
+    beside_walls = np.bincount(region[outline], walled[outline], minlength=count) / length
+    suspect = covered < OPEN_SHARE
+    if not suspect.any():
+        return region
+    at = np.argwhere(in_region & suspect[np.where(in_region, region, 0)])
+    low, base = columns_of(plan, grid)
+    cells = np.column_stack([at + low, base[tuple(at.T)]])
+    heights = (round(height / grid.edge) for height in (SHEET_THICKNESS, *STOREY_BELOW))
+    hollow = hollow_below(*grid._bricks, cells, 1, *heights)
+    thin = np.bincount(region[tuple(at.T)], hollow, minlength=count) > 0.5 * size
+    ceiling = suspect & (thin | (beside_walls < OPEN_SHARE))
+    return np.where(in_region & ceiling[np.where(in_region, region, 0)], -1, region)

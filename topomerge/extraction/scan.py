@@ -1,0 +1,111 @@
+"""A scan as cells: what is extracted from, and what its file knows beside the points (seeds 2.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.extraction.sparsity import COARSEST_CELL, without_gaps
+from topomerge.extraction.voxels import voxelise
+from topomerge.types import Array, PointCloud, VoxelGrid
+
+FINEST_CELL = 0.02  # m
+MOST_RAYS = 400_000  # of a portion of two million points
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A scan as a voxel grid.
+
+    Args:
+        grid: occupied cells.
+        rays: (k, 3) places of the sensor and (k, 3) of what it saw from there, m; None where they are unknown.
+        free: cells that the file says are empty, or None.
+        source: where it comes from.
+        warnings: what the user should know.
+    """
+
+    grid: VoxelGrid
+    rays: tuple[Array, Array] | None = None
+    free: VoxelGrid | None = None
+    source: str = ""
+    warnings: tuple[str, ...] = ()
+
+    def with_grid(self, grid: VoxelGrid, warning: str) -> Scan:
+        """The scan with another grid, and with what the user should know about that."""
+        return replace(self, grid=grid, warnings=(*self.warnings, warning))
+
+
+def read_scan(
+    source: PointCloud | VoxelGrid | Array | Iterable[PointCloud], voxel_size: float, least_neighbours: float = 0.0
+) -> Scan:
+    """Points -> cells, so large that surfaces hold together (seeds 2.2). A grid is taken as it is.
+
+    Args:
+        source: a cloud, chunks of one, (N, 3) points, or occupied cells.
+        voxel_size: edge length of a cell, m (a grid keeps its own).
+        least_neighbours: that the median cell has, of 26; the cells are doubled until it has them. 0: never.
+
+    Raises:
+        InputError: no finite point, an absurd extent, or cells of a size that shows no rooms and doors.
+    """
+    edge = source.edge if isinstance(source, VoxelGrid) else voxel_size
+    if not (isinstance(edge, int | float) and FINEST_CELL <= edge <= COARSEST_CELL):
+        raise InputError(f"voxel size must be between {FINEST_CELL} and {COARSEST_CELL} m to find rooms and doors, not {edge}")
+    if isinstance(source, VoxelGrid):
+        return Scan(source)
+    chunks = _Chunks([PointCloud(source)] if isinstance(source, np.ndarray) else source)
+    with reasons(chunks.warnings):
+        grid = voxelise(chunks, edge, chunks.warnings)
+    if least_neighbours:
+        grid = without_gaps(grid, least_neighbours, chunks.warnings)
+    return Scan(grid, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings))
+
+
+@contextmanager
+def reasons(warnings: Sequence[str]) -> Iterator[None]:
+    """Adds to an error of the input what looked wrong before it: that is often the reason."""
+    try:
+        yield
+    except InputError as error:
+        if not warnings:
+            raise
+        raise InputError(f"{error} (and {'; '.join(warnings)})") from error
+
+
+class _Chunks:
+    """The chunks of a cloud, to be read once; it gathers what they know beside their points."""
+
+    def __init__(self, chunks: PointCloud | Iterable[PointCloud]) -> None:
+        self.chunks = [chunks] if isinstance(chunks, PointCloud) else chunks
+        self.source = ""
+        self.free: VoxelGrid | None = None
+        self.warnings: list[str] = []
+        self._rays: list[tuple[Array, Array]] = []
+
+    def __iter__(self) -> Iterator[PointCloud]:
+        for chunk in self.chunks:
+            self.source = chunk.source
+            self.free = chunk.free or self.free
+            self.warnings += [w for w in chunk.warnings if w not in self.warnings]
+            if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
+                self._rays.append(_rays(chunk, chunk.poses, chunk.pose_of))
+            yield chunk
+
+    @property
+    def rays(self) -> tuple[Array, Array] | None:
+        if not self._rays:
+            return None
+        starts, ends = (np.concatenate(part) for part in zip(*self._rays, strict=True))
+        return starts, ends
+
+
+def _rays(cloud: PointCloud, poses: Array, pose_of: Array) -> tuple[Array, Array]:
+    """Places of the sensor and of what it saw, m: an even selection of the points whose pose is known."""
+    rows = np.arange(0, len(cloud), max(len(cloud) // MOST_RAYS, 1))
+    rows = rows[pose_of[rows] >= 0]
+    return poses[pose_of[rows], :3, 3], cloud.points[rows] + cloud.shift

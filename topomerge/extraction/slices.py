@@ -1,0 +1,89 @@
+"""Slices of a 2D laser: they get walls and a floor (beyond the thesis)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.extraction.scan import Scan
+from topomerge.kernels.carve import carve
+from topomerge.types import Array, VoxelGrid
+
+SLICE_HEIGHT = 0.6  # m: what is flatter is a slice
+EXTRUDED_HEIGHT = 2.4  # m, of the walls that a slice becomes
+ENCLOSED_SHARE = 0.75  # of the directions in which a place inside sees a wall
+SIGHT_DIRECTIONS = 24
+SIGHT_RANGE = 15.0  # m
+
+
+def with_raised_slice(scan: Scan) -> Scan:
+    """A scan that is a slice gets walls over its columns, and a floor; any other stays as it is."""
+    if not is_slice(scan.grid):
+        return scan
+    warning = f"the scan is a slice: walls of {EXTRUDED_HEIGHT:g} m and a floor were assumed"
+    return scan.with_grid(_extruded(scan.grid, scan.rays), warning)
+
+
+def is_slice(grid: VoxelGrid) -> bool:
+    """Is the scan flat, but for single points?"""
+    levels = np.sort(grid.cells[:, 2])
+    if not len(levels):
+        return False
+    low, high = levels[int(0.01 * len(levels))], levels[int(0.99 * (len(levels) - 1))]
+    return bool((high - low) * grid.edge <= SLICE_HEIGHT)
+
+
+def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
+    """Walls over the columns of a slice, and a floor where the sensor looked, or where walls are around.
+
+    Args:
+        grid: occupied cells.
+        rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, where they are known.
+    """
+    low = int(np.sort(grid.cells[:, 2])[int(0.01 * len(grid))])
+    columns = np.unique(grid.cells[:, :2], axis=0)
+    wall = np.zeros(grid.shape[:2], bool)
+    wall[tuple(columns.T)] = True
+    inside = _crossed(grid, *rays) if rays is not None else _enclosed(wall, grid.edge)
+    inside = ndimage.binary_closing(np.pad(inside, 2), np.ones((3, 3)))[2:-2, 2:-2] & ~wall
+    high = round(EXTRUDED_HEIGHT / grid.edge)
+    levels = np.arange(low + 1, low + high)
+    walls = np.column_stack([np.repeat(columns, len(levels), axis=0), np.tile(levels, len(columns))])
+    shape = (grid.shape[0], grid.shape[1], max(grid.shape[2], low + high + 1))
+    floor = np.column_stack([np.argwhere(inside), np.full(int(inside.sum()), low)])
+    return VoxelGrid.from_cells(np.concatenate([walls, floor]), grid.origin, grid.edge, shape)
+
+
+def _crossed(grid: VoxelGrid, starts: Array, ends: Array) -> Array:
+    """(nx, ny) columns that rays crossed, seen from above."""
+    flat = np.zeros((*grid.shape[:2], 1), bool)
+    at, to = ((np.asarray(p, np.float64) - grid.origin) / grid.edge for p in (starts, ends))
+    at[:, 2], to[:, 2] = 0.5, 0.5
+    carve(np.ascontiguousarray(at), np.ascontiguousarray(to), 1.0, flat)
+    return flat[:, :, 0]
+
+
+def _enclosed(wall: Array, edge: float) -> Array:
+    """(nx, ny) columns around which walls stand in most directions."""
+    hits = np.zeros(wall.shape, np.int32)
+    far = round(SIGHT_RANGE / edge)
+    for angle in np.arange(SIGHT_DIRECTIONS) * 2 * np.pi / SIGHT_DIRECTIONS:
+        seen = wall.copy()  # swept along the direction: doubling the shift each time covers all distances
+        step = 1
+        reach = np.array([np.cos(angle), np.sin(angle)])
+        while step < far:
+            dx, dy = np.rint(reach * step).astype(int)
+            seen |= _shifted(seen, int(dx), int(dy))
+            step *= 2
+        hits += seen
+    return np.asarray(hits >= ENCLOSED_SHARE * SIGHT_DIRECTIONS)
+
+
+def _shifted(mask: Array, dx: int, dy: int) -> Array:
+    shifted = np.zeros_like(mask)
+    nx, ny = mask.shape
+    if abs(dx) < nx and abs(dy) < ny:
+        shifted[max(dx, 0) : nx + min(dx, 0), max(dy, 0) : ny + min(dy, 0)] = mask[
+            max(-dx, 0) : nx + min(-dx, 0), max(-dy, 0) : ny + min(-dy, 0)
+        ]
+    return shifted

@@ -1,0 +1,39 @@
+"""Seconds a step, and news of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+Progress = Callable[[float, str], None]  # share of the work that is done, what is being done
+
+
+class Stopwatch:
+    """Measures steps that follow one another: each ends where the next one begins."""
+
+    def __init__(self, progress: Progress | None = None) -> None:
+        self.seconds: dict[str, float] = {}
+        self.progress = progress
+        self._step: str | None = None
+        self._began = 0.0
+
+    def begin(self, step: str, done: float) -> None:
+        """A step begins, at which this share of all work is done."""
+        self.end()
+        if self.progress is not None:
+            self.progress(done, step)
+        self._step, self._began = step, time.perf_counter()
+
+    def end(self) -> dict[str, float]:
+        """The last step ends; returns step -> s."""
+        if self._step is not None:
+            self.seconds[self._step] = round(time.perf_counter() - self._began, 4)
+        self._step = None
+        return self.seconds
+
+    def part(self, begin: float, end: float) -> Progress | None:
+        """News from within a step that takes the work from one share done to another."""
+        if self.progress is None:
+            return None
+        progress = self.progress
+        return lambda done, text: progress(begin + done * (end - begin), text)
