@@ -103,11 +103,11 @@ def sets_of(rows: list[list[int]], n: int) -> Visibility:
 def test_jaccard_equals_sets(sets, threshold):
     visibility = sets_of([sorted(s) for s in sets], 301)
     assert [visibility.rows(v).tolist() for v in range(len(sets))] == [sorted(s) for s in sets]
-    visibility = jaccard_similarity(visibility, threshold).toarray()
+    similarity = jaccard_similarity(visibility, threshold).toarray()
     for i, a in enumerate(sets):
         for j, b in enumerate(sets):
             exact = 1.0 if i == j else len(a & b) / max(len(a | b), 1)
-            assert visibility[i, j] == pytest.approx(exact if exact >= threshold or i == j else 0.0)
+            assert similarity[i, j] == pytest.approx(exact if exact >= threshold or i == j else 0.0)
     np.testing.assert_allclose(visibility.matrix().sum(axis=1), [len(s) for s in sets])
 
 
@@ -124,8 +124,8 @@ def test_views_of_other_heights_are_not_compared():
 
 def test_only_pairs_within_reach_are_compared():
     visibility = sets_of([[1, 2, 3], [1, 2, 3], [1, 2, 3]], 64)
-    visibility = jaccard_similarity(visibility, 0.3, np.array([[0, 0, 0], [1, 0, 0], [9, 0, 0]]), 2.0).toarray()
-    assert visibility.tolist() == [[1, 1, 0], [1, 1, 0], [0, 0, 1]]
+    similarity = jaccard_similarity(visibility, 0.3, np.array([[0, 0, 0], [1, 0, 0], [9, 0, 0]]), 2.0).toarray()
+    assert similarity.tolist() == [[1, 1, 0], [1, 1, 0], [0, 0, 1]]
 
 
 @settings(max_examples=30, deadline=None)
