@@ -31,16 +31,16 @@ def free_space(scan: Scan, navigable: VoxelGrid, range: float) -> VoxelGrid | No
     """
     if scan.free is not None:
         return scan.free
-    crossed_shape = tuple(-(-s // FREE_CELL) for s in scan.grid.shape)
-    if int(np.prod(crossed_shape, dtype=np.float64)) > LARGEST_VOLUME:
+    nx, ny, nz = (-(-s // FREE_CELL) for s in scan.grid.shape)
+    if nx * ny * nz > LARGEST_VOLUME:
         return None
-    crossed = np.zeros(crossed_shape, bool)
+    crossed = np.zeros((nx, ny, nz), bool)
     if scan.rays is not None:
         _carve_rays(scan.grid, *scan.rays, crossed)
     else:
         _carve_views(scan.grid, navigable, range, crossed)
     crossed[tuple((scan.grid.cells // FREE_CELL).T)] = False
-    return VoxelGrid.from_cells(np.argwhere(crossed), scan.grid.origin, scan.grid.edge * FREE_CELL, crossed.shape)
+    return VoxelGrid.from_cells(np.argwhere(crossed), scan.grid.origin, scan.grid.edge * FREE_CELL, (nx, ny, nz))
 
 
 def _carve_rays(grid: VoxelGrid, starts: Array, ends: Array, crossed: Array) -> None:

@@ -10,6 +10,7 @@ from scipy import ndimage
 from topomerge.extraction.completeness import outline_seen
 from topomerge.extraction.components import spread_labels
 from topomerge.extraction.floor import Floor
+from topomerge.extraction.plans.partition import Pair
 from topomerge.extraction.plans.plan import columns_of
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.plans.storey_rooms import StoreyRooms
@@ -38,7 +39,7 @@ def floor_of_storeys(
     """
     label = np.full(len(grid), -1, np.int32)
     cells, properties, room_of_area, seen = [], [], [], []
-    probability = {}
+    probability: dict[Pair, float] = {}
     rooms = areas = 0
     for part in cut:
         room = np.where(part.room >= 0, part.room + rooms, -1)
