@@ -14,12 +14,12 @@ from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.kernels.columns import first_occupied, hollow_below, levels_below
 from topomerge.types import Array, VoxelGrid
 
-HEADROOM = 1.2  # m: empty space under a ceiling, above furniture
-STOREY = 8.0  # m: how far above a floor something may be, and how far below a ceiling its floor
-THICKNESS = 0.3  # m: a noisy sheet is this thick
-SLAB = 0.8  # m: so far below a ceiling's upper side, or a roof's, its lower side may be
-SOLID = 0.5  # share of the levels in the metre below that are occupied: a slab is thinner, a wall or a shelf is not
-WALLED = 0.25  # share of a floor's boundary beside which walls rise
+HOLLOW_HEIGHT = 1.2  # m: empty space under a ceiling, above furniture
+STOREY_REACH = 8.0  # m: how far above a floor something may be, and how far below a ceiling its floor
+SHEET_HEIGHT = 0.3  # m: a noisy sheet is this thick
+SLAB_HEIGHT = 0.8  # m: so far below a ceiling's upper side, or a roof's, its lower side may be
+SOLID_SHARE = 0.5  # share of the levels in the metre below that are occupied: a slab is thinner, a wall or a shelf is not
+WALLED_SHARE = 0.25  # share of a floor's boundary beside which walls rise
 
 
 def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
@@ -30,13 +30,13 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
     ceiling's they end.
     """
     cells = standing.cells.astype(np.int64)
-    thick = max(int(np.ceil(THICKNESS / grid.edge)), 1)
-    far = int(np.ceil(STOREY / grid.edge))
+    thick = max(int(np.ceil(SHEET_HEIGHT / grid.edge)), 1)
+    far = int(np.ceil(STOREY_REACH / grid.edge))
     bare = first_occupied(*grid._bricks, cells, thick + 1, 1, far) == 0
     if not bare.any():
         return standing
-    slab = int(np.ceil(SLAB / grid.edge))
-    hollow = hollow_below(*grid._bricks, cells, 1, slab, int(np.ceil(HEADROOM / grid.edge)), far)
+    slab = int(np.ceil(SLAB_HEIGHT / grid.edge))
+    hollow = hollow_below(*grid._bricks, cells, 1, slab, int(np.ceil(HOLLOW_HEIGHT / grid.edge)), far)
     component = connected_components(standing, moore(), group=np.where(bare, 0, -1))
     count = int(component.max()) + 1
     boundary = np.flatnonzero(bare & (horizontal_distance_field(standing) == 0))
@@ -44,14 +44,14 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
     on_boundary = np.bincount(component[boundary], minlength=count)
     with_wall = np.bincount(component[boundary], walled, minlength=count)
     hollow_share = np.bincount(component[bare], hollow[bare], minlength=count) / np.bincount(component[bare], minlength=count)
-    ceiling = (hollow_share > 0.5) & (with_wall < WALLED * np.maximum(on_boundary, 1))
+    ceiling = (hollow_share > 0.5) & (with_wall < WALLED_SHARE * np.maximum(on_boundary, 1))
     return standing.subset(~(bare & (ceiling[component] | _on_a_wall(grid, cells))))
 
 
 def _on_a_wall(grid: VoxelGrid, cells: Array) -> Array:
     """(m,) bool: is much of the metre below filled, here or in a neighbouring column?"""
     depth = max(int(1.0 / grid.edge), 1)
-    return levels_below(*grid._bricks, cells, 1, depth) >= SOLID * depth
+    return levels_below(*grid._bricks, cells, 1, depth) >= SOLID_SHARE * depth
 
 
 def beside_and_above(edge: float) -> Kernel:

@@ -10,7 +10,7 @@ import numpy as np
 from topomerge.types import Array
 
 COLUMN_CLASSES = ("inside", "wall", "doorway", "shut", "outside")  # furniture is inside
-INSIDE, WALL, DOORWAY, SHUT = range(4)
+INSIDE_CLASS, WALL_CLASS, DOORWAY_CLASS, SHUT_CLASS = range(4)  # of them
 DOOR_CHANCE, WALL_CHANCE = 0.3, 0.02  # less of a door and more of a wall around it, and a passage leads through a wall
 PASSAGE_REACH = 0.3  # m around a passage
 
@@ -43,4 +43,6 @@ def leads_through_wall(storeys: Sequence[ClassifiedStorey], centre: Array) -> bo
     near = storey.probability[box]
     if not near.size:
         return False
-    return bool(near[..., DOORWAY : SHUT + 1].sum(axis=-1).max() < DOOR_CHANCE and near[..., WALL].mean() > WALL_CHANCE)
+    return bool(
+        near[..., DOORWAY_CLASS : SHUT_CLASS + 1].sum(axis=-1).max() < DOOR_CHANCE and near[..., WALL_CLASS].mean() > WALL_CHANCE
+    )

@@ -9,11 +9,11 @@ from topomerge.extraction.convolution import Kernel, any_at
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import Array, VoxelGrid
 
-GLIMPSED = 0.6  # rooms of which less of the outline was seen were only looked into
-STEP = 0.3  # m: floor beside a cell may be this much higher or lower
-WALL = (0.3, 1.5)  # m above the floor: where a wall has to be seen
-BESIDE = 0.15  # m: between a floor and its wall in a plan
-REACH = 0.25  # m beyond the body's half width
+GLIMPSED_SHARE = 0.6  # rooms of which less of the outline was seen were only looked into
+STEP_HEIGHT = 0.3  # m: floor beside a cell may be this much higher or lower
+WALL_SIGHT = (0.3, 1.5)  # m above the floor: where a wall has to be seen
+PLAN_WALL_REACH = 0.15  # m: between a floor and its wall in a plan
+WALL_DISTANCE = 0.25  # m beyond the body's half width
 
 
 def outline_seen(room: Array, inside: Array, wall: Array, edge: float) -> Array:
@@ -26,7 +26,7 @@ def outline_seen(room: Array, inside: Array, wall: Array, edge: float) -> Array:
         edge: of a column, m.
     """
     count = int(room.max(initial=-1)) + 1
-    reach = max(round(BESIDE / edge), 1)
+    reach = max(round(PLAN_WALL_REACH / edge), 1)
     near = ndimage.binary_dilation(wall, np.ones((2 * reach + 1, 2 * reach + 1)))
     outline = (room >= 0) & ndimage.binary_dilation(~inside)
     total = np.bincount(room[outline], minlength=count)
@@ -49,7 +49,7 @@ def completeness(grid: VoxelGrid, navigable: VoxelGrid, label: Array, count: int
     floor = lowest_of_column(navigable)
     floor = floor[label[floor] >= 0]
     cells = navigable.cells[floor].astype(np.int64)
-    step = int(STEP / grid.edge)
+    step = int(STEP_HEIGHT / grid.edge)
     end = np.zeros(len(floor), bool)
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         goes_on = np.zeros(len(floor), bool)
@@ -65,7 +65,7 @@ def completeness(grid: VoxelGrid, navigable: VoxelGrid, label: Array, count: int
 
 def _wall(edge: float, body: float) -> Kernel:
     """Where the wall beside the outline of a floor may stand."""
-    reach = int(np.ceil((body / 2 + REACH) / edge))
+    reach = int(np.ceil((body / 2 + WALL_DISTANCE) / edge))
     steps = np.arange(-reach, reach + 1)
-    heights = np.arange(int(WALL[0] / edge), int(WALL[1] / edge) + 1)
+    heights = np.arange(int(WALL_SIGHT[0] / edge), int(WALL_SIGHT[1] / edge) + 1)
     return Kernel.from_offsets(np.stack(np.meshgrid(steps, steps, heights, indexing="ij"), -1).reshape(-1, 3))

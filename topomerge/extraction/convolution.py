@@ -13,7 +13,7 @@ from topomerge.kernels import stencil
 from topomerge.types import VoxelGrid
 
 Array = NDArray[Any]
-SLACK = 1e-6  # cells: 0.3 m are three cells of 0.1 m, whatever the last bit of the quotient says
+LENGTH_SLACK = 1e-6  # cells: 0.3 m are three cells of 0.1 m, whatever the last bit of the quotient says
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,19 +86,19 @@ class Kernel:
 def _ball(radius: float, axes: int, edge: float, with_origin: bool) -> Kernel:
     if not (edge > 0 and 0 <= radius < np.inf):
         raise ValueError(f"a kernel needs a radius of 0 m or more and an edge above 0 m, not {radius} and {edge}")
-    reach = int(np.floor(radius / edge + SLACK))
+    reach = int(np.floor(radius / edge + LENGTH_SLACK))
     steps = np.arange(-reach, reach + 1)
     offsets = np.stack(np.meshgrid(steps, steps, steps if axes == 3 else [0], indexing="ij"), -1).reshape(-1, 3)
     squared = (offsets**2).sum(axis=1)
-    kept = squared <= (radius / edge + SLACK) ** 2
-    return Kernel.from_offsets(offsets[kept & (with_origin | (squared > 0))])
+    inside = squared <= (radius / edge + LENGTH_SLACK) ** 2
+    return Kernel.from_offsets(offsets[inside & (with_origin | (squared > 0))])
 
 
 def _layers(height: float, edge: float) -> int:
     """Cells that it takes to cover a length: sizes are rounded up, so that a body never fits where it should not."""
     if not (edge > 0 and 0 < height < np.inf):
         raise ValueError(f"sizes of a kernel must be above 0 m, not {height} with an edge of {edge}")
-    return int(np.ceil(height / edge - SLACK))
+    return int(np.ceil(height / edge - LENGTH_SLACK))
 
 
 def von_neumann(with_origin: bool = False) -> Kernel:

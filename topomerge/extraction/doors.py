@@ -14,14 +14,14 @@ from topomerge.extraction.floor import Floor
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import EDGE_DTYPE, Array, VoxelGrid
 
-LEAST_WIDTH = 0.4  # m: narrower gaps in which no body fits are holes in a wall
-DOOR_WIDTH = 1.6  # m: what is wider is an opening
-SAME_DOOR = 0.8  # m: passages between the same rooms that are this close are one
-HEIGHT = 0.6  # m: what is higher or lower is another level
-LANDING = 0.35  # m: what is nearer to the level of a storey is no stair
-RAMP = 0.25  # climb below which it is a ramp
-SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
-NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
+PASSAGE_LEAST_WIDTH = 0.4  # m: narrower gaps in which no body fits are holes in a wall
+DOOR_MOST_WIDTH = 1.6  # m: what is wider is an opening
+SAME_DOOR_DISTANCE = 0.8  # m: passages between the same rooms that are this close are one
+LEVEL_HEIGHT = 0.6  # m: what is higher or lower is another level
+LANDING_HEIGHT = 0.35  # m: what is nearer to the level of a storey is no stair
+RAMP_CLIMB = 0.25  # climb below which it is a ramp
+DOOR_SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
+HALF_NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
 
 
 def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceiling: Array) -> Array:
@@ -39,26 +39,28 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
     navigable, body = floor.cells, floor.body_width
     cells = navigable.cells.astype(np.int64)
     first, second = [], []
-    for step in NEIGHBOURS:
+    for step in HALF_NEIGHBOURS:
         other = navigable.rows(cells + step)
-        here = np.flatnonzero((other >= 0) & (room >= 0))
-        there = other[here]
-        meet = (room[there] >= 0) & (room[there] != room[here])
-        first.append(here[meet])
-        second.append(there[meet])
+        row = np.flatnonzero((other >= 0) & (room >= 0))
+        neighbour = other[row]
+        meet = (room[neighbour] >= 0) & (room[neighbour] != room[row])
+        first.append(row[meet])
+        second.append(neighbour[meet])
     a, b = np.concatenate(first), np.concatenate(second)
     swap = room[a] > room[b]
     a[swap], b[swap] = b[swap], a[swap]
     edges: list[tuple[Any, ...]] = []
     pair = room[a].astype(np.int64) * (int(room.max(initial=0)) + 1) + room[b]
     order = np.argsort(pair, kind="stable")
-    for here in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []:
-        rows = np.unique(np.concatenate([a[here], b[here]]))
+    for contacts in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []:
+        rows = np.unique(np.concatenate([a[contacts], b[contacts]]))
         meeting = navigable.subset(rows)
         contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))
         parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
-        found = [_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts]
-        edges += _apart([edge for edge in found if edge[2] >= LEAST_WIDTH or (edge[6] and edge[5] != "stairs")])
+        passages = [_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts]
+        edges += _distinct_doors(
+            [edge for edge in passages if edge[2] >= PASSAGE_LEAST_WIDTH or (edge[6] and edge[5] != "stairs")]
+        )
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
     _add_stairs(table, floor)
     return table
@@ -75,7 +77,7 @@ def _add_stairs(edges: Array, floor: Floor) -> None:
     z = floor.cells.centroids()[:, 2]
     nearest = np.abs(z[:, None] - floor.storeys["floor"]).min(axis=1)
     rows = lowest_of_column(floor.cells)
-    rows = rows[nearest[rows] > LANDING]
+    rows = rows[nearest[rows] > LANDING_HEIGHT]
     if not len(rows):
         return
     steps = floor.cells.subset(np.sort(rows))
@@ -83,13 +85,13 @@ def _add_stairs(edges: Array, floor: Floor) -> None:
     places = steps.centroids()
     for i in stairs:
         distance = np.linalg.norm(places - edges["centre"][i], axis=1)
-        if distance.min() > SEARCH:
+        if distance.min() > DOOR_SEARCH:
             continue
-        mine = places[part == part[distance.argmin()]]
-        low, high = mine[:, 2].min(), mine[:, 2].max()
-        edges["lower"][i] = mine[mine[:, 2] <= low + LANDING].mean(axis=0)
-        edges["upper"][i] = mine[mine[:, 2] >= high - LANDING].mean(axis=0)
-        if _steepness(mine) < RAMP:
+        stair = places[part == part[distance.argmin()]]
+        low, high = stair[:, 2].min(), stair[:, 2].max()
+        edges["lower"][i] = stair[stair[:, 2] <= low + LANDING_HEIGHT].mean(axis=0)
+        edges["upper"][i] = stair[stair[:, 2] >= high - LANDING_HEIGHT].mean(axis=0)
+        if _steepness(stair) < RAMP_CLIMB:
             edges["kind"][i] = "ramp"
 
 
@@ -104,13 +106,13 @@ def _steepness(places: Array) -> float:
     return float(np.median(high - low)) / 0.6
 
 
-def _apart(edges: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-    """The edges of one pair of rooms, without those that lead through the same door: the widest is kept."""
-    kept: list[tuple[Any, ...]] = []
+def _distinct_doors(edges: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    """The edges of one pair of rooms, without those that lead through the same door as a wider one."""
+    distinct: list[tuple[Any, ...]] = []
     for edge in sorted(edges, key=lambda e: (-e[2], e[1])):
-        if all(np.linalg.norm(np.subtract(edge[1], other[1])) > max(SAME_DOOR, other[2] / 2) for other in kept):
-            kept.append(edge)
-    return sorted(kept)
+        if all(np.linalg.norm(np.subtract(edge[1], other[1])) > max(SAME_DOOR_DISTANCE, other[2] / 2) for other in distinct):
+            distinct.append(edge)
+    return sorted(distinct)
 
 
 def _edge(
@@ -134,7 +136,7 @@ def _edge(
     if storey_of_room[pair[0]] != storey_of_room[pair[1]]:
         kind = "stairs"
     else:
-        kind = "door" if width <= DOOR_WIDTH else "opening"
+        kind = "door" if width <= DOOR_MOST_WIDTH else "opening"
     across = float(np.arctan2(along[0], -along[1]) % np.pi)  # the wall's normal
     place = tuple(centre.tolist())
     standing = navigable.properties.get("standing")
@@ -144,7 +146,7 @@ def _edge(
 
 def _under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:
     """Rows of the navigable cells in the middle of a passage, at the height of the contact."""
-    reach, rise = int(0.25 / navigable.edge), int(HEIGHT / navigable.edge)
+    reach, rise = int(0.25 / navigable.edge), int(LEVEL_HEIGHT / navigable.edge)
     low = np.rint([*middle, contact[:, 2].mean()]).astype(np.int64) - (reach, reach, rise)
     window = np.argwhere(np.ones((2 * reach + 1, 2 * reach + 1, 2 * rise + 1), bool)) + low
     rows = navigable.rows(window)
@@ -166,7 +168,7 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
 
     Borders between clusters of views lie somewhere near a door, not in it; the floor itself is narrowest in the door.
     """
-    reach = int(np.ceil(SEARCH / navigable.edge))
+    reach = int(np.ceil(DOOR_SEARCH / navigable.edge))
     low = contact[:, :2].min(axis=0) - reach
     size = contact[:, :2].max(axis=0) + reach + 1 - low
     owner = _owners(navigable, room, low, size, contact)
@@ -178,10 +180,10 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
     away = np.sqrt(edt.edtsq(far.view(np.uint8), parallel=1))
     sides = []
     for p in pair:
-        mine = owner == p
-        if not mine.any():
+        side = owner == p
+        if not side.any():
             return None
-        away_enough = mine & (away >= min(0.6 * reach, away[mine].max()))
+        away_enough = side & (away >= min(0.6 * reach, away[side].max()))
         sides.append(np.argmax(np.where(away_enough, clearance, -1.0)))
     if clearance.flat[sides[0]] <= 1 or clearance.flat[sides[1]] <= 1:
         return None
@@ -203,7 +205,7 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
 
 def _owners(navigable: VoxelGrid, room: Array, low: Array, size: Array, contact: Array) -> Array:
     """(size) room of each column of a window at `low`, at the height of the contact; -1 where nobody can stand."""
-    reach = int(HEIGHT / navigable.edge)
+    reach = int(LEVEL_HEIGHT / navigable.edge)
     middle = round(float(contact[:, 2].mean()))
     levels = np.arange(middle - reach, middle + reach + 1)
     columns = np.argwhere(np.ones(size, bool)) + low

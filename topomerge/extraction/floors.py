@@ -9,8 +9,8 @@ from topomerge.extraction.components import connected_components
 from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.types import Array, VoxelGrid
 
-LEAST_AREA = 1.0  # m2
-LEAST_HALF_WIDTH = 0.2  # m: a wall's top is narrower, a floor on which somebody stands is not
+FLOOR_LEAST_AREA = 1.0  # m2
+FLOOR_LEAST_HALF_WIDTH = 0.2  # m: a wall's top is narrower, a floor on which somebody stands is not
 FURNITURE_AREA = 15.0  # m2: the largest table, stage or bed
 FURNITURE_HEIGHT = (0.25, 1.3)  # m over the floor beside it
 
@@ -37,7 +37,7 @@ def floor_components(grid: VoxelGrid) -> VoxelGrid:
     area = _columns(grid, component, count) * grid.edge**2
     widest = np.zeros(count, np.int64)
     np.maximum.at(widest, component, horizontal_distance_field(grid))
-    floor = (area >= LEAST_AREA) & ((widest + 0.5) * grid.edge >= LEAST_HALF_WIDTH)
+    floor = (area >= FLOOR_LEAST_AREA) & ((widest + 0.5) * grid.edge >= FLOOR_LEAST_HALF_WIDTH)
     suspects = np.flatnonzero(floor & (area <= FURNITURE_AREA))
     if len(suspects):
         large = grid.cells[(floor & (area > 2 * area[suspects].min()))[component]] * grid.edge
@@ -69,8 +69,8 @@ def _on_furniture(top: Array, floors: Array, below: cKDTree) -> bool:
     if len(near) <= len(top):
         return False
     distance, nearest = cKDTree(near[:, :2]).query(top[:, :2], distance_upper_bound=1.0)
-    found = np.isfinite(distance)
-    if found.mean() < 0.3:
+    beside_floor = np.isfinite(distance)
+    if beside_floor.mean() < 0.3:
         return False
-    rise = float(np.median(top[found, 2] - near[nearest[found], 2]))
+    rise = float(np.median(top[beside_floor, 2] - near[nearest[beside_floor], 2]))
     return FURNITURE_HEIGHT[0] <= rise <= FURNITURE_HEIGHT[1]

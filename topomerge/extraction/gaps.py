@@ -8,13 +8,13 @@ import numpy as np
 from topomerge.extraction.convolution import Kernel, any_at
 from topomerge.types import Array, VoxelGrid
 
-TILE = 256  # cells
+CLOSING_TILE = 256  # cells
 
 
 def bridge_gaps(grid: VoxelGrid, standing: VoxelGrid, stick: Kernel, reach: float) -> VoxelGrid:
     """Close gaps of up to twice `reach` m between cells that one can stand on.
 
-    The standing cells of a level and its two neighbours are closed horizontally; of the cells that this adds, those are kept in
+    The standing cells of a level and its two neighbours are closed horizontally; of the cells that this adds, those remain in
     which the stick fits. A kernel grown to bridge gaps lets beds become floor; this adds no height, so it does not.
 
     Args:
@@ -48,17 +48,17 @@ def _closing(columns: Array, radius: float) -> Array:
     """(k, 2) columns that closing by a disc of `radius` cells adds to the given ones, tile by tile: most of a building's box is
     empty on most of its levels."""
     margin = 2 * int(np.ceil(radius)) + 1
-    tile = columns // TILE
+    tile = columns // CLOSING_TILE
     added = []
     for corner in np.unique(tile, axis=0):
         # closing looks twice as far as its radius
-        low, high = corner * TILE - margin, (corner + 1) * TILE + margin
-        here = columns[((columns >= low) & (columns < high)).all(axis=1)]
-        start = np.maximum(here.min(axis=0) - margin, low)
-        plan = np.zeros(np.minimum(here.max(axis=0) + margin + 1, high) - start, bool)
-        plan[tuple((here - start).T)] = True
+        low, high = corner * CLOSING_TILE - margin, (corner + 1) * CLOSING_TILE + margin
+        window = columns[((columns >= low) & (columns < high)).all(axis=1)]
+        start = np.maximum(window.min(axis=0) - margin, low)
+        plan = np.zeros(np.minimum(window.max(axis=0) + margin + 1, high) - start, bool)
+        plan[tuple((window - start).T)] = True
         grown = edt.edtsq((~plan).view(np.uint8), parallel=1) <= radius**2
         closed = (edt.edtsq(grown.view(np.uint8), parallel=1) > radius**2) & ~plan
         cells = np.argwhere(closed) + start
-        added.append(cells[(cells // TILE == corner).all(axis=1)])
+        added.append(cells[(cells // CLOSING_TILE == corner).all(axis=1)])
     return np.concatenate(added)

@@ -16,7 +16,7 @@ def without_gaps(grid: VoxelGrid, neighbours: float, warnings: list[str]) -> Vox
     Cells that would be too large to find doors are not made.
 
     Args:
-        warnings: of what was done the user is told here.
+        warnings: what the user should know is appended here.
     """
     while len(grid) and 2 * grid.edge <= COARSEST_CELL and float(np.median(convolve(grid, moore()))) < neighbours:
         grid = grid.coarser(2)

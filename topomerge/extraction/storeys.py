@@ -7,10 +7,10 @@ import numpy as np
 from topomerge.kernels.columns import first_occupied
 from topomerge.types import STOREY_DTYPE, Array, VoxelGrid
 
-LEAST_AREA = 3.0  # m2
-LEAST_SHARE = 0.01  # of the largest storey: a landing upstairs is one
+STOREY_LEAST_AREA = 3.0  # m2
+STOREY_LEAST_SHARE = 0.01  # of the largest storey: a landing upstairs is one
 HIGHEST_CEILING = 30.0  # m
-LEAST_HEIGHT = 1.9  # m between floors: nobody stands upright in less
+STOREY_LEAST_HEIGHT = 1.9  # m between floors: nobody stands upright in less
 
 
 def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, Array]:
@@ -32,9 +32,9 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
     floors: list[int] = []
     largest = smooth.max()
     for z in np.argsort(-smooth, kind="stable"):
-        if smooth[z] < min(max(LEAST_AREA, LEAST_SHARE * largest), largest):
+        if smooth[z] < min(max(STOREY_LEAST_AREA, STOREY_LEAST_SHARE * largest), largest):
             break
-        if all(abs(int(z) - f) * navigable.edge >= LEAST_HEIGHT for f in floors):
+        if all(abs(int(z) - f) * navigable.edge >= STOREY_LEAST_HEIGHT for f in floors):
             floors.append(int(z))
     floors.sort()
     halfway = (np.array(floors[:-1]) + np.array(floors[1:])) / 2

@@ -18,9 +18,9 @@ log = logging.getLogger(__name__)
 # A group of points is a stray when it lies this far (m) from every larger group and holds less than this share of the cells.
 STRAY_DISTANCE = 10.0
 STRAY_SHARE = 0.01
-STRAY_TOTAL = 0.05  # of all cells may be strays
-MERGE_AT = 4_000_000  # cells of pending chunks
-LARGE = 2e8  # cells: 200 x 200 x 5 m at 0.1 m; smaller grids cost little whatever is in them
+STRAY_TOTAL_SHARE = 0.05  # of all cells may be strays
+PENDING_CELLS = 4_000_000  # cells of pending chunks
+LARGE_VOLUME = 2e8  # cells: 200 x 200 x 5 m at 0.1 m; smaller grids cost little whatever is in them
 
 
 def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1, warnings: list[str] | None = None) -> VoxelGrid:
@@ -48,15 +48,15 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
     if not len(cells):
         raise InputError("no finite point: nothing to voxelise")
     base, shape = _box(cells)
-    if _volume(shape) > LARGE:
-        kept = _without_strays(cells, edge)
+    if _volume(shape) > LARGE_VOLUME:
+        connected = _without_strays(cells, edge)
         # Nothing is dropped unless that makes the grid much smaller: a wing that was scanned thinly is no stray. And where
         # much would go, the points are not strays: the unit is wrong.
-        if _volume(_box(cells[kept])[1]) < _volume(shape) / 4 and kept.mean() > 1 - STRAY_TOTAL:
-            dropped = int(counts[~kept].sum())
+        if _volume(_box(cells[connected])[1]) < _volume(shape) / 4 and connected.mean() > 1 - STRAY_TOTAL_SHARE:
+            dropped = int(counts[~connected].sum())
             said = "1 stray point lies" if dropped == 1 else f"{dropped} stray points lie"
             warn(warnings, f"{said} more than {STRAY_DISTANCE:g} m from the rest: left out")
-            cells, counts = cells[kept], counts[kept]
+            cells, counts = cells[connected], counts[connected]
             base, shape = _box(cells)
     if (shape > morton.LIMIT).any() or _volume(shape) / 512 > lookup.MAX_BRICKS:
         extent = " x ".join(f"{s * edge:.0f}" for s in shape)
@@ -72,7 +72,7 @@ def _gather(chunks: Iterable[PointCloud], edge: float) -> tuple[Array, Array]:
     for chunk in chunks:
         base, cells, counts = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), edge)
         pending.append((cells + base, counts))
-        if sum(len(c) for c, _ in pending) > max(len(merged[0]), MERGE_AT):
+        if sum(len(c) for c, _ in pending) > max(len(merged[0]), PENDING_CELLS):
             merged, pending = _merge([merged, *pending]), []
     return _merge([merged, *pending])
 

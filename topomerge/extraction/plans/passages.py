@@ -13,7 +13,7 @@ import edt
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.classified_storey import DOORWAY, SHUT, WALL
+from topomerge.extraction.classified_storey import DOORWAY_CLASS, SHUT_CLASS, WALL_CLASS
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.kernels import crossing
 from topomerge.kernels.watershed import contacts, watershed
@@ -69,7 +69,7 @@ def regions_of(plan: StoreyPlan, probability: Array) -> Array:
     Args:
         probability: (nx, ny, 5) what probably stands in each column, see `COLUMN_CLASSES`.
     """
-    barrier = plan.inside & (probability[..., WALL : SHUT + 1].sum(axis=-1) > BARRIER_CHANCE)
+    barrier = plan.inside & (probability[..., WALL_CLASS : SHUT_CLASS + 1].sum(axis=-1) > BARRIER_CHANCE)
     clearance = edt.edt((plan.inside & ~barrier).view(np.uint8), black_border=True, parallel=1) * plan.edge
     order = np.argsort(-clearance, axis=None, kind="stable")
     order = order[clearance.ravel()[order] > 0]
@@ -108,7 +108,10 @@ class _Measure:
         self.thick_wall = ndimage.binary_dilation(plan.wall, np.ones((3, 3)))  # walls are not quite straight
         self.nearest_wall = ndimage.distance_transform_edt(plan.inside, return_distances=False, return_indices=True)
         low = plan.clear < plan.ceiling - LINTEL_DROP  # nan: no
-        doorway, boundary = np.ascontiguousarray(probability[..., DOORWAY]), probability[..., WALL : SHUT + 1].sum(axis=-1)
+        doorway, boundary = (
+            np.ascontiguousarray(probability[..., DOORWAY_CLASS]),
+            probability[..., WALL_CLASS : SHUT_CLASS + 1].sum(axis=-1),
+        )
         self.layers = low, doorway, boundary
 
     def passage(self, a: int, b: int, at: int) -> Passage:

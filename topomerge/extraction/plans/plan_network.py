@@ -15,14 +15,14 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.classified_storey import COLUMN_CLASSES, INSIDE
+from topomerge.extraction.classified_storey import COLUMN_CLASSES, INSIDE_CLASS
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.io.weight_files import weights_file
 from topomerge.numpy_nn import convolution, linear, softmax
 from topomerge.types import Array
 
 PLAN_NETWORK_FILE = "plan_network.npz"
-HEIGHT_BANDS = ((0.1, 0.5), (0.5, 1.2), (1.2, 2.0), (2.0, 2.4))  # m
+EVIDENCE_HEIGHTS = ((0.1, 0.5), (0.5, 1.2), (1.2, 2.0), (2.0, 2.4))  # m
 EVIDENCE_CHANNELS = 11
 COARSEST_STRIDE = 16  # columns a side, of an element of the coarsest level
 DOWN_LEVELS = ("a", "b", "c", "d")  # levels of 1/2, 1/4, 1/8, 1/16: each halves and goes on
@@ -34,7 +34,7 @@ def evidence(plan: StoreyPlan) -> Array:
     """(nx, ny, 11) float32 of what was seen in each column: known, wall, how full four bands of heights are, floor, lintel,
     ceiling and its height, and how large a column is."""
     levels = []
-    for low, high in HEIGHT_BANDS:
+    for low, high in EVIDENCE_HEIGHTS:
         mask = np.uint64(plan.bands.mask(low, high))
         levels.append(np.bitwise_count(plan.profile & mask) / float(np.bitwise_count(mask)))
     seen = ~np.isnan(plan.clear)
@@ -65,7 +65,7 @@ def without_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:
     Args:
         probability: (nx, ny, 5) of each of `COLUMN_CLASSES`.
     """
-    furniture = plan.wall & (probability[..., INSIDE] > np.where(np.isnan(plan.ceiling), *FURNITURE_CHANCE))
+    furniture = plan.wall & (probability[..., INSIDE_CLASS] > np.where(np.isnan(plan.ceiling), *FURNITURE_CHANCE))
     furniture &= ~ndimage.binary_dilation(plan.wall & ~furniture, np.ones((3, 3)))
     return replace(plan, wall=plan.wall & ~furniture, inside=plan.inside | furniture)
 

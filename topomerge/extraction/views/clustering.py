@@ -26,7 +26,7 @@ def markov_clusters(
         similarity: (V, V) symmetric, not negative, with self loops on the diagonal.
         inflation: above 1; larger gives smaller clusters.
         threshold: flow below it is pruned.
-        most: entries kept in a column.
+        most: entries of a column; smaller ones go.
         rounds: at most so many steps.
 
     Returns:

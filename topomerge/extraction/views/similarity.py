@@ -41,9 +41,9 @@ def jaccard_similarity(
     first, second = first[possible], second[possible]
     both = sets.intersections(visibility.indptr, visibility.words, visibility.masks, first, second)
     value = both / (sizes[first] + sizes[second] - both)
-    kept = (value >= threshold) & (both > 0)
-    first, second, value = first[kept], second[kept], value[kept]
-    own = np.arange(len(visibility))
-    rows, columns = np.concatenate([first, second, own]), np.concatenate([second, first, own])
-    values = np.concatenate([value, value, np.ones(len(own))])
-    return sparse.csr_array((values, (rows, columns)), shape=(len(own), len(own)))
+    similar = (value >= threshold) & (both > 0)
+    first, second, value = first[similar], second[similar], value[similar]
+    view = np.arange(len(visibility))
+    rows, columns = np.concatenate([first, second, view]), np.concatenate([second, first, view])
+    values = np.concatenate([value, value, np.ones(len(view))])
+    return sparse.csr_array((values, (rows, columns)), shape=(len(view), len(view)))

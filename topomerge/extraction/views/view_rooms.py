@@ -26,7 +26,7 @@ def rooms_of_views(grid: VoxelGrid, navigable: VoxelGrid, p: ThesisParameters, w
         grid: occupied cells.
         navigable: the navigable volume.
         p: parameters of the thesis.
-        watch: is told of each step.
+        watch: measures each step.
     """
     watch.begin("views", 0.4)
     views = optimal_views(navigable, p.view_radius, p.view_height)  # 2.4

@@ -20,7 +20,7 @@ VIEWS_AT_ONCE = 64  # whose cells in range are held at a time: some 20,000 each
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The cells that each of V views sees: sorted sets of rows, kept as bits, 64 rows a word.
+    """The cells that each of V views sees: sorted sets of rows as bits, 64 rows a word.
 
     Rows stand in Morton order, so neighbours in space share words: a set of ten thousand cells takes about 5 kB.
     """
