@@ -19,14 +19,14 @@ from topomerge.datasets.pairs.evaluation_pair import KeptPair, load_set
 from topomerge.embedding.embedders import embedder
 from topomerge.evaluation.score import FLAT, pose_error, within
 from topomerge.fusion.merge import merge
-from topomerge.matching.consistency import CANDIDATES, candidate_poses, distinct, votes
+from topomerge.matching.consistency import CONSISTENCY, best_of, candidate_poses, votes
 from topomerge.matching.costs import best_partners, descriptor_costs, similarities
 from topomerge.matching.match import match
-from topomerge.matching.topdown import TopDown, top_down
+from topomerge.matching.room_plans import RoomPlans, room_plans
 from topomerge.types import Array, Sim3, TopometricMap
 
 NEAR, RIGHT = (1.0, 10.0), (0.5, 5.0)  # m, degrees
-PARTNERS = (1, 2, 3, CANDIDATES)  # of a room
+PARTNERS = (1, 2, 3, CONSISTENCY.partners)  # of a room
 MOST = 1000  # poses that are looked through
 
 
@@ -38,17 +38,15 @@ def right(pose: Sim3, pair: KeptPair, limits: tuple[float, float]) -> bool:
 
 
 def proposed(
-    a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], cost: Array, partners: int, pair: KeptPair
+    a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], cost: Array, partners: int, pair: KeptPair
 ) -> tuple[int, float]:
     """Number of poses, and the place of the first right one in the order of how many rooms speak for each; inf without one."""
     pairs = best_partners(cost, partners)
     weight = similarities(cost)[tuple(pairs.T)] + 1e-3
     poses = candidate_poses(a, b, plans, pairs, weight, False)
-    order = distinct(poses, votes(poses), MOST) if len(poses.yaw) else []
-    for place, h in enumerate(order, 1):
-        if right(Sim3(float(poses.yaw[h]), tuple(poses.shift[h].tolist())), pair, NEAR):  # type: ignore[arg-type]
-            return len(poses.yaw), float(place)
-    return len(poses.yaw), np.inf
+    ranked = best_of(poses, votes(poses), plans[1].middle, MOST) if len(poses) else poses
+    places = (k for k in range(len(ranked)) if right(ranked.transform(k), pair, NEAR))
+    return len(poses), float(next(places, np.inf)) + 1
 
 
 def measured(pair: KeptPair, name: str, merged: bool) -> dict[str, Any]:
@@ -58,7 +56,7 @@ def measured(pair: KeptPair, name: str, merged: bool) -> dict[str, Any]:
     rows = describe(a), describe(b)
     out: dict[str, Any] = {"embed": time.process_time() - began}
     rows_of_map = {id(a): rows[0], id(b): rows[1]}
-    plans, cost = (top_down(a), top_down(b)), descriptor_costs(*rows)
+    plans, cost = (room_plans(a), room_plans(b)), descriptor_costs(*rows)
     out["proposed"] = {n: proposed(a, b, plans, cost, n, pair) for n in PARTNERS}
     hypotheses = match(a, b, lambda m: rows_of_map[id(m)]).alternatives
     out["matched"] = bool(hypotheses) and right(hypotheses[0].transform, pair, RIGHT)
@@ -94,7 +92,7 @@ def main() -> None:
             poses, place = np.array([r["proposed"][n] for r in some]).T
             most = " / ".join(f"{np.sort(place)[int(q * (len(place) - 1))]:.0f}" for q in (0.5, 0.9))
             cells = [f"{np.median(poses):.0f}", most, *(f"{np.mean(place <= k):.2f}" for k in (10, 60))]
-            matched = f"{good:.2f}" if n == CANDIDATES else "–"
+            matched = f"{good:.2f}" if n == CONSISTENCY.partners else "–"
             print(f"| {name} | {len(some)} | {took:.3f} | {n} | {' | '.join(cells)} | {matched} |")
     for name, some in rows.items():
         done = [r for r in some if "merge" in r]

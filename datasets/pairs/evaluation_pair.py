@@ -21,9 +21,8 @@ from topomerge.embedding.schema import column
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.io.maps import load_map, save_map
-from topomerge.matching.consistency import matches_under, storey_map
-from topomerge.matching.poses import PoseArrays
-from topomerge.matching.topdown import top_down
+from topomerge.matching.consistency import matches_under
+from topomerge.matching.room_plans import room_plans
 from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
 
 TWIN_AREA, TWIN_SIDE = 0.05, 0.25  # share, m: rooms that differ by less are near-identical
@@ -208,9 +207,7 @@ def laid(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
     t = pair.truth
     if t is None or pair.kind != "overlap":
         return np.zeros((0, 2), np.int64)
-    plans = (top_down(maps[0]), top_down(maps[1]))
-    pose = PoseArrays(np.array([t.yaw]), np.array([t.translation]), np.array([t.scale]), np.ones(1))
-    rooms, fit = matches_under(t, plans, storey_map(pose, plans[0].floors, plans[1].floors)[0])
+    rooms, fit = matches_under(t, (room_plans(maps[0]), room_plans(maps[1])))
     kept: list[tuple[int, int]] = []
     for i, j in rooms[np.argsort(-fit, kind="stable")][: int((fit >= LAID).sum())].tolist():
         if i not in {k[0] for k in kept} and j not in {k[1] for k in kept}:

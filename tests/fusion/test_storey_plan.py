@@ -10,7 +10,6 @@ from tests.scenes import HEIGHT, Scene
 from topomerge.errors import InputError
 from topomerge.fusion.storey_levels import extruded, slices
 from topomerge.fusion.storey_plan import plans
-from topomerge.kernels.plan import column_bits, on_lines
 from topomerge.types import VoxelGrid
 
 
@@ -37,11 +36,11 @@ def test_walls_floor_and_furniture_of_a_room(room):
 
 def test_without_ceiling_and_without_all_that_is_low(room):
     (low,) = plans(grid_of(room[room[:, 2] < 2.4]))
-    assert np.isfinite(low.floor) and np.isnan(low.ceiling) and at(low, low.free, 5, 2) and at(low, low.wall, 3, 0.05)
+    assert np.isfinite(low.levels[0]) and np.isnan(low.levels[1]) and at(low, low.free, 5, 2) and at(low, low.wall, 3, 0.05)
     (high,) = plans(grid_of(room[room[:, 2] > 1.0]))
-    assert np.isnan(high.floor) and high.ceiling == pytest.approx(HEIGHT, abs=0.1)
+    assert np.isnan(high.levels[0]) and high.levels[1] == pytest.approx(HEIGHT, abs=0.1)
     assert at(high, high.free, 5, 2) and at(high, high.wall, 3, 0.05)
-    assert high.guess == pytest.approx(0.0, abs=0.15)
+    assert high.floor_guess == pytest.approx(0.0, abs=0.15)
 
 
 def test_a_slice_shows_walls_and_what_rays_crossed(room):
@@ -61,13 +60,13 @@ def test_slices_of_two_storeys():
     above = cut + np.array([0, 0, 3.1], np.float32)
     found = plans(grid_of(np.concatenate([cut, above])))
     assert [p.sliced for p in found] == [True, True]
-    assert found[1].floor - found[0].floor == pytest.approx(3.1, abs=0.05)
+    assert found[1].levels[0] - found[0].levels[0] == pytest.approx(3.1, abs=0.05)
 
 
 def test_storeys_above_each_other():
     found = plans(grid_of(doubled(office())))
     assert len(found) == 2
-    assert found[1].floor - found[0].floor == pytest.approx(HEIGHT + 0.3, abs=0.1)
+    assert found[1].levels[0] - found[0].levels[0] == pytest.approx(HEIGHT + 0.3, abs=0.1)
     same = found[0].wall & found[1].wall
     assert same.sum() > 0.9 * found[0].wall.sum()
 
@@ -89,32 +88,6 @@ def test_extruded_drawings_are_maps():
 def test_an_empty_map_is_refused():
     with pytest.raises(InputError, match="no occupied cells"):
         plans(VoxelGrid.from_cells(np.zeros((0, 3), int)))
-
-
-def test_column_bits_equal_a_slow_twin():
-    rng = np.random.default_rng(0)
-    ix, iy, z = rng.integers(-1, 7, 300), rng.integers(-1, 6, 300), rng.uniform(-1, 9, 300)
-    z[::17] = np.nan
-    base = rng.uniform(0, 1, (6, 5))
-    slow = np.zeros((6, 5), np.uint32)
-    for x, y, h in zip(ix, iy, z, strict=True):
-        if 0 <= x < 6 and 0 <= y < 5 and not np.isnan(h):
-            k = int(np.floor((h - base[x, y] + 0.5) / 0.25))
-            slow[x, y] |= np.uint32(1 << k) if 0 <= k < 32 else np.uint32(0)
-    assert np.array_equal(column_bits(ix, iy, z, base, -0.5, 0.25), slow)
-
-
-def test_on_lines_keeps_straight_runs_only():
-    mask = np.zeros((40, 40), bool)
-    mask[5, 3:30] = True
-    mask[np.arange(10, 35), np.arange(10, 35)] = True
-    legs = [(20, 5), (22, 7), (33, 3), (35, 6), (30, 9)]
-    for leg in legs:
-        mask[leg] = True
-    angles = np.pi * np.arange(24) / 24
-    kept = on_lines(mask, np.cos(angles), np.sin(angles), 12, 11, 3)
-    assert kept[5, 3:30].all() and kept[np.arange(10, 35), np.arange(10, 35)].all()
-    assert not any(kept[leg] for leg in legs)
 
 
 def test_a_slice_that_was_given_walls_stays_a_slice(room):

@@ -25,9 +25,8 @@ from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.storey_levels import extruded
 from topomerge.kernels import morton
-from topomerge.matching.consistency import matches_under, storey_map
-from topomerge.matching.poses import PoseArrays
-from topomerge.matching.topdown import top_down
+from topomerge.matching.consistency import matches_under
+from topomerge.matching.room_plans import room_plans
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
@@ -237,9 +236,7 @@ def rooms_in_common(a: TopometricMap, b: TopometricMap, transform: Sim3) -> tupl
     """
     if not len(a.rooms) or not len(b.rooms):
         return np.zeros((0, 2), np.int64), np.zeros(0)
-    plans = (top_down(a), top_down(b))
-    pose = PoseArrays(np.array([transform.yaw]), np.array([transform.translation]), np.array([transform.scale]), np.ones(1))
-    return matches_under(transform, plans, storey_map(pose, plans[0].floors, plans[1].floors)[0])
+    return matches_under(transform, (room_plans(a), room_plans(b)))
 
 
 def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3) -> Array:

@@ -137,12 +137,12 @@ class Side:
         self.bits = np.ones_like(fields.plan.profile) if flat else fields.plan.profile & np.uint32(common)
         if common and not fields.plan.sliced:
             kind[(kind == align.CLUTTER) & ((fields.plan.profile & np.uint32(common)) == 0)] = align.FREE
-        many = ndimage.uniform_filter((kind == align.CLUTTER).astype(np.float32), 3) * 9
+        clutter_around = ndimage.uniform_filter((kind == align.CLUTTER).astype(np.float32), 3) * 9
         clutter = kind == align.CLUTTER
-        solid = clutter & (many > 4.5)
+        solid = clutter & (clutter_around > 4.5)
         kind[clutter & ~solid] = align.HAZE
         self.kind = kind
-        self.open = (solid | ((kind == align.FREE) & (many < 1.5))) & (fields.to_wall >= INNER_REACH)
+        self.open = (solid | ((kind == align.FREE) & (clutter_around < 1.5))) & (fields.to_wall >= INNER_REACH)
         rows = np.argwhere(kind > 0)
         self.weight = fields.plan.edge**2 * max(len(rows) / JUDGED_COLUMNS, 1.0)
         if len(rows) > JUDGED_COLUMNS:

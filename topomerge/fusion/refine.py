@@ -11,13 +11,13 @@ from topomerge.fusion.cell_means import cell_middles
 from topomerge.kernels import icp
 from topomerge.types import Array, Sim3, VoxelGrid
 
-BLOCK = 2  # cells
-STAGES = ((2, 0.2), (1, 0.1), (1, 0.06))  # blocks in which partners are looked for, and sigma of the robust weights, m
-ROUNDS = 8  # of each stage at most
-SAMPLE = 6_000  # points that are moved
-FLAT = 0.6  # points of less flat neighbourhoods have no plane
-LEAST = 50  # partners, below which nothing is refined
-STILL = (1e-4, 1e-5)  # m, rad: a smaller step ends a stage
+SURFACE_BLOCK = 2  # cells
+REFINE_STAGES = ((2, 0.2), (1, 0.1), (1, 0.06))  # blocks in which partners are looked for, and sigma of the robust weights, m
+STAGE_ROUNDS = 8  # of each stage at most
+MOVED_POINTS = 6_000  # points that are moved
+LEAST_FLATNESS = 0.6  # points of less flat neighbourhoods have no plane
+LEAST_PARTNERS = 50  # partners, below which nothing is refined
+STILL_STEP = (1e-4, 1e-5)  # m, rad: a smaller step ends a stage
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Refined:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points, one a block of `BLOCK` cells a side, with the normals of the planes they lie on. Rows are those of the grid."""
+    """Points, one a block of `SURFACE_BLOCK` cells a side, with the normals of their planes. Rows are those of the grid."""
 
     grid: VoxelGrid
     points: Array
@@ -42,11 +42,11 @@ class Surface:
 def surface(grid: VoxelGrid) -> Surface:
     """Blocks of cells, their mean points, and normals from the cells within two of the block's first one."""
     points = cell_middles(grid)
-    coarse = grid.cells // BLOCK
-    blocks = VoxelGrid.from_cells(coarse, grid.origin, grid.edge * BLOCK)
+    coarse = grid.cells // SURFACE_BLOCK
+    blocks = VoxelGrid.from_cells(coarse, grid.origin, grid.edge * SURFACE_BLOCK)
     owner = blocks.rows(coarse)
-    many = np.bincount(owner, minlength=len(blocks))
-    middle = np.column_stack([np.bincount(owner, points[:, k], len(blocks)) / many for k in range(3)])
+    sizes = np.bincount(owner, minlength=len(blocks))
+    middle = np.column_stack([np.bincount(owner, points[:, k], len(blocks)) / sizes for k in range(3)])
     gap = ((points - middle[owner]) ** 2).sum(axis=1)
     nearest = np.full(len(blocks), np.inf)
     np.minimum.at(nearest, owner, gap)
@@ -58,14 +58,14 @@ def surface(grid: VoxelGrid) -> Surface:
 
 
 def refine_pose(
-    a: Surface, b: Surface, start: Sim3, scaled: bool = False, stages: Sequence[tuple[int, float]] = STAGES
+    a: Surface, b: Surface, start: Sim3, scaled: bool = False, stages: Sequence[tuple[int, float]] = REFINE_STAGES
 ) -> Refined:
     """T_ab that brings b's surfaces onto a's, from a start that is right to a few decimetres.
 
     Slices have vertical planes only: what the planes do not fix (the height) stays as it was.
     """
-    rows = np.flatnonzero(b.flat >= FLAT)
-    if len(rows) > SAMPLE:
+    rows = np.flatnonzero(b.flat >= LEAST_FLATNESS)
+    if len(rows) > MOVED_POINTS:
         rows = _spread(b, rows)
     middle = b.points[rows].mean(axis=0) if len(rows) else np.zeros(3)
     moving, direction = np.ascontiguousarray(b.points[rows] - middle), np.ascontiguousarray(b.normals[rows])
@@ -73,14 +73,14 @@ def refine_pose(
     fixed = (*a.grid._bricks, a.grid.origin, a.grid.edge, a.points, a.normals, moving, direction)
     rmse, share = float("nan"), 0.0
     for reach, sigma in stages:
-        for _ in range(ROUNDS):
-            h, g, many, weight, square = icp.gather(*fixed, pose, reach, sigma, scaled)
-            if many < LEAST:
-                return Refined(start, float("nan"), many / max(len(rows), 1))
-            rmse, share = float(np.sqrt(square / weight)), many / len(rows)
+        for _ in range(STAGE_ROUNDS):
+            h, g, partners, weight, square = icp.gather(*fixed, pose, reach, sigma, scaled)
+            if partners < LEAST_PARTNERS:
+                return Refined(start, float("nan"), partners / max(len(rows), 1))
+            rmse, share = float(np.sqrt(square / weight)), partners / len(rows)
             step = _step(h, g, weight, scaled)
             pose = pose + step
-            if np.abs(step[:3]).max() < STILL[0] and abs(step[3]) < STILL[1]:
+            if np.abs(step[:3]).max() < STILL_STEP[0] and abs(step[3]) < STILL_STEP[1]:
                 break
     turn = Sim3((pose[3] + np.pi) % (2 * np.pi) - np.pi, (0.0, 0.0, 0.0), float(np.exp(pose[4])))
     x, y, z = (pose[:3] - turn.apply(middle[None])[0]).tolist()
@@ -91,7 +91,7 @@ def _spread(b: Surface, rows: Array) -> Array:
     """A sample that has as many upright planes as level ones: floors fix the height only."""
     level = np.abs(b.normals[rows, 2]) > 0.7
     rng = np.random.default_rng(0)
-    chosen = [rng.permutation(rows[mask])[: SAMPLE * part // 4] for mask, part in ((level, 1), (~level, 3))]
+    chosen = [rng.permutation(rows[mask])[: MOVED_POINTS * part // 4] for mask, part in ((level, 1), (~level, 3))]
     return np.sort(np.concatenate(chosen))
 
 

@@ -77,8 +77,8 @@ def _heaps(at: Array, size: int) -> Array:
     """(S, size) how much higher than around it the projections (n, S), m, are heaped up; unit norm."""
     columns = np.floor((at - at.min(axis=0)) / HEAP_BIN).astype(np.int64)
     flat = (columns + np.arange(at.shape[1]) * size).ravel()
-    many = np.bincount(flat, minlength=at.shape[1] * size).reshape(at.shape[1], size).astype(np.float64)
-    sharp, blunt = (ndimage.gaussian_filter1d(many, s / HEAP_BIN, axis=1, mode="constant") for s in HEAP_SIGMAS)
+    counts = np.bincount(flat, minlength=at.shape[1] * size).reshape(at.shape[1], size).astype(np.float64)
+    sharp, blunt = (ndimage.gaussian_filter1d(counts, s / HEAP_BIN, axis=1, mode="constant") for s in HEAP_SIGMAS)
     heaps = np.clip(sharp - blunt, 0.0, None)
     out: Array = heaps / np.maximum(np.linalg.norm(heaps, axis=1, keepdims=True), 1e-9)
     return out

@@ -25,8 +25,8 @@ def height_offsets(a: Sequence[StoreyPlan], b: Sequence[StoreyPlan], scale: floa
         for q in b:
             floors, ceilings = ((p.levels[k], q.levels[k]) for k in (0, 1))
             guesses = (p.floor_guess, q.floor_guess)
-            here, there = next((pair for pair in (floors, ceilings) if np.isfinite(pair).all()), guesses)
-            offset = here - scale * there
+            of_a, of_b = next((pair for pair in (floors, ceilings) if np.isfinite(pair).all()), guesses)
+            offset = of_a - scale * of_b
             if all(abs(offset - other) > SEARCH.height_gap for other in offsets):
                 offsets.append(float(offset))
     return offsets

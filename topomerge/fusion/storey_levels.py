@@ -21,11 +21,11 @@ def extruded(grid: VoxelGrid) -> bool:
     if not len(grid):
         return False
     level = grid.cells[:, 2] - grid.cells[:, 2].min()
-    many = np.bincount(level)[1:]
-    if len(many) < EXTRUDED_LEVELS or (many != many[0]).any():
+    counts = np.bincount(level)[1:]
+    if len(counts) < EXTRUDED_LEVELS or (counts != counts[0]).any():
         return False
     first = grid.cells[level == 1, :2]
-    return all(np.array_equal(grid.cells[level == k, :2], first) for k in range(2, len(many) + 1))
+    return all(np.array_equal(grid.cells[level == k, :2], first) for k in range(2, len(counts) + 1))
 
 
 def lines_of(grid: VoxelGrid) -> tuple[VoxelGrid, VoxelGrid]:
@@ -46,10 +46,10 @@ def slices(grid: VoxelGrid) -> list[float]:
     if float(np.ptp(z)) + grid.edge <= SLICE_HEIGHT:
         return [] if _filled(grid.cells, grid.edge) else [float(np.median(z))]
     thick = max(round(SLICE_HEIGHT / 2 / grid.edge), 1)
-    many = np.convolve(np.bincount(grid.cells[:, 2], minlength=grid.shape[2]), np.ones(thick), "same")
+    counts = np.convolve(np.bincount(grid.cells[:, 2], minlength=grid.shape[2]), np.ones(thick), "same")
     layers: list[int] = []
-    for k in np.argsort(-many, kind="stable"):
-        if many[k] < LAYER_SHARE * len(grid):
+    for k in np.argsort(-counts, kind="stable"):
+        if counts[k] < LAYER_SHARE * len(grid):
             break
         if all(abs(int(k) - other) * grid.edge >= STOREY_GAP for other in layers):
             layers.append(int(k))

@@ -100,11 +100,11 @@ def _local_floor(ix: Array, iy: Array, z: Array, heights: Array) -> Array:
     lowest = np.full(heights.shape, np.inf)
     np.minimum.at(lowest, (ix[near], iy[near]), z[near])
     seen = np.isfinite(lowest)
-    many = seen.astype(np.float32)
+    weight = seen.astype(np.float32)
     total = np.where(seen, lowest - heights, 0.0).astype(np.float32)
     cells = FLOOR_RADIUS / COLUMN_EDGE
-    many, total = (ndimage.gaussian_filter(i, cells, truncate=2.0) for i in (many, total))
-    return heights + np.where(many > 0.02, total / np.maximum(many, 1e-6), 0.0)
+    weight, total = (ndimage.gaussian_filter(i, cells, truncate=2.0) for i in (weight, total))
+    return heights + np.where(weight > 0.02, total / np.maximum(weight, 1e-6), 0.0)
 
 
 def _ceiling(ix: Array, iy: Array, z: Array, base: float, ceiling: float, shape: tuple[int, ...]) -> Array:
@@ -137,9 +137,8 @@ def _plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: tuple[
     if sliced:
         wall = _straight(wall, cell)
     inside = ~wall & (standing | rays | (shut & (not sliced)))
-    heights = (floor, ceiling)
     return StoreyPlan(
-        origin, cell, wall, inside, occupied, BANDS, *heights, levels=levels, observed=observed, sliced=sliced
+        origin, cell, wall, inside, occupied, BANDS, floor, ceiling, levels=levels, observed=observed, sliced=sliced
     )
 
 

@@ -35,12 +35,12 @@ def winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
     main = np.radians(float(judge.a[0].profile.argmax()) / 2)
     moved = np.zeros(2)
     for v, w in storeys_at(judge.a, judge.b, pose.translation[2], pose.scale):
-        for here, there, move, side in ((w, v, pose, 0), (v, w, back, 1)):
-            rows, stuck = _walls(here, there, move)
-            moved += _moved(rows, there, main if side == 0 else main - pose.yaw)
+        for source, target, move, side in ((w, v, pose, 0), (v, w, back, 1)):
+            rows, stuck = _walls(source, target, move)
+            moved += _moved(rows, target, main if side == 0 else main - pose.yaw)
             rows[:, 5] *= (pose.scale if side == 0 else 1.0) ** 2
             if side == 1:  # all in the frame of a
-                rows[:, :2] = here.walls
+                rows[:, :2] = source.walls
             else:
                 rows[:, 4] += pose.yaw
             walls = np.concatenate([walls, rows])
@@ -50,30 +50,30 @@ def winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
     return {**shares, **_furniture(judge, pose), **_overhead(judge, pose)}
 
 
-def _walls(here: PlanFields, there: PlanFields, move: Sim3) -> tuple[Array, float]:
+def _walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, float]:
     """(n, 6) of each wall column: place in the other map, is it on known ground, does it agree, direction, m2; and the m2 of high
     walls in runs that stand on free ground."""
-    points = here.walls
+    points = source.walls
     at = move.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
-    cells = np.floor((at - there.plan.origin) / there.plan.edge).astype(np.int64)
-    inside = np.asarray(((cells >= 0) & (cells < there.plan.wall.shape)).all(axis=1))
+    cells = np.floor((at - target.plan.origin) / target.plan.edge).astype(np.int64)
+    inside = np.asarray(((cells >= 0) & (cells < target.plan.wall.shape)).all(axis=1))
     i, j = np.where(inside[:, None], cells, 0).T
-    near = inside & (there.to_wall[i, j] <= SAME_WALL)
-    seen = inside & (near | (there.kind[i, j] != 0))
-    clash = inside & (there.kind[i, j] == align.FREE) & (there.to_any[i, j] >= FREE_MARGIN)
-    area = here.plan.edge**2
-    rows = np.column_stack([at, seen, near, here.directions, np.full(len(at), area)])
-    mask = np.zeros(here.plan.wall.shape, bool)
-    mask[here.plan.wall] = clash & here.tall
+    near = inside & (target.to_wall[i, j] <= SAME_WALL)
+    seen = inside & (near | (target.kind[i, j] != 0))
+    clash = inside & (target.kind[i, j] == align.FREE) & (target.to_any[i, j] >= FREE_MARGIN)
+    area = source.plan.edge**2
+    rows = np.column_stack([at, seen, near, source.directions, np.full(len(at), area)])
+    mask = np.zeros(source.plan.wall.shape, bool)
+    mask[source.plan.wall] = clash & source.tall
     label, _ = ndimage.label(mask, np.ones((3, 3), int))
     long = 0.0
     for number, box in enumerate(ndimage.find_objects(label), 1):
-        if max(s.stop - s.start for s in box) * here.plan.edge >= WALL_RUN:
+        if max(s.stop - s.start for s in box) * source.plan.edge >= WALL_RUN:
             long += float((label[box] == number).sum())
     return rows, long * area
 
 
-def _moved(rows: Array, there: PlanFields, main: float) -> Array:
+def _moved(rows: Array, target: PlanFields, main: float) -> Array:
     """How much more of the walls would agree if each square were moved along one of the main directions by itself, m2, and how
     much there is of them: a longer end fits only after such a move, and furniture or noise hardly fit better."""
     rows = rows[rows[:, 2] > 0]
@@ -81,7 +81,7 @@ def _moved(rows: Array, there: PlanFields, main: float) -> Array:
     steps = np.concatenate([[0.0], steps, -steps])
     axes = np.array([[np.cos(main), np.sin(main)], [-np.sin(main), np.cos(main)]])
     shifts = np.concatenate([steps[:, None] * axes[0], steps[1:, None] * axes[1]])
-    size = np.array(there.to_wall.shape)
+    size = np.array(target.to_wall.shape)
     out = np.zeros(2)
     for offset in (0.0, 0.5):
         square = np.floor(rows[:, :2] @ axes.T / WINDOW_SIDE + offset).astype(np.int64)
@@ -89,10 +89,10 @@ def _moved(rows: Array, there: PlanFields, main: float) -> Array:
         area = np.bincount(owner, weights=rows[:, 5], minlength=1)
         fit = np.zeros((len(shifts), len(area)))
         for k, shift in enumerate(shifts):
-            cells = np.floor((rows[:, :2] + shift - there.plan.origin) / there.plan.edge).astype(np.int64)
+            cells = np.floor((rows[:, :2] + shift - target.plan.origin) / target.plan.edge).astype(np.int64)
             inside = ((cells >= 0) & (cells < size)).all(axis=1)
             i, j = np.where(inside[:, None], cells, 0).T
-            weight = np.where(inside, np.exp(-((there.to_wall[i, j] / WINDOW_SIGMA) ** 2) / 2), 0.0) * rows[:, 5]
+            weight = np.where(inside, np.exp(-((target.to_wall[i, j] / WINDOW_SIGMA) ** 2) / 2), 0.0) * rows[:, 5]
             fit[k] = np.bincount(owner, weights=weight, minlength=1)
         compared = area >= WINDOW_WALLS
         gain = np.maximum(fit[1:].max(axis=0) - fit[0], 0.0)
@@ -125,17 +125,17 @@ def _overhead(judge: Judge, pose: Sim3) -> dict[str, float]:
     look higher."""
     pieces, back = np.zeros((2, 2)), pose.inverse()
     for v, w in storeys_at(judge.a, judge.b, pose.translation[2], pose.scale):
-        for side, (here, there, move) in enumerate(((w, v, pose), (v, w, back))):
-            rows = np.argwhere(here.hung == 2)
+        for side, (source, target, move) in enumerate(((w, v, pose), (v, w, back))):
+            rows = np.argwhere(source.hung == 2)
             if not len(rows):
                 continue
-            at = np.column_stack([here.plan.origin + (rows + 0.5) * here.plan.edge, np.zeros(len(rows))])
-            cells = np.floor((move.apply(at)[:, :2] - there.plan.origin) / there.plan.edge).astype(np.int64)
-            cells = cells[((cells >= 1) & (cells < np.array(there.hung.shape) - 1)).all(axis=1)]
-            around = np.stack([there.hung[cells[:, 0] + i, cells[:, 1] + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+            at = np.column_stack([source.plan.origin + (rows + 0.5) * source.plan.edge, np.zeros(len(rows))])
+            cells = np.floor((move.apply(at)[:, :2] - target.plan.origin) / target.plan.edge).astype(np.int64)
+            cells = cells[((cells >= 1) & (cells < np.array(target.hung.shape) - 1)).all(axis=1)]
+            around = np.stack([target.hung[cells[:, 0] + i, cells[:, 1] + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
             seen = (around > 0).sum(axis=0) > 4
             met = (around[:, seen] == 2).any(axis=0)
-            pieces[side] += np.array([met.sum(), seen.sum()]) * here.plan.edge**2 / HANGING_PIECE
+            pieces[side] += np.array([met.sum(), seen.sum()]) * source.plan.edge**2 / HANGING_PIECE
     met, total = pieces[pieces[:, 1].argmin()].tolist()
     return {"hanging": total, "hanging_met": met}
 

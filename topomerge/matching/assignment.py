@@ -28,8 +28,8 @@ def assign(cost: Array, largest: float = np.inf) -> Array:
     wide[np.arange(n), m + np.arange(n)] = largest / 2
     wide[n + np.arange(m), np.arange(m)] = largest / 2
     i, j = linear_sum_assignment(wide)
-    kept = (i < n) & (j < m)
-    i, j = i[kept], j[kept]
+    paired = (i < n) & (j < m)
+    i, j = i[paired], j[paired]
     good = cost[i, j] <= largest
     return np.stack([i[good], j[good]], axis=1).astype(np.int64)
 

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from topomerge.matching.poses import PoseArrays, joined_poses
-from topomerge.matching.topdown import TopDown
+from topomerge.matching.room_plans import RoomPlans
 from topomerge.types import Array, TopometricMap
 
-SNAP = np.radians(12)  # a door's direction is that of the walls if it is within this
+SNAP_ANGLE = np.radians(12)  # a door's direction is that of the walls if it is within this
 ORDERLY = 0.3  # share of walls that keep to two directions, from which on they are trusted
-INTO = (0.35, 0.6, 0.9)  # m from a door's middle into its rooms
-WIDTHS = 0.7  # m by which the widths of one door may differ
-SCALES = (0.4, 2.5)
-SPREAD = 0.5  # m, two doors of a room must be farther apart to tell the scale
+INTO_ROOM = (0.35, 0.6, 0.9)  # m from a door's middle into its rooms
+WIDTH_GAP = 0.7  # m by which the widths of one door may differ
+SCALE_LIMITS = (0.4, 2.5)  # least and greatest that is tried
+DOORS_APART = 0.5  # m, two doors of a room must be farther apart to tell the scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Doors:
     kind: Array
 
 
-def doors_of(map: TopometricMap, plan: TopDown) -> Doors:
+def doors_of(map: TopometricMap, plan: RoomPlans) -> Doors:
     """Doors and openings of a map; which side of a door a room is on is read off the floor around it."""
     edges = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
     room = np.concatenate([edges["rooms"][:, 0], edges["rooms"][:, 1]]).astype(np.int64)
@@ -42,7 +42,7 @@ def doors_of(map: TopometricMap, plan: TopDown) -> Doors:
     votes = np.einsum("nd,nd->n", map.rooms["centroid"][room, :2] - both["centre"][:, :2], normal)
     votes = np.sign(votes) * 0.5
     storey = map.rooms["storey"][room]
-    for step in INTO:
+    for step in INTO_ROOM:
         for side in (1, -1):
             cell = np.floor((both["centre"][:, :2] + side * step * normal - plan.origin) / plan.edge).astype(int)
             cell = np.clip(cell, 0, np.array(plan.label.shape[1:]) - 1)
@@ -51,24 +51,30 @@ def doors_of(map: TopometricMap, plan: TopDown) -> Doors:
     return Doors(room, both["centre"].astype(float), into, both["width"].astype(float), both["kind"])
 
 
-def door_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> PoseArrays:
+def door_poses(a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], pairs: Array, weight: Array) -> PoseArrays:
     """One pose for each two doors of each pair of rooms (P, 2), at the scale 1."""
     of = [doors_of(m, p) for m, p in zip((a, b), plans, strict=True)]
     p, q, w = _door_pairs(of[0], of[1], pairs, weight)
     yaw = snapped(of[0].into[p] - of[1].into[q], plans)
-    return _put(of[0].centre[p], of[1].centre[q], yaw, np.ones(len(p)), w, a, b, of[0].room[p], of[1].room[q])
+    scale = np.ones(len(p))
+    return _put(of[0].centre[p], of[1].centre[q], yaw, scale, w, _lift(a, b, of[0].room[p], of[1].room[q], scale))
 
 
-def middle_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> PoseArrays:
+def middle_poses(
+    a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], pairs: Array, weight: Array
+) -> PoseArrays:
     """Four poses for each pair of rooms, middle on middle along the walls: for rooms without doors in common."""
     quarter = (plans[0].direction[0] - plans[1].direction[0]) + np.arange(4) * np.pi / 2
     i, j = np.repeat(pairs[:, 0], 4), np.repeat(pairs[:, 1], 4)
     yaw = np.tile(quarter, len(pairs))
     middle = (a.rooms["centroid"][i], b.rooms["centroid"][j])
-    return _put(*middle, yaw, np.ones(len(i)), np.repeat(weight, 4), a, b, i, j)
+    scale = np.ones(len(i))
+    return _put(*middle, yaw, scale, np.repeat(weight, 4), _lift(a, b, i, j, scale))
 
 
-def scaled_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDown], pairs: Array, weight: Array) -> PoseArrays:
+def scaled_poses(
+    a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], pairs: Array, weight: Array
+) -> PoseArrays:
     """Poses at a scale of their own: from two doors of one room on two doors of another, the ratio of whose distances it is; and
     from single doors at the ratio of the rooms' heights."""
     of = [doors_of(m, p) for m, p in zip((a, b), plans, strict=True)]
@@ -77,25 +83,26 @@ def scaled_poses(a: TopometricMap, b: TopometricMap, plans: tuple[TopDown, TopDo
     i, j = of[0].room[p], of[1].room[q]
     high = np.stack([a.rooms["height"][i], b.rooms["height"][j]])
     ratio = high[0] / np.maximum(high[1], 1e-3)
-    fine = (high > 0).all(axis=0) & (ratio > SCALES[0]) & (ratio < SCALES[1])
+    fine = (high > 0).all(axis=0) & (ratio > SCALE_LIMITS[0]) & (ratio < SCALE_LIMITS[1])
     p, q, i, j, ratio = p[fine], q[fine], i[fine], j[fine], ratio[fine]
     yaw = snapped(of[0].into[p] - of[1].into[q], plans)
-    second = _put(of[0].centre[p], of[1].centre[q], yaw, ratio, w[fine], a, b, i, j)
+    second = _put(of[0].centre[p], of[1].centre[q], yaw, ratio, w[fine], _lift(a, b, i, j, ratio))
     p, q, yaw, ratio, w = first
-    third = _put(of[0].centre[p], of[1].centre[q], snapped(yaw, plans), ratio, w, a, b, of[0].room[p], of[1].room[q])
+    lift = _lift(a, b, of[0].room[p], of[1].room[q], ratio)
+    third = _put(of[0].centre[p], of[1].centre[q], snapped(yaw, plans), ratio, w, lift)
     return joined_poses(second, third)
 
 
-def snapped(yaw: Array, plans: tuple[TopDown, TopDown]) -> Array:
+def snapped(yaw: Array, plans: tuple[RoomPlans, RoomPlans]) -> Array:
     """Yaws turned to the nearest one at which the walls of both maps are parallel, if that is near and walls are orderly."""
     if min(p.direction[1] for p in plans) < ORDERLY:
         return yaw
     base = plans[0].direction[0] - plans[1].direction[0]
     off = (yaw - base + np.pi / 4) % (np.pi / 2) - np.pi / 4
-    return np.where(abs(off) <= SNAP, yaw - off, yaw)
+    return np.where(abs(off) <= SNAP_ANGLE, yaw - off, yaw)
 
 
-def _door_pairs(a: Doors, b: Doors, pairs: Array, weight: Array, widths: float = WIDTHS) -> tuple[Array, Array, Array]:
+def _door_pairs(a: Doors, b: Doors, pairs: Array, weight: Array, widths: float = WIDTH_GAP) -> tuple[Array, Array, Array]:
     """Rows of the doors of a and of b that may be one, and the weight of their rooms."""
     table = np.zeros((int(max(a.room.max(initial=0), pairs[:, 0].max(initial=0))) + 1,
                       int(max(b.room.max(initial=0), pairs[:, 1].max(initial=0))) + 1))  # fmt: skip
@@ -109,20 +116,20 @@ def _door_pairs(a: Doors, b: Doors, pairs: Array, weight: Array, widths: float =
 
 def _two_doors(a: Doors, b: Doors, pairs: Array, weight: Array) -> tuple[Array, Array, Array, Array, Array]:
     """Two doors of one room on two of another: rows of the first doors, yaw, scale, weight."""
-    found: list[tuple[int, int, float, float, float]] = []
+    pairs_of_doors: list[tuple[int, int, float, float, float]] = []
     for (i, j), w in zip(pairs.tolist(), weight.tolist(), strict=True):
-        mine, other = np.flatnonzero(a.room == i), np.flatnonzero(b.room == j)
-        for p, p2 in _ordered(mine):
+        doors_a, doors_b = np.flatnonzero(a.room == i), np.flatnonzero(b.room == j)
+        for p, p2 in _ordered(doors_a):
             u = complex(*(a.centre[p2] - a.centre[p])[:2])
-            for q, q2 in _ordered(other):
+            for q, q2 in _ordered(doors_b):
                 v = complex(*(b.centre[q2] - b.centre[q])[:2])
-                if min(abs(u), abs(v)) < SPREAD or not SCALES[0] < abs(u) / abs(v) < SCALES[1]:
+                if min(abs(u), abs(v)) < DOORS_APART or not SCALE_LIMITS[0] < abs(u) / abs(v) < SCALE_LIMITS[1]:
                     continue
                 yaw = float(np.angle(u / v))
                 turns = np.array([a.into[p] - b.into[q], a.into[p2] - b.into[q2]]) - yaw
-                if (abs((turns + np.pi) % (2 * np.pi) - np.pi) < 2 * SNAP).all():
-                    found.append((p, q, yaw, abs(u) / abs(v), w))
-    table = np.array(found, float).reshape(-1, 5)
+                if (abs((turns + np.pi) % (2 * np.pi) - np.pi) < 2 * SNAP_ANGLE).all():
+                    pairs_of_doors.append((p, q, yaw, abs(u) / abs(v), w))
+    table = np.array(pairs_of_doors, float).reshape(-1, 5)
     return table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2], table[:, 3], table[:, 4]
 
 
@@ -130,12 +137,15 @@ def _ordered(rows: Array) -> list[tuple[int, int]]:
     return [(p, q) for p in rows.tolist() for q in rows.tolist() if p != q]
 
 
-def _put(
-    to: Array, point: Array, yaw: Array, scale: Array, weight: Array, a: TopometricMap, b: TopometricMap, i: Array, j: Array
-) -> PoseArrays:
-    """Poses that bring points (H, 3) of b onto points of a; upright by the floors of the storeys of rooms i and j."""
+def _put(to: Array, point: Array, yaw: Array, scale: Array, weight: Array, lift: Array) -> PoseArrays:
+    """Poses that bring points (H, 3) of b onto points of a, and floors onto floors (`_lift`)."""
     c, s = scale * np.cos(yaw), scale * np.sin(yaw)
     x = to[:, 0] - (c * point[:, 0] - s * point[:, 1])
     y = to[:, 1] - (s * point[:, 0] + c * point[:, 1])
-    z = a.storeys["floor"][a.rooms["storey"][i]] - scale * b.storeys["floor"][b.rooms["storey"][j]]
-    return PoseArrays(yaw, np.stack([x, y, z], axis=1), scale, weight)
+    return PoseArrays(yaw, np.stack([x, y, lift], axis=1), scale, weight)
+
+
+def _lift(a: TopometricMap, b: TopometricMap, i: Array, j: Array, scale: Array) -> Array:
+    """(H,) m, z of the poses that bring the floors of the storeys of rooms j of b onto those of rooms i of a."""
+    floors = [m.storeys["floor"][m.rooms["storey"][rooms]] for m, rooms in ((a, i), (b, j))]
+    return np.asarray(floors[0] - scale * floors[1])

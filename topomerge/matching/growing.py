@@ -30,8 +30,8 @@ def grow(a: TopometricMap, b: TopometricMap, cost: Array, c_max: float | None = 
     limit = float(np.median(cost)) if c_max is None else c_max
     beside = [[set(n.tolist()) - {i} for i, n in enumerate(neighbours(m))] for m in (a, b)]
     centroids = (a.rooms["centroid"], b.rooms["centroid"])
-    found = {_grown((i, j), cost, beside, centroids, limit, de_max) for i, j in assign(cost).tolist()}
-    return sorted(found, key=lambda pairs: (-len(pairs), sum(cost[p] for p in pairs), pairs))
+    hypotheses = {_grown((i, j), cost, beside, centroids, limit, de_max) for i, j in assign(cost).tolist()}
+    return sorted(hypotheses, key=lambda pairs: (-len(pairs), sum(cost[p] for p in pairs), pairs))
 
 
 def _grown(
@@ -44,9 +44,9 @@ def _grown(
         i, j = queue.popleft()
         free_a = np.array(sorted(beside[0][i] - set(partner)), np.int64)
         free_b = np.array(sorted(beside[1][j] - set(partner.values())), np.int64)
-        some = cost[np.ix_(free_a, free_b)]
-        pairs = assign(some)
-        for k, l in pairs[np.argsort(some[tuple(pairs.T)], kind="stable")].tolist():
+        costs = cost[np.ix_(free_a, free_b)]
+        pairs = assign(costs)
+        for k, l in pairs[np.argsort(costs[tuple(pairs.T)], kind="stable")].tolist():
             new = (int(free_a[k]), int(free_b[l]))
             if cost[new] > c_max:
                 continue
@@ -71,6 +71,6 @@ def align(to: Array, points: Array, scale: bool = False, weight: Array | None = 
     size = abs(z) / spread if scale and spread > 1e-9 and abs(z) > 1e-12 else 1.0
     turn = Sim3(yaw, (0.0, 0.0, 0.0), float(size))
     x, y, height = (middle_to - turn.apply(middle[None])[0]).tolist()
-    found = Sim3(yaw, (x, y, height), float(size))
-    off = found.apply(points) - to
-    return found, float(np.sqrt(w @ (off**2).sum(axis=1)))
+    transform = Sim3(yaw, (x, y, height), float(size))
+    off = transform.apply(points) - to
+    return transform, float(np.sqrt(w @ (off**2).sum(axis=1)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,21 @@ from topomerge.types import Array, TopometricMap
 
 METHODS = ("consistent", "growing", "assignment", "thesis")
 THESIS: dict[str, Any] = {"laplacian": "graph", "values": 256, "normalise": "first", "k": 1}
-LIKELY = 0.5  # probability of a match that the best hypothesis lacks
-KEPT = 10  # hypotheses
+LIKELY_MATCH = 0.5  # probability of a match that the best hypothesis lacks
+MOST_HYPOTHESES = 10
+
+
+@dataclass(frozen=True)
+class GrowingLimits:
+    """Of the growing of hypotheses (seeds 3.3).
+
+    Args:
+        cost: of a pair; the median of the costs if None.
+        error: m by which the alignment of all matched centroids may get worse with a pair.
+    """
+
+    cost: float | None = None
+    error: float = 2.5
 
 
 def match(
@@ -34,8 +48,7 @@ def match(
     k: int = 0,
     scale_free: bool = False,
     largest_cost: float | None = None,
-    c_max: float | None = None,
-    de_max: float = 2.5,
+    growing: GrowingLimits = GrowingLimits(),
     **options: Any,
 ) -> Matching:
     """Rooms of a that are rooms of b.
@@ -47,9 +60,9 @@ def match(
             ``"assignment"``: by cost alone; ``"thesis"``: ShapeDNA with one step of context, and growing (embedder and k are the
             thesis' then).
         k: steps of context.
-        scale_free: the scale of b is unknown (only ``"consistent"`` knows what to do about it).
+        scale_free: the scale of b is unknown (only ``"consistent"`` allows for it).
         largest_cost: of the assignment; pairs above it stay alone. Twice the usual cost of a room's best partner if None.
-        c_max, de_max: limits of the growing.
+        growing: limits of the growing.
         options: of the embedder.
 
     Raises:
@@ -61,21 +74,18 @@ def match(
     describe = make_embedder("shapedna", **THESIS) if method == "thesis" else make_embedder(embedder, k, **options)
     cost = descriptor_costs(checked(describe, a), checked(describe, b))
     similarity = similarities(cost)
-    told = {"rooms_a": float(len(a.rooms)), "rooms_b": float(len(b.rooms)), "median_cost": float(np.median(cost))}
-    told["usual_best_cost"] = usual_best(cost)
+    statistics = {"rooms_a": float(len(a.rooms)), "rooms_b": float(len(b.rooms)), "median_cost": float(np.median(cost))}
+    statistics["usual_best_cost"] = usual_best(cost)
     if method == "assignment":
         pairs = assign(cost, 2 * usual_best(cost) if largest_cost is None else largest_cost)
-        return Matching(pairs, similarity[tuple(pairs.T)], statistics=told)
-    found: tuple[PoseHypothesis, ...]
+        return Matching(pairs, similarity[tuple(pairs.T)], statistics=statistics)
     if method == "consistent":
-        found = hypotheses(a, b, cost, similarity, scale_free, KEPT)
-    else:
-        found = _from_growing(a, b, cost, similarity, c_max, de_max)
-    if method != "consistent":  # one hypothesis wins as a whole, as in the thesis
-        rooms = found[0].rooms if found else np.zeros((0, 2), np.int64)
-        return Matching(rooms, found[0].fit if found else np.zeros(0), found[0].transform if found else None, found, told)
-    rooms, probability = marginal(a, b, found)
-    return Matching(rooms, probability, found[0].transform if found else None, found, told)
+        ranked = hypotheses(a, b, cost, similarity, scale_free, MOST_HYPOTHESES)
+        rooms, probability = marginal(a, b, ranked)
+    else:  # one hypothesis wins as a whole, as in the thesis
+        ranked = _from_growing(a, b, cost, similarity, growing)
+        rooms, probability = (ranked[0].rooms, ranked[0].fit) if ranked else (np.zeros((0, 2), np.int64), np.zeros(0))
+    return Matching(rooms, probability, ranked[0].transform if ranked else None, ranked, statistics)
 
 
 def check(a: TopometricMap, b: TopometricMap) -> None:
@@ -104,33 +114,33 @@ def checked(describe: Descriptor, map: TopometricMap) -> Array:
     return rows
 
 
-def marginal(a: TopometricMap, b: TopometricMap, found: tuple[PoseHypothesis, ...]) -> tuple[Array, Array]:
+def marginal(a: TopometricMap, b: TopometricMap, ranked: tuple[PoseHypothesis, ...]) -> tuple[Array, Array]:
     """Matches of the best hypothesis, and all whose probability over the hypotheses is above 0.5 and that exclude none of those.
 
     The probability of a match is the sum, over the hypotheses that have it, of theirs times that rooms which fit so are one.
     """
     total: dict[tuple[int, int], float] = {}
-    for h in found:
-        one = match_probability(a, b, h.rooms, h.fit)
-        for (i, j), p in zip(h.rooms.tolist(), one.tolist(), strict=True):
+    for h in ranked:
+        chance = match_probability(a, b, h.rooms, h.fit)
+        for (i, j), p in zip(h.rooms.tolist(), chance.tolist(), strict=True):
             total[i, j] = total.get((i, j), 0.0) + h.probability * p
-    best = {(i, j) for i, j in found[0].rooms.tolist()} if found else set()
+    best = {(i, j) for i, j in ranked[0].rooms.tolist()} if ranked else set()
     taken = ({i for i, _ in best}, {j for _, j in best})
-    others = {(i, j) for (i, j), p in total.items() if p > LIKELY and i not in taken[0] and j not in taken[1]}
+    others = {(i, j) for (i, j), p in total.items() if p > LIKELY_MATCH and i not in taken[0] and j not in taken[1]}
     chosen = sorted(best | others)
     return np.array(chosen, np.int64).reshape(-1, 2), np.array([min(total[p], 1.0) for p in chosen])
 
 
 def _from_growing(
-    a: TopometricMap, b: TopometricMap, cost: Array, similarity: Array, c_max: float | None, de_max: float
+    a: TopometricMap, b: TopometricMap, cost: Array, similarity: Array, limits: GrowingLimits
 ) -> tuple[PoseHypothesis, ...]:
     """Hypotheses of the growing; their probability goes with the square of the number of matches."""
-    grown = grow(a, b, cost, c_max, de_max)[:KEPT]
+    grown = grow(a, b, cost, limits.cost, limits.error)[:MOST_HYPOTHESES]
     weight = np.array([len(p) ** 2 for p in grown], float)
-    found = []
+    ranked = []
     for pairs, share in zip(grown, weight / max(weight.sum(), 1.0), strict=True):
         rooms = np.array(pairs, np.int64)
         pose, error = align(a.rooms["centroid"][rooms[:, 0]], b.rooms["centroid"][rooms[:, 1]])
         fit = similarity[tuple(rooms.T)]
-        found.append(PoseHypothesis(pose, float(len(rooms)), float(share), {"error_m": error}, True, rooms, fit))
-    return tuple(found)
+        ranked.append(PoseHypothesis(pose, float(len(rooms)), float(share), {"error_m": error}, True, rooms, fit))
+    return tuple(ranked)

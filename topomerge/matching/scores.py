@@ -7,7 +7,7 @@ import numpy as np
 from topomerge.matching.assignment import assign
 from topomerge.types import Array
 
-ALIKE = 0.15  # rooms whose area, length and width differ by no more than this share are near-identical
+TWIN_SIZE = 0.15  # rooms whose area, length and width differ by no more than this share are near-identical
 
 
 def partner_ranks(similarity: Array, matches: Array) -> tuple[Array, Array]:
@@ -42,7 +42,7 @@ def has_twin(sizes: Array, matches: Array, rooms: Array) -> Array:
     """
     out = np.zeros(len(rooms), bool)
     logs = np.log(np.maximum(np.asarray(sizes, float), 1e-3))
-    alike = (np.abs(logs[:, None] - logs[None]) <= np.log1p(ALIKE)).all(axis=2)
+    alike = (np.abs(logs[:, None] - logs[None]) <= np.log1p(TWIN_SIZE)).all(axis=2)
     for k, i in enumerate(rooms):
         partners = matches[matches[:, 0] == i, 1]
         others = np.ones(len(sizes), bool)
@@ -67,13 +67,13 @@ def assign_certain(certain: Array, least: float) -> Array:
     return assign(1 - certain, 1 - least)
 
 
-def pair_counts(found: Array, matches: Array) -> tuple[int, int, int, int]:
-    """Numbers of pairs found, of right ones, of rooms of a and b that have a partner, and of those that got a right one.
+def pair_counts(pairs: Array, matches: Array) -> tuple[int, int, int, int]:
+    """Numbers of pairs, of right ones, of rooms of a and b that have a partner, and of those that got a right one.
 
     Precision is the second over the first, recall the fourth over the third.
     """
     true = {(int(i), int(j)) for i, j in matches}
-    right = [(int(i), int(j)) for i, j in found if (int(i), int(j)) in true]
+    right = [(int(i), int(j)) for i, j in pairs if (int(i), int(j)) in true]
     wanted = sum(len(np.unique(matches[:, k])) for k in (0, 1))
     got = sum(len({pair[k] for pair in right}) for k in (0, 1))
-    return len(found), len(right), wanted, got
+    return len(pairs), len(right), wanted, got

@@ -1,0 +1,33 @@
+"""Columns of a plan, by the kernels and by plain Python."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from topomerge.kernels.plan import column_bits, on_lines
+
+
+def test_column_bits_equal_a_slow_twin():
+    rng = np.random.default_rng(0)
+    ix, iy, z = rng.integers(-1, 7, 300), rng.integers(-1, 6, 300), rng.uniform(-1, 9, 300)
+    z[::17] = np.nan
+    base = rng.uniform(0, 1, (6, 5))
+    slow = np.zeros((6, 5), np.uint32)
+    for x, y, h in zip(ix, iy, z, strict=True):
+        if 0 <= x < 6 and 0 <= y < 5 and not np.isnan(h):
+            k = int(np.floor((h - base[x, y] + 0.5) / 0.25))
+            slow[x, y] |= np.uint32(1 << k) if 0 <= k < 32 else np.uint32(0)
+    assert np.array_equal(column_bits(ix, iy, z, base, -0.5, 0.25), slow)
+
+
+def test_on_lines_keeps_straight_runs_only():
+    mask = np.zeros((40, 40), bool)
+    mask[5, 3:30] = True
+    mask[np.arange(10, 35), np.arange(10, 35)] = True
+    legs = [(20, 5), (22, 7), (33, 3), (35, 6), (30, 9)]
+    for leg in legs:
+        mask[leg] = True
+    angles = np.pi * np.arange(24) / 24
+    kept = on_lines(mask, np.cos(angles), np.sin(angles), 12, 11, 3)
+    assert kept[5, 3:30].all() and kept[np.arange(10, 35), np.arange(10, 35)].all()
+    assert not any(kept[leg] for leg in legs)
