@@ -15,14 +15,14 @@ from torch import Tensor, nn
 
 from topomerge.errors import InputError
 
-KINDS = ("infonce", "ntxent", "triplet")
-NEVER = -1e4  # a logit that is never chosen; minus infinity would make gradients of rows without a partner nan
+LOSS_KINDS = ("infonce", "ntxent", "triplet")
+NEVER_LOGIT = -1e4  # a logit that is never chosen; minus infinity would make gradients of rows without a partner nan
 
 
 @dataclass
 class LossSettings:
     """Args:
-    kind: of `KINDS`.
+    kind: of `LOSS_KINDS`.
     easy: weight of the other buildings' rooms among the negatives.
     dustbin: weight of the choice between the other map's rooms and no partner at all.
     margin: of the triplets, in distances between unit vectors.
@@ -63,8 +63,8 @@ def check(settings: LossSettings) -> None:
     Raises:
         InputError: names the key.
     """
-    if settings.kind not in KINDS:
-        raise InputError(f"loss.kind: unknown {settings.kind!r}; {', '.join(KINDS)} are possible")
+    if settings.kind not in LOSS_KINDS:
+        raise InputError(f"loss.kind: unknown {settings.kind!r}; {', '.join(LOSS_KINDS)} are possible")
     for key in ("easy", "dustbin", "margin", "faint"):
         if getattr(settings, key) < 0:
             raise InputError(f"loss.{key} must be 0 or more, not {getattr(settings, key)}")
@@ -104,12 +104,12 @@ def info_nce(embedding: Tensor, temperature: Tensor, truth: Truth, easy: float =
     """(N,) -log(sum of exp(s) of partners / sum of exp(s) of partners and negatives), s being the cosine over the temperature;
     and (N,) bool, which rooms have a partner; negatives of other pairs count `easy` times (van den Oord et al. 2018)."""
     logits = embedding @ embedding.T / temperature
-    own = truth.pair[:, None] == truth.pair[None]
-    weight = torch.where(own, 1.0, easy) * ~(truth.piece | torch.eye(len(own), dtype=torch.bool, device=own.device))
-    every = (logits + weight.clamp(min=1e-30).log()).masked_fill(weight == 0, NEVER).logsumexp(dim=1)
-    partners = logits.masked_fill(~truth.same, NEVER).logsumexp(dim=1)
+    same_pair = truth.pair[:, None] == truth.pair[None]
+    weight = torch.where(same_pair, 1.0, easy) * ~(truth.piece | torch.eye(len(logits), dtype=torch.bool, device=logits.device))
+    candidates = (logits + weight.clamp(min=1e-30).log()).masked_fill(weight == 0, NEVER_LOGIT).logsumexp(dim=1)
+    partners = logits.masked_fill(~truth.same, NEVER_LOGIT).logsumexp(dim=1)
     has = truth.same.any(dim=1)
-    return torch.where(has, every - partners, 0.0), has
+    return torch.where(has, candidates - partners, 0.0), has
 
 
 def triplet(embedding: Tensor, truth: Truth, margin: float) -> tuple[Tensor, Tensor]:
@@ -121,13 +121,14 @@ def triplet(embedding: Tensor, truth: Truth, margin: float) -> tuple[Tensor, Ten
     """
     # Distances of unit vectors; the root needs a gradient at 0.
     apart = (2 - 2 * embedding @ embedding.T).clamp(min=0).add(1e-6).sqrt()
-    own = truth.pair[:, None] == truth.pair[None]
-    negative = own & ~truth.same & ~truth.piece & ~torch.eye(len(own), dtype=torch.bool, device=own.device)
+    same_pair = truth.pair[:, None] == truth.pair[None]
+    negative = same_pair & ~truth.same & ~truth.piece
+    negative &= ~torch.eye(len(negative), dtype=torch.bool, device=negative.device)
     room, partner = truth.same.nonzero(as_tuple=True)
     wrong = (apart[room, partner, None] - apart[room] + margin).relu() * negative[room]
     each = wrong.sum(dim=1) / (wrong > 0).sum(dim=1).clamp(min=1)
-    found = torch.zeros_like(embedding[:, 0]).index_add(0, room, each)
-    return found / truth.same.sum(dim=1).clamp(min=1), truth.same.any(dim=1) & negative.any(dim=1)
+    total = torch.zeros_like(embedding[:, 0]).index_add(0, room, each)
+    return total / truth.same.sum(dim=1).clamp(min=1), truth.same.any(dim=1) & negative.any(dim=1)
 
 
 def dustbin_loss(embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth) -> Tensor:
@@ -135,9 +136,9 @@ def dustbin_loss(embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth:
     and the dustbin."""
     logits = embedding @ embedding.T / temperature
     other = (truth.pair[:, None] == truth.pair[None]) & (truth.side[:, None] != truth.side[None])
-    every = torch.cat([logits.masked_fill(~other, NEVER), dustbin[:, None]], dim=1).logsumexp(dim=1)
-    partners = logits.masked_fill(~truth.same, NEVER).logsumexp(dim=1)
-    return every - torch.where(truth.same.any(dim=1), partners, dustbin)
+    candidates = torch.cat([logits.masked_fill(~other, NEVER_LOGIT), dustbin[:, None]], dim=1).logsumexp(dim=1)
+    partners = logits.masked_fill(~truth.same, NEVER_LOGIT).logsumexp(dim=1)
+    return candidates - torch.where(truth.same.any(dim=1), partners, dustbin)
 
 
 class Objective(nn.Module):

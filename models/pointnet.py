@@ -6,7 +6,7 @@ import torch
 from topomerge.models.layers import mlp
 from torch import Tensor, nn
 
-UNIT = 4.0  # m: coordinates come as multiples of it, so that they are of the order of 1; the scale stays known
+COORDINATE_UNIT = 4.0  # m: coordinates come as multiples of it, so that they are of the order of 1; the scale stays known
 
 
 class PointNet(nn.Module):
@@ -21,8 +21,8 @@ class PointNet(nn.Module):
         self.all = mlp(2 * inside[-1], inside[-1], width)
 
     def forward(self, points: Tensor) -> Tensor:
-        found = self.each(with_radius(points))
-        out: Tensor = self.all(torch.cat([found.amax(dim=1), found.mean(dim=1)], dim=1))
+        features = self.each(with_radius(points))
+        out: Tensor = self.all(torch.cat([features.amax(dim=1), features.mean(dim=1)], dim=1))
         return out
 
 
@@ -42,16 +42,16 @@ class LocalPointNet(nn.Module):
         middle = points[rows, chosen]
         around = points[rows[:, :, None], nearest(points, middle, min(self.near, points.shape[1]))]
         local = self.local(around - middle[:, :, None]).amax(dim=2)  # metres: a neighbourhood is of the order of 1
-        found = self.each(torch.cat([local, with_radius(middle)], dim=2))
-        out: Tensor = self.all(torch.cat([found.amax(dim=1), found.mean(dim=1)], dim=1))
+        features = self.each(torch.cat([local, with_radius(middle)], dim=2))
+        out: Tensor = self.all(torch.cat([features.amax(dim=1), features.mean(dim=1)], dim=1))
         return out
 
 
 def with_radius(points: Tensor) -> Tensor:
-    """(R, P, 4) coordinates over `UNIT`, and the distance from the middle seen from above, which no turn changes."""
+    """(R, P, 4) coordinates over `COORDINATE_UNIT`, and the distance from the middle seen from above, which no turn changes."""
     # The root of a sum that is never 0 has a gradient at the middle, too.
     radius = ((points[..., :2] ** 2).sum(dim=-1, keepdim=True) + 1e-6).sqrt()
-    return torch.cat([points, radius], dim=-1) / UNIT
+    return torch.cat([points, radius], dim=-1) / COORDINATE_UNIT
 
 
 def farthest(points: Tensor, number: int) -> Tensor:

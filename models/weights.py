@@ -30,7 +30,7 @@ def save_embedder(network: Embedder, folder: str | Path, about: Mapping[str, Any
     """Write both files into a folder, which is made if need be.
 
     Args:
-        about: what else should be known: on what it was trained, how good it is.
+        about: on what it was trained, how good it is.
 
     Raises:
         InputError: the folder can't be written.

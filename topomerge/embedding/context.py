@@ -11,7 +11,7 @@ from topomerge.embedding.room_cells import Descriptor, joined, neighbours
 from topomerge.errors import InputError
 from topomerge.types import Array, TopometricMap
 
-HOWS = ("join", "mean")
+CONTEXT_KINDS = ("join", "mean")
 MOST_STEPS = 20  # no room of a building is much farther from another
 
 
@@ -29,33 +29,33 @@ def with_context(descriptor: Descriptor, k: int = 1, how: str = "join") -> Descr
     """
     if not isinstance(k, int) or isinstance(k, bool) or not 0 <= k <= MOST_STEPS:
         raise InputError(f"steps of context must be a whole number from 0 to {MOST_STEPS}, not {k}")
-    if how not in HOWS:
-        raise InputError(f"context {how!r}: {', '.join(HOWS)} are possible")
+    if how not in CONTEXT_KINDS:
+        raise InputError(f"context {how!r}: {', '.join(CONTEXT_KINDS)} are possible")
     if k == 0:
         return descriptor
 
     def describe(map: TopometricMap) -> Array:
-        own = descriptor(map)
-        parts = [own]
+        rows = descriptor(map)
+        parts = [rows]
         for step in range(1, k + 1):
             around = neighbours(map, step)
-            parts.append(_joined(descriptor, map, around, own) if how == "join" else _mean(own, around))
+            parts.append(_joined(descriptor, map, around, rows) if how == "join" else _mean(rows, around))
         return np.concatenate(parts, axis=1)
 
     return describe
 
 
-def _mean(own: Array, around: list[Array]) -> Array:
-    return np.stack([own[rooms].mean(axis=0) for rooms in around]) if len(own) else own
+def _mean(rows: Array, around: list[Array]) -> Array:
+    return np.stack([rows[rooms].mean(axis=0) for rooms in around]) if len(rows) else rows
 
 
-def _joined(descriptor: Descriptor, map: TopometricMap, around: list[Array], own: Array) -> Array:
+def _joined(descriptor: Descriptor, map: TopometricMap, around: list[Array], rows: Array) -> Array:
     """Descriptor of each union; rooms with the same surroundings share the work."""
-    known: dict[tuple[int, ...], Array] = {}
-    out = np.zeros_like(own)
+    by_rooms: dict[tuple[int, ...], Array] = {}
+    out = np.zeros_like(rows)
     for room, rooms in enumerate(around):
         key = tuple(rooms.tolist())
-        if key not in known:
-            known[key] = descriptor(joined(map, rooms))[0] if len(key) > 1 else own[room]
-        out[room] = known[key]
+        if key not in by_rooms:
+            by_rooms[key] = descriptor(joined(map, rooms))[0] if len(key) > 1 else rows[room]
+        out[room] = by_rooms[key]
     return out

@@ -1,7 +1,7 @@
 """Engineered features of a room: the twelve of the thesis, and its place in the graph (seeds 3.1.1; method, section 2).
 
 Lengths are metres and nothing depends on the frame. Sizes are taken as logarithms, then all is scaled by statistics of a training
-set, kept in `engineered.json` (made by ``train.py task=feature_scale``): either every feature by its spread over
+set, which stand in `engineered.json` (made by ``train.py task=feature_scale``): either every feature by its spread over
 rooms (``"standard"``), or all of them by how much they differ between two maps' views of one room (``"matched"``: features that
 a partial view changes count less).
 """
@@ -27,8 +27,8 @@ GRAPH_FEATURES = (
 )
 FEATURES = (*THESIS_FEATURES, *GRAPH_FEATURES)
 SCALINGS = ("matched", "standard", "none")
-NEIGHBOURS = 32
-SAMPLES = 500  # cells of a room whose roughness is measured
+PLANE_NEIGHBOURS = 32
+ROUGHNESS_CELLS = 500  # cells of a room whose roughness is measured
 
 
 def engineered(features: str = "all", scaling: str = "matched") -> Descriptor:
@@ -51,8 +51,8 @@ def engineered(features: str = "all", scaling: str = "matched") -> Descriptor:
 
 def raw_features(map: TopometricMap) -> Array:
     """(R, 18) float64 in the order of `FEATURES`, not scaled."""
-    own = [thesis_features(cells, map.grid.edge) for cells in room_cells(map)]
-    return np.concatenate([np.array(own).reshape(-1, len(THESIS_FEATURES)), _graph_features(map)], axis=1)
+    geometry = [thesis_features(cells, map.grid.edge) for cells in room_cells(map)]
+    return np.concatenate([np.array(geometry).reshape(-1, len(THESIS_FEATURES)), _graph_features(map)], axis=1)
 
 
 def scaled(values: Array, scaling: str) -> Array:
@@ -122,13 +122,13 @@ def roughness(points: Array) -> float:
     """Mean distance (m) of points (n, 3) to the plane of their 32 nearest; of at most 500 of them, evenly spread."""
     if len(points) < 4:
         return 0.0
-    some = points[np.linspace(0, len(points) - 1, min(SAMPLES, len(points))).astype(int)]
-    _, near = cKDTree(points).query(some, min(NEIGHBOURS, len(points)))
+    sample = points[np.linspace(0, len(points) - 1, min(ROUGHNESS_CELLS, len(points))).astype(int)]
+    _, near = cKDTree(points).query(sample, min(PLANE_NEIGHBOURS, len(points)))
     around = points[near]
     middle = around.mean(axis=1, keepdims=True)
     away = around - middle
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))
-    return float(np.abs(np.einsum("ni,ni->n", some - middle[:, 0], axes[:, :, 0])).mean())
+    return float(np.abs(np.einsum("ni,ni->n", sample - middle[:, 0], axes[:, :, 0])).mean())
 
 
 def _graph_features(map: TopometricMap) -> Array:

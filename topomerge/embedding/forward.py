@@ -110,26 +110,26 @@ class Forward:
         return out
 
     def _edge_value_conv(self, name: str, rooms: Array, edge_index: Array, edges: Array | None) -> Array:
-        """`models.edge_value_conv.EdgeValueConv`; here the second row of the index are the neighbours."""
-        here, there = edge_index
-        value, score = self._linear(f"{name}.lin_value", rooms)[there], self._scores(name, rooms, edge_index, edges)[1]
+        """`models.edge_value_conv.EdgeValueConv`; the second row of the index are the neighbours."""
+        targets, sources = edge_index
+        value, score = self._linear(f"{name}.lin_value", rooms)[sources], self._scores(name, rooms, edge_index, edges)[1]
         if edges is not None:
             value = value + self._linear(f"{name}.lin_edge_value", edges, bias=False)
-        alpha = nn.segment_softmax(SCORE_BOUND * np.tanh(score / SCORE_BOUND), here, len(rooms))
-        return self._linear(f"{name}.lin_out", nn.segment_sum(_weighed(value, alpha), here, len(rooms)))
+        alpha = nn.segment_softmax(SCORE_BOUND * np.tanh(score / SCORE_BOUND), targets, len(rooms))
+        return self._linear(f"{name}.lin_out", nn.segment_sum(_weighed(value, alpha), targets, len(rooms)))
 
     def _gatv2_conv(self, name: str, rooms: Array, edge_index: Array, edges: Array | None) -> Array:
         """`torch_geometric.nn.GATv2Conv` without loops."""
-        here, there = edge_index
+        targets, sources = edge_index
         keys, score = self._scores(name, rooms, edge_index, edges)
-        alpha = nn.segment_softmax(score, here, len(rooms))
-        return nn.segment_sum(_weighed(keys[there], alpha), here, len(rooms)) + self._get(f"{name}.bias", (rooms.shape[1],))
+        alpha = nn.segment_softmax(score, targets, len(rooms))
+        return nn.segment_sum(_weighed(keys[sources], alpha), targets, len(rooms)) + self._get(f"{name}.bias", (rooms.shape[1],))
 
     def _scores(self, name: str, rooms: Array, edge_index: Array, edges: Array | None) -> tuple[Array, Array]:
         """(R, width) keys of the rooms; (E, heads) scores of attention (Brody et al. 2022)."""
-        here, there = edge_index
+        targets, sources = edge_index
         keys = self._linear(f"{name}.lin_l", rooms)
-        pair = self._linear(f"{name}.lin_r", rooms)[here] + keys[there]
+        pair = self._linear(f"{name}.lin_r", rooms)[targets] + keys[sources]
         if edges is not None:
             pair = pair + self._linear(f"{name}.lin_edge", edges, bias=False)
         shape = (self.network.node.heads, rooms.shape[1] // self.network.node.heads)
@@ -138,11 +138,11 @@ class Forward:
 
     def _sage_conv(self, name: str, rooms: Array, edge_index: Array, edges: Array | None) -> Array:
         """`torch_geometric.nn.SAGEConv`, or `models.edge_sage_conv.EdgeSAGEConv` where edges have features."""
-        here, there = edge_index
-        message = rooms[there]
+        targets, sources = edge_index
+        message = rooms[sources]
         if edges is not None:
             message = nn.relu(self._linear(f"{name}.lin_message", np.concatenate([message, edges], axis=1)))
-        around = nn.segment_mean(message, here, len(rooms))
+        around = nn.segment_mean(message, targets, len(rooms))
         return self._linear(f"{name}.lin_l", around) + self._linear(f"{name}.lin_r", rooms, bias=False)
 
     def _mlp(self, name: str, x: Array) -> Array:

@@ -11,20 +11,20 @@ from topomerge.kernels.voronoi import voronoi_weights
 from topomerge.types import Array, VoxelGrid
 
 Laplacian = tuple[sparse.csr_matrix, Array]  # stiffness (n, n), mass (n,)
-NEIGHBOURS = 18
-STEPS = np.eye(3, dtype=np.int64)
-DENSE = 400  # from so many unknowns on the sparse solver is quicker
+TANGENT_NEIGHBOURS = 18
+CELL_STEPS = np.eye(3, dtype=np.int64)
+DENSE_UNKNOWNS = 400  # from so many unknowns on the sparse solver is quicker
 
 
 def graph_laplacian(cells: Array) -> Laplacian:
     """L = D - A of the 6-neighbourhood of cells (n, 3), with masses of 1 (thesis): eigenvalues have no unit."""
     grid = VoxelGrid.from_cells(cells - cells.min(axis=0))
-    here, there = [], []
-    for step in STEPS:
+    first, second = [], []
+    for step in CELL_STEPS:
         rows = grid.rows(grid.cells + step)
-        here.append(np.flatnonzero(rows >= 0))
-        there.append(rows[rows >= 0])
-    return _stiffness(np.concatenate(here), np.concatenate(there), None, len(grid)), np.ones(len(grid))
+        first.append(np.flatnonzero(rows >= 0))
+        second.append(rows[rows >= 0])
+    return _stiffness(np.concatenate(first), np.concatenate(second), None, len(grid)), np.ones(len(grid))
 
 
 def surface_laplacian(points: Array) -> Laplacian:
@@ -33,7 +33,7 @@ def surface_laplacian(points: Array) -> Laplacian:
     On a flat sample the weights are the cotangents of its Delaunay triangulation, as in the finite elements of ShapeDNA (Reuter
     et al. 2006); where two points see their common side differently, the mean is taken. Borders are free (Neumann).
     """
-    count = min(NEIGHBOURS, len(points) - 1)
+    count = min(TANGENT_NEIGHBOURS, len(points) - 1)
     distance, near = cKDTree(points).query(points, count + 1)
     distance, near = distance[:, 1:], near[:, 1:]
     away = points[near] - points[:, None]
@@ -41,13 +41,13 @@ def surface_laplacian(points: Array) -> Laplacian:
     flat = np.einsum("nki,nij->nkj", away, axes[:, :, 1:])
     flat *= (distance / np.maximum(np.linalg.norm(flat, axis=2), 1e-9))[:, :, None].clip(1.0, 2.0)  # around edges: as if unfolded
     area, weight = voronoi_weights(np.ascontiguousarray(flat), distance[:, : min(4, count)].mean(axis=1))
-    here, k = np.nonzero(weight)
-    return _stiffness(here, near[here, k], weight[here, k] / 2, len(points)), np.maximum(area, 1e-6 * area.mean())
+    first, k = np.nonzero(weight)
+    return _stiffness(first, near[first, k], weight[first, k] / 2, len(points)), np.maximum(area, 1e-6 * area.mean())
 
 
-def _stiffness(here: Array, there: Array, weight: Array | None, count: int) -> sparse.csr_matrix:
-    values = np.ones(len(here)) if weight is None else weight
-    half = sparse.coo_matrix((values, (here, there)), shape=(count, count)).tocsr()
+def _stiffness(first: Array, second: Array, weight: Array | None, count: int) -> sparse.csr_matrix:
+    values = np.ones(len(first)) if weight is None else weight
+    half = sparse.coo_matrix((values, (first, second)), shape=(count, count)).tocsr()
     both = half + half.T
     return sparse.diags(np.asarray(both.sum(axis=1)).ravel()) - both
 
@@ -63,16 +63,16 @@ def smallest_eigenvalues(laplacian: Laplacian, number: int) -> Array:
 
     stiffness, mass = laplacian
     _, part = connected_components(stiffness, directed=False)
-    kept = np.flatnonzero(part == np.argmax(np.bincount(part)))
-    stiffness, mass = stiffness[kept][:, kept], mass[kept]
+    part_rows = np.flatnonzero(part == np.argmax(np.bincount(part)))
+    stiffness, mass = stiffness[part_rows][:, part_rows], mass[part_rows]
     root = 1 / np.sqrt(mass)
     matrix = sparse.csc_matrix(sparse.diags(root) @ stiffness @ sparse.diags(root))
-    wanted = min(number + 1, len(kept))
+    wanted = min(number + 1, len(part_rows))
     with threadpool_limits(1):
-        if len(kept) <= max(DENSE, 2 * wanted + 1):
+        if len(part_rows) <= max(DENSE_UNKNOWNS, 2 * wanted + 1):
             values = np.linalg.eigvalsh(matrix.toarray())[:wanted]
         else:
-            usual = float(matrix.diagonal().mean()) / len(kept)  # of the order of the first eigenvalues
-            start = np.random.default_rng(0).standard_normal(len(kept))
+            usual = float(matrix.diagonal().mean()) / len(part_rows)  # of the order of the first eigenvalues
+            start = np.random.default_rng(0).standard_normal(len(part_rows))
             values = np.sort(eigsh(matrix, wanted, sigma=-usual, v0=start, return_eigenvectors=False, tol=1e-10))
     return np.maximum(values[1:], 0.0)

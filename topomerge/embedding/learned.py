@@ -24,7 +24,7 @@ from topomerge.errors import InputError
 from topomerge.numpy_nn import softmax
 from topomerge.types import Array, TopometricMap
 
-EXTRAS = {"engineered": point_features, "shapedna": point_spectra}  # computed from the points where a network reads them
+POINT_TABLES = {"engineered": point_features, "shapedna": point_spectra}  # computed from the points where a network reads them
 Run = Callable[[Mapping[str, Array]], tuple[Array, Array]]
 
 
@@ -88,7 +88,7 @@ class Learned:
         inputs, names = dict(arrays), tensors(self.network)
         if self.network.node.around:
             inputs |= with_rooms_around(inputs, self.network.node.around)
-        inputs |= {n: compute(arrays["room_points"]) for n, compute in EXTRAS.items() if n in names and n not in arrays}
+        inputs |= {n: compute(arrays["room_points"]) for n, compute in POINT_TABLES.items() if n in names and n not in arrays}
         if "near_index" in names and "near_index" not in arrays:
             layout = door_layout(*(arrays[n] for n in ("edge_index", "pos", "edge_pos")))
             inputs |= dict(zip(("near_index", "near_attr"), layout, strict=True))

@@ -32,30 +32,30 @@ def neighbours(map: TopometricMap, steps: int = 1) -> list[Array]:
     for a, b in map.edges["rooms"].tolist():
         beside[a].add(b)
         beside[b].add(a)
-    found = []
+    neighbourhoods = []
     for room in range(count):
         reached, border = {room}, {room}
         for _ in range(steps):
             border = {n for r in border for n in beside[r]} - reached
             reached |= border
-        found.append(np.array(sorted(reached)))
-    return found
+        neighbourhoods.append(np.array(sorted(reached)))
+    return neighbourhoods
 
 
 def joined(map: TopometricMap, members: Array) -> TopometricMap:
     """A map whose only room is the union of the given ones; the doors that lead out of them are lost."""
     occupied = np.flatnonzero(np.isin(map.room, members))
     walk = np.flatnonzero(np.isin(map.navigable_room, members))
-    some = map.rooms[members]
-    share = some["area"] / max(some["area"].sum(), 1e-9)
+    rows = map.rooms[members]
+    share = rows["area"] / max(rows["area"].sum(), 1e-9)
     room = np.zeros(1, ROOM_DTYPE)
     for name in ("area", "volume", "cells"):
-        room[name] = some[name].sum()
+        room[name] = rows[name].sum()
     for name in ("height", "completeness"):
-        room[name] = (some[name] * share).sum()
-    room["centroid"] = (some["centroid"] * share[:, None]).sum(axis=0)
-    room["lo"], room["hi"] = some["lo"].min(axis=0), some["hi"].max(axis=0)
-    room["storey"] = some["storey"].min()
+        room[name] = (rows[name] * share).sum()
+    room["centroid"] = (rows["centroid"] * share[:, None]).sum(axis=0)
+    room["lo"], room["hi"] = rows["lo"].min(axis=0), rows["hi"].max(axis=0)
+    room["storey"] = rows["storey"].min()
     return replace(
         map,
         grid=map.grid.subset(occupied),

@@ -1,7 +1,7 @@
 """Rooms that stand near each other as neighbours, too, with or without a door between them.
 
 Doors are missed, and lead into rooms that one of two maps has not seen. How far away the rooms around are, and how large, is
-mostly known in both.
+mostly the same in both.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ def with_rooms_around(graph: Mapping[str, Array], reach: float) -> dict[str, Arr
     """
     pos = np.asarray(graph["pos"], float)
     away = np.linalg.norm(pos[:, None, :2] - pos[None, :, :2], axis=2)
-    here, there = np.nonzero(np.triu((away <= reach) & (abs(pos[:, None, 2] - pos[None, :, 2]) <= STOREY_CLIMB), 1))
-    features = np.zeros((len(here), width("edge_attr")), np.float32)
-    features[:, DISTANCE], features[:, CLIMB], features[:, TURN_COS] = away[here, there], pos[there, 2] - pos[here, 2], 1.0
+    first, second = np.nonzero(np.triu((away <= reach) & (abs(pos[:, None, 2] - pos[None, :, 2]) <= STOREY_CLIMB), 1))
+    features = np.zeros((len(first), width("edge_attr")), np.float32)
+    features[:, DISTANCE], features[:, CLIMB], features[:, TURN_COS] = away[first, second], pos[second, 2] - pos[first, 2], 1.0
     back = features.copy()
     back[:, CLIMB] *= -1
-    middle = (pos[here] + pos[there]) / 2
+    middle = (pos[first] + pos[second]) / 2
     index, attr, places = (np.asarray(graph[name]) for name in ("edge_index", "edge_attr", "edge_pos"))
     half = index.shape[1] // 2
+    ways = np.concatenate([index[:, :half], [first, second], index[:, half:], [second, first]], axis=1)
     return {
-        "edge_index": np.concatenate([index[:, :half], [here, there], index[:, half:], [there, here]], axis=1).astype(np.int64),
+        "edge_index": ways.astype(np.int64),
         "edge_attr": np.concatenate([attr[:half], features, attr[half:], back]).astype(np.float32),
         "edge_pos": np.concatenate([places[:half], middle, places[half:], middle]),
     }

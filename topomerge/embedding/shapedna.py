@@ -11,7 +11,7 @@ from topomerge.types import Array, TopometricMap
 
 LAPLACIANS = ("surface", "graph")
 NORMALISATIONS = ("weyl", "first", "none")
-LEAST = 8  # cells: fewer have no shape
+SHAPE_LEAST_CELLS = 8  # cells: fewer have no shape
 
 
 def shapedna(
@@ -42,7 +42,7 @@ def shapedna(
     def describe(map: TopometricMap) -> Array:
         out = np.zeros((len(map.rooms), values))
         for room, cells in enumerate(room_cells(map)):
-            if len(cells) >= LEAST:
+            if len(cells) >= SHAPE_LEAST_CELLS:
                 out[room] = spectrum(cells, map.grid.edge, laplacian, values, spacing, largest)
         return normalised(out, normalise)
 
@@ -55,25 +55,25 @@ def spectrum(cells: Array, edge: float, laplacian: str, values: int, spacing: fl
         while len(cells) > largest:
             halved = cells // 2
             cells = halved[_firsts(halved)[0]]
-        found = smallest_eigenvalues(graph_laplacian(cells), values)
+        eigenvalues = smallest_eigenvalues(graph_laplacian(cells), values)
     else:
         points = thinned((cells + 0.5) * edge, spacing)
         while len(points) > largest:
             spacing *= max(float(np.sqrt(len(points) / largest)), 1.05)
             points = thinned((cells + 0.5) * edge, spacing)
-        found = smallest_eigenvalues(surface_laplacian(points), values)
-    if not len(found):
+        eigenvalues = smallest_eigenvalues(surface_laplacian(points), values)
+    if not len(eigenvalues):
         return np.zeros(values)
     number = np.arange(1, values + 1)
-    slope = _slope(found[None])[0]
-    return np.concatenate([found, np.maximum(slope * number[len(found) :], found[-1])])
+    slope = _slope(eigenvalues[None])[0]
+    return np.concatenate([eigenvalues, np.maximum(slope * number[len(eigenvalues) :], eigenvalues[-1])])
 
 
 def thinned(points: Array, spacing: float) -> Array:
     """Middle of the points (n, 3) in each cube of a grid that is laid over them; all points if hardly any would be left."""
     cube = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
     first, of = _firsts(cube)
-    if len(first) < LEAST:
+    if len(first) < SHAPE_LEAST_CELLS:
         return points
     sums = np.stack([np.bincount(of, points[:, a]) for a in range(3)], axis=1)
     return sums / np.bincount(of)[:, None]

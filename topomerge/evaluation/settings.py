@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.datasets.pairs.recipe import Recipe
-from topomerge.embedding.context import HOWS
+from topomerge.embedding.context import CONTEXT_KINDS
 from topomerge.embedding.embedders import EMBEDDERS
 from topomerge.embedding.weights import read_weights
 from topomerge.errors import InputError
@@ -109,7 +109,7 @@ def check(settings: Evaluation) -> None:
     for name, options in settings.descriptors.items():
         if options.get("name") not in EMBEDDERS:
             raise InputError(f"descriptors.{name}.name {options.get('name')!r}: {', '.join(EMBEDDERS)} are possible")
-    for key, known in (("methods", METHODS), ("context", HOWS), ("tables", TABLES)):
+    for key, known in (("methods", METHODS), ("context", CONTEXT_KINDS), ("tables", TABLES)):
         for value in getattr(settings, key):
             if value not in known:
                 raise InputError(f"{key}: unknown {value!r}; {', '.join(known)} are possible")

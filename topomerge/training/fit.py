@@ -30,7 +30,7 @@ from topomerge.io.atomic import replacing
 from topomerge.models.embedder import Embedder
 from topomerge.models.losses import Objective
 from topomerge.models.weights import read_embedder, save_embedder
-from topomerge.training.batches import Batch, make_batch
+from topomerge.training.batches import MapPair, make_batch
 from topomerge.training.log import Clock, Log
 from topomerge.training.packed import EXTRAS, GraphPair, load_pairs
 from topomerge.training.settings import Augment, Training, check, to_dict
@@ -154,7 +154,7 @@ class Run:
         row |= {"rooms_per_second": of_all / took, "waiting": waited / took}
         return row | {f"train/{name}": value / self.steps for name, value in self.state.sums.items()}
 
-    def step(self, batch: Batch) -> dict[str, float]:
+    def step(self, batch: MapPair) -> dict[str, float]:
         """One step of the optimizer; the losses."""
         settings, done = self.settings, self.state.epoch * self.steps + self.state.step
         for group in self.optimizer.param_groups:
@@ -170,7 +170,7 @@ class Run:
         self.optimizer.step()
         return {name: float(value.detach()) for name, value in losses.items()}
 
-    def batches(self) -> Generator[Batch, None, None]:
+    def batches(self) -> Generator[MapPair, None, None]:
         """Those of this epoch from the state's step on, each made while the one before it is worked on."""
         settings, state = self.settings, self.state
         shuffle = torch.Generator().manual_seed(mixed(settings.seed, state.epoch))
@@ -179,7 +179,7 @@ class Run:
             order = list(range(len(self.train)))
         rank, world, size, names = self.fabric.global_rank, self.fabric.world_size, settings.batch, self.network.tensors
 
-        def make(step: int) -> Batch:
+        def make(step: int) -> MapPair:
             chosen = order[step * size * world :][: size * world][rank::world]
             generator = torch.Generator().manual_seed(mixed(settings.seed, state.epoch, step, rank))
             return make_batch([self.train[i] for i in chosen], names, self.augment, generator)

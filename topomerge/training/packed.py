@@ -20,16 +20,17 @@ from torch import Tensor
 
 from topomerge.embedding.door_layout import door_layout
 from topomerge.embedding.rooms_around import with_rooms_around
+from topomerge.embedding.schema import width
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array
 
-FORMAT = 4
-CHUNK = 100  # pairs; descriptors that take long are kept chunk by chunk
-TABLES = ("x", "edge_attr", "door_attr", "pos", "edge_pos")  # no network reads positions: they depend on the frame
+PACKED_FORMAT = 4
+PAIRS_PER_CHUNK = 100  # pairs; descriptors that take long are stored chunk by chunk
+PACKED_TABLES = ("x", "edge_attr", "door_attr", "pos", "edge_pos")  # no network reads positions: they depend on the frame
 INDICES = ("edge_index", "door_index", "near_index")
-STORED = INDICES[:2]
-COUNTS = {
+PACKED_INDICES = INDICES[:2]
+ROWS_OF = {
     "edge_attr": "edges",
     "edge_pos": "edges",
     "edge_index": "edges",
@@ -37,7 +38,6 @@ COUNTS = {
     "door_index": "doors",
 }  # of the others: rooms
 EXTRAS = ("engineered", "shapedna")
-WIDTHS = {"engineered": 12, "shapedna": 32}
 Graph = dict[str, Tensor]
 
 
@@ -88,15 +88,15 @@ def load_pairs(
         return _with_layout(_unpacked(arrays, {})[: limit or None], extras, around)
     rows = _rows(path)
     names = [str(row["file"]) for row in rows]
-    digest = hashlib.sha256(json.dumps([FORMAT, names]).encode()).hexdigest()[:12]
+    digest = hashlib.sha256(json.dumps([PACKED_FORMAT, names]).encode()).hexdigest()[:12]
     folder = path.parent / "packed"
     folder.mkdir(exist_ok=True)
-    whole = folder / f"{path.stem}-{digest}.npz"
-    if not whole.exists():
+    packed_file = folder / f"{path.stem}-{digest}.npz"
+    if not packed_file.exists():
         say(f"packing {len(names)} pairs")
-        archive.write(_packed([archive.read(path.parent / "pairs" / name, "cached pair") for name in names], rows), whole)
-    arrays = archive.read(whole, "packed set")
-    tables = {name: _extra(name, arrays, whole, say, limit) for name in extras if name in EXTRAS}
+        archive.write(_packed([archive.read(path.parent / "pairs" / name, "cached pair") for name in names], rows), packed_file)
+    arrays = archive.read(packed_file, "packed set")
+    tables = {name: _extra(name, arrays, packed_file, say, limit) for name in extras if name in EXTRAS}
     return _with_layout(_unpacked(arrays, tables)[: limit or None], extras, around)
 
 
@@ -107,8 +107,8 @@ def _with_layout(pairs: list[GraphPair], extras: Sequence[str], around: float) -
         del graph["door_index"], graph["door_attr"]  # of the edges before
     if "near" in extras:
         for graph in (g for pair in pairs for g in (pair.a, pair.b)):
-            found = door_layout(*(graph[name].numpy() for name in ("edge_index", "pos", "edge_pos")))
-            graph["near_index"], graph["near_attr"] = (torch.from_numpy(array) for array in found)
+            layout = door_layout(*(graph[name].numpy() for name in ("edge_index", "pos", "edge_pos")))
+            graph["near_index"], graph["near_attr"] = (torch.from_numpy(array) for array in layout)
     return pairs
 
 
@@ -116,8 +116,8 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        made = f"make it with python -m topomerge.datasets.pairs.build data={path.stem}"
-        raise InputError(f"{path}: {error.strerror or error}; {made}") from error
+        advice = f"make it with python -m topomerge.datasets.pairs.build data={path.stem}"
+        raise InputError(f"{path}: {error.strerror or error}; {advice}") from error
     rows = [json.loads(line) for line in text.splitlines()]
     if not rows:
         raise InputError(f"{path}: no pairs in it")
@@ -127,8 +127,8 @@ def _rows(path: Path) -> list[dict[str, Any]]:
 def _packed(pairs: list[dict[str, Array]], rows: list[dict[str, Any]]) -> dict[str, Array]:
     """All maps behind each other, a0 b0 a1 b1 ..., with how many rooms, edges and pairs of doors each has."""
     sides = [{n[2:]: v for n, v in pair.items() if n.startswith(f"{s}.")} for pair in pairs for s in "ab"]
-    out = {name: np.concatenate([side[name] for side in sides]).astype(np.float32) for name in TABLES}
-    out |= {name: np.concatenate([side[name] for side in sides], axis=1).astype(np.int32) for name in STORED}
+    out = {name: np.concatenate([side[name] for side in sides]).astype(np.float32) for name in PACKED_TABLES}
+    out |= {name: np.concatenate([side[name] for side in sides], axis=1).astype(np.int32) for name in PACKED_INDICES}
     points = np.concatenate([np.round(side["room_points"] * 1000).clip(-32767, 32767).astype(np.int16) for side in sides])
     out["room_points"] = points
     for name, of in (("rooms", "x"), ("edges", "edge_attr"), ("doors", "door_attr")):
@@ -138,50 +138,50 @@ def _packed(pairs: list[dict[str, Array]], rows: list[dict[str, Any]]) -> dict[s
     out["matches"] = np.concatenate([pair["matches"] for pair in pairs]).astype(np.int32)
     out["transform"] = np.stack([pair["transform"] for pair in pairs])
     out["partners"] = np.array([len(pair["matches"]) for pair in pairs])
-    told = json.dumps([_short(row) for row in rows], ensure_ascii=False)
-    return out | {"about": np.frombuffer(told.encode(), np.uint8)}
+    about = json.dumps([_short(row) for row in rows], ensure_ascii=False)
+    return out | {"about": np.frombuffer(about.encode(), np.uint8)}
 
 
 def _short(row: dict[str, Any]) -> dict[str, Any]:
-    kept = ("file", "building", "source", "kind", "sensors", "overlap", "hard", "storeys")
-    return {key: row[key] for key in kept if key in row}
+    columns = ("file", "building", "source", "kind", "sensors", "overlap", "hard", "storeys")
+    return {key: row[key] for key in columns if key in row}
 
 
 def _unpacked(arrays: dict[str, Array], extras: dict[str, Array]) -> list[GraphPair]:
     counts = {name: arrays[name].tolist() for name in ("rooms", "edges", "doors")}
-    tensors = {name: torch.from_numpy(arrays[name]) for name in (*TABLES, *STORED, "room_points")}
+    tensors = {name: torch.from_numpy(arrays[name]) for name in (*PACKED_TABLES, *PACKED_INDICES, "room_points")}
     tensors |= {name: torch.from_numpy(values) for name, values in extras.items()}
     split = {}
     for name, tensor in tensors.items():
-        split[name] = tensor.split(counts[COUNTS.get(name, "rooms")], dim=1 if name in STORED else 0)
+        split[name] = tensor.split(counts[ROWS_OF.get(name, "rooms")], dim=1 if name in PACKED_INDICES else 0)
     maps = range(len(counts["rooms"]))
-    graphs = [{name: parts[i].long() if name in STORED else parts[i] for name, parts in split.items()} for i in maps]
+    graphs = [{name: parts[i].long() if name in PACKED_INDICES else parts[i] for name, parts in split.items()} for i in maps]
     true = torch.from_numpy(arrays["true"]).long().split(counts["rooms"])
     matches = torch.from_numpy(arrays["matches"]).long().split(arrays["partners"].tolist())
-    told = json.loads(arrays["about"].tobytes())
+    about = json.loads(arrays["about"].tobytes())
     iou = torch.from_numpy(arrays["iou"]).split(counts["rooms"])
     truth = [list(zip(of[::2], of[1::2], strict=True)) for of in (true, iou)]
     poses = torch.from_numpy(arrays["transform"]).unbind()
-    return [GraphPair(*one) for one in zip(graphs[::2], graphs[1::2], matches, *truth, told, poses, strict=True)]
+    return [GraphPair(*one) for one in zip(graphs[::2], graphs[1::2], matches, *truth, about, poses, strict=True)]
 
 
-def _extra(name: str, arrays: dict[str, Array], whole: Path, say: Callable[[str], None], limit: int) -> Array:
+def _extra(name: str, arrays: dict[str, Array], packed_file: Path, say: Callable[[str], None], limit: int) -> Array:
     """A descriptor of all rooms, 0 of those beyond the limit; chunks that were reckoned before are read."""
     from topomerge.embedding.point_features import point_features, point_spectra
 
     reckon = {"engineered": point_features, "shapedna": point_spectra}[name]
     ends = np.concatenate([[0], np.cumsum(arrays["rooms"])])
     wanted = int(ends[2 * limit]) if 0 < 2 * limit < len(ends) else len(arrays["x"])
-    starts = np.append(ends[: -1 : 2 * CHUNK], len(arrays["x"]))
-    found = []
+    starts = np.append(ends[: -1 : 2 * PAIRS_PER_CHUNK], len(arrays["x"]))
+    chunks = []
     for k, (first, last) in enumerate(itertools.pairwise(starts)):
-        path = whole.with_name(f"{whole.stem}-{name}-{k}.npz")
+        path = packed_file.with_name(f"{packed_file.stem}-{name}-{k}.npz")
         if first < wanted and not path.exists():
             say(f"{name} of rooms {first} to {last} of {wanted}")
             archive.write({"values": reckon(metres(arrays["room_points"][first:last]))}, path)
-        empty = np.zeros((last - first, WIDTHS[name]), np.float32)
-        found.append(archive.read(path, "descriptors")["values"] if first < wanted else empty)
-    return np.concatenate(found)
+        empty = np.zeros((last - first, width(name)), np.float32)
+        chunks.append(archive.read(path, "descriptors")["values"] if first < wanted else empty)
+    return np.concatenate(chunks)
 
 
 def metres(points: Array) -> Array:

@@ -1,0 +1,56 @@
+"""Pairs of maps as graphs of torch-geometric: a batch says of each map what the map says alone."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from topomerge.models.embedder import Embedder
+from torch_geometric.data import Batch
+from torch_geometric.loader import DataLoader
+
+from tests.graphs import pair
+from topomerge.embedding.network import Geometry, Network, Node
+from topomerge.training.batches import MapPair, make_batch, map_pair
+from topomerge.training.settings import Augment
+
+
+@pytest.mark.parametrize(
+    "node", [Node("gat", 2, doors=1, width=4), Node("gat", 1, doors=1, near=True, width=4), Node("sage", 1, width=4)]
+)
+def test_maps_of_a_batch_do_not_see_each_other(node):
+    torch.manual_seed(0)
+    network = Embedder(Network(Geometry(["scalars"], width=8), node, size=8)).eval()
+    pairs = [pair(0, 5), pair(1, 9)]
+    batch = make_batch(pairs, network.tensors)
+    assert isinstance(batch, Batch) and isinstance(batch, MapPair) and batch.rooms == [5, 5, 9, 9]
+    with torch.no_grad():
+        embeddings = network(batch.tensors)[0].split(batch.rooms)
+        for embedding, graph in zip(embeddings, (g for p in pairs for g in (p.a, p.b)), strict=True):
+            assert torch.allclose(embedding, network(graph)[0], atol=1e-6)
+
+
+def test_matches_lead_to_rooms_of_the_batch():
+    pairs = [pair(k, 5) for k in range(3)]
+    batch = make_batch(pairs, ("x", "edge_index", "edge_attr"))
+    first, second = batch.match_index
+    assert batch.match_index.shape[1] == sum(len(p.matches) for p in pairs)
+    assert torch.equal(batch.batch[first], batch.batch[second])
+    assert (batch.side[first] == 0).all() and (batch.side[second] == 1).all()
+    assert torch.equal(batch.true[first], batch.true[second])
+    assert batch.truth.same.sum() == 2 * len(first) and not batch.truth.piece.any()
+
+
+def test_the_loader_of_torch_geometric_makes_the_same_batches():
+    pairs, names = [pair(k, 6) for k in range(4)], ("x", "edge_index", "edge_attr", "near_index", "near_attr")
+    loader = DataLoader([map_pair(p, names) for p in pairs], batch_size=2)
+    for batch, start in zip(loader, (0, 2), strict=True):
+        again = make_batch(pairs[start : start + 2], names)
+        assert all(torch.equal(batch[name], again[name]) for name in (*names, "match_index", "clear", "batch"))
+
+
+def test_rooms_that_are_left_out_take_their_matches_along():
+    one, generator = pair(0, 12), torch.Generator().manual_seed(0)
+    batch = make_batch([one], ("x", "edge_index", "edge_attr"), Augment(rooms=0.9), generator)
+    assert sum(batch.rooms) < 24 and len(batch.x) == len(batch.side) == len(batch.true) == sum(batch.rooms)
+    first, second = batch.match_index
+    assert torch.equal(batch.true[first], batch.true[second]) and batch.edge_index.max() < len(batch.x)
