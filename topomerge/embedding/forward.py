@@ -115,7 +115,8 @@ class Forward:
         value, score = self._linear(f"{name}.lin_value", rooms)[sources], self._scores(name, rooms, edge_index, edges)[1]
         if edges is not None:
             value = value + self._linear(f"{name}.lin_edge_value", edges, bias=False)
-        alpha = nn.segment_softmax(SCORE_BOUND * np.tanh(score / SCORE_BOUND), targets, len(rooms))
+        weight = np.exp(SCORE_BOUND * np.tanh(score / SCORE_BOUND))  # bounded: no need to subtract the largest first
+        alpha = weight / nn.segment_sum(weight, targets, len(rooms))[targets]
         return self._linear(f"{name}.lin_out", nn.segment_sum(_weighed(value, alpha), targets, len(rooms)))
 
     def _gatv2_conv(self, name: str, rooms: Array, edge_index: Array, edges: Array | None) -> Array:
