@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.embedding import graph
 from topomerge.embedding.graph import graph_arrays, to_graph
-from topomerge.embedding.schema import DOOR_FEATURES, EDGE_FEATURES, ROOM_FEATURES
+from topomerge.embedding.schema import DOOR_FEATURES, EDGE_FEATURES, EDGE_KINDS, ROOM_FEATURES
 from topomerge.errors import InputError
 from topomerge.types import TopometricMap, VoxelGrid
 
@@ -74,7 +73,7 @@ def test_both_directions_agree(map: TopometricMap) -> None:
     for opposite in ("climb", "turn_sin"):
         assert np.allclose(there[:, name[opposite]], -back[:, name[opposite]], atol=1e-5), opposite
     assert np.allclose(there[:, name["from_middle"]], back[:, name["to_middle"]])
-    assert np.allclose(there[:, [name[k] for k in graph.KINDS]].sum(axis=1), 1)
+    assert np.allclose(there[:, [name[k] for k in EDGE_KINDS]].sum(axis=1), 1)
 
 
 def test_features_do_not_depend_on_the_frame(map: TopometricMap) -> None:

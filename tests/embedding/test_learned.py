@@ -31,15 +31,15 @@ SAGE = Network(Geometry(["scalars"], width=8), Node("sage", 1, width=4), size=8)
 def graphs() -> dict[str, dict[str, np.ndarray]]:
     """Arrays of varied maps: a house of one room, one without doors, several storeys, rooms that nothing leads to."""
     two = building(2, 3)
-    found = {"storeys": graph_arrays(two), "small": graph_arrays(building(1)), "one": graph_arrays(joined(two, np.arange(3)))}
-    alone = dict(found["small"])
+    graphs = {"storeys": graph_arrays(two), "small": graph_arrays(building(1)), "one": graph_arrays(joined(two, np.arange(3)))}
+    alone = dict(graphs["small"])
     for name, array in alone.items():
         if name.startswith(("edge", "door")):
             alone[name] = array[:, :0] if name.endswith("index") else array[:0]
-    big, keep = found["storeys"], found["storeys"]["edge_index"].min(axis=0) > 2
-    kept = {n: big[n][:, keep] if n == "edge_index" else big[n][keep] for n in ("edge_index", "edge_attr", "edge_pos")}
+    big, keep = graphs["storeys"], graphs["storeys"]["edge_index"].min(axis=0) > 2
+    remaining = {n: big[n][:, keep] if n == "edge_index" else big[n][keep] for n in ("edge_index", "edge_attr", "edge_pos")}
     none = {"door_index": np.zeros((2, 0), int), "door_attr": np.zeros((0, 3), np.float32)}
-    return found | {"no edges": alone, "isolated": {**big, **kept, **none}}
+    return graphs | {"no edges": alone, "isolated": {**big, **remaining, **none}}
 
 
 @pytest.fixture(scope="module")
@@ -69,9 +69,9 @@ def compare(folder: Path, several: dict[str, dict[str, np.ndarray]]) -> None:
     ours, theirs = load_embedder(folder), load_with_torch(folder)
     assert ours.temperature == pytest.approx(theirs.temperature, abs=1e-7) and ours.about == theirs.about
     for name, arrays in several.items():
-        for found, wanted in zip(ours.graph(arrays), theirs.graph(arrays), strict=True):
-            assert found.shape == wanted.shape and found.dtype == np.float64
-            assert np.abs(found - wanted).max() < 1e-5, name
+        for rows, wanted in zip(ours.graph(arrays), theirs.graph(arrays), strict=True):
+            assert rows.shape == wanted.shape and rows.dtype == np.float64
+            assert np.abs(rows - wanted).max() < 1e-5, name
 
 
 def test_the_embedder_that_ships_is_as_with_torch(torch):
@@ -118,7 +118,7 @@ def test_networks_that_read_points_go_through_torch(torch, tmp_path, monkeypatch
 def test_torch_is_never_imported():
     code = (
         "import sys, topomerge as tm; from tests.scenes_map import building; from topomerge.cli.main import COMMANDS\n"
-        "found = tm.merge([building(1), building(2)]); tm.load_embedder()(building(1)); assert found.descriptor == 'learned'\n"
+        "result = tm.merge([building(1), building(2)]); tm.load_embedder()(building(1)); assert result.descriptor == 'learned'\n"
         "print([m for m in ('torch', 'torch_geometric', 'hydra', 'lightning_fabric') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -123,7 +123,7 @@ def test_grouping_and_crop_by_hand():
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("table", "message"),
     [
         ({"geometry": {"parts": ["lidar"]}}, "geometry.parts"),
         ({"geometry": {"parts": ["pointnet"], "canonical": True, "yaws": 3}}, "geometry.yaws"),
@@ -139,9 +139,9 @@ def test_grouping_and_crop_by_hand():
         ({"dropout": 1.0}, "dropout"),
     ],
 )
-def test_bad_networks_name_their_key(told, said):
-    with pytest.raises(InputError, match=said):
-        network_from(told)
+def test_bad_networks_name_their_key(table, message):
+    with pytest.raises(InputError, match=message):
+        network_from(table)
 
 
 @pytest.mark.parametrize("part", ["pointnet", "pointnet_local", "voxelcnn"])
@@ -156,9 +156,9 @@ def test_a_file_gives_the_same_network(tmp_path, part):
 
 
 def spoil(path, change) -> None:
-    told = json.loads(path.read_text())
-    change(told)
-    path.write_text(json.dumps(told))
+    settings = json.loads(path.read_text())
+    change(settings)
+    path.write_text(json.dumps(settings))
 
 
 def test_bad_files_are_refused(tmp_path):
@@ -242,17 +242,26 @@ def test_layout_of_doors_by_hand():
     index = np.array([[0, 0, 2, 1, 2, 3], [1, 2, 3, 0, 0, 2]])
     middle = np.array([[0, 0, 1], [4, 0, 1], [0, 4, 1], [0, 40, 1]], float)
     door = np.array([[2, 0, 1], [0, 2, 1], [0, 30, 1]] * 2, float)
-    pairs, told = door_layout(index, middle, door)
-    known = {(int(e), int(f)): row for (e, f), row in zip(pairs.T, told, strict=True)}
-    assert sorted(known) == [(0, 1), (0, 4), (1, 0), (1, 3), (3, 1), (3, 4), (4, 0), (4, 3)]  # none is its own way back, none far
+    pairs, features = door_layout(index, middle, door)
+    by_pair = {(int(e), int(f)): row for (e, f), row in zip(pairs.T, features, strict=True)}
+    assert sorted(by_pair) == [
+        (0, 1),
+        (0, 4),
+        (1, 0),
+        (1, 3),
+        (3, 1),
+        (3, 4),
+        (4, 0),
+        (4, 3),
+    ]  # no way back, none far
     half = np.sqrt(0.5)
-    assert np.allclose(known[0, 1], [np.sqrt(8), 0, half, -half, 1])  # out to the east, then back and to the left
-    assert np.allclose(known[1, 0], [np.sqrt(8), 0, -half, -half, 1])
-    assert np.allclose(known[0, 4][:4], known[0, 1][:4]) and known[0, 4][4] == 0  # the same door, left from room 2
+    assert np.allclose(by_pair[0, 1], [np.sqrt(8), 0, half, -half, 1])  # out to the east, then back and to the left
+    assert np.allclose(by_pair[1, 0], [np.sqrt(8), 0, -half, -half, 1])
+    assert np.allclose(by_pair[0, 4][:4], by_pair[0, 1][:4]) and by_pair[0, 4][4] == 0  # the same door, left from room 2
     c, s = np.cos(1.1), np.sin(1.1)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     again = door_layout(index, middle @ turn.T + 7, door @ turn.T + 7)
-    assert np.array_equal(again[0], pairs) and np.allclose(again[1], told, atol=1e-6) and told[:, 0].max() <= LAYOUT_REACH
+    assert np.array_equal(again[0], pairs) and np.allclose(again[1], features, atol=1e-6) and features[:, 0].max() <= LAYOUT_REACH
     assert door_layout(np.zeros((2, 0), int), middle, np.zeros((0, 3)))[1].shape == (0, 5)
 
 
@@ -274,22 +283,22 @@ def test_onnx_agrees(parts, tmp_path):
         tensors = sample(net, rooms, edges, doors, seed=rooms)
         with torch.no_grad():
             wanted = net(tensors)
-        found = session.run(None, {name: tensor.numpy() for name, tensor in tensors.items()})
-        for one, other in zip(found, wanted, strict=True):
+        outputs = session.run(None, {name: tensor.numpy() for name, tensor in tensors.items()})
+        for one, other in zip(outputs, wanted, strict=True):
             assert np.abs(one - other.numpy()).max() < 1e-5
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("table", "message"),
     [
         ({"size": 10**9}, "size must be 1 to 4096"),
         ({"node": {"kind": "gat", "doors": 10**12}}, "node.doors must be 0 to 4"),
         ({"geometry": {"parts": [["scalars"]]}}, "unknown"),
     ],
 )
-def test_settings_that_would_take_all_memory_or_fail_oddly_are_refused(tmp_path, told, said):
+def test_settings_that_would_take_all_memory_or_fail_oddly_are_refused(tmp_path, table, message):
     save_embedder(network(), tmp_path)
     settings = json.loads((tmp_path / "embedder.json").read_text())
-    (tmp_path / "embedder.json").write_text(json.dumps({**settings, "network": told}))
-    with pytest.raises(InputError, match=rf"embedder\.json: .*{said}"):
+    (tmp_path / "embedder.json").write_text(json.dumps({**settings, "network": table}))
+    with pytest.raises(InputError, match=rf"embedder\.json: .*{message}"):
         read_embedder(tmp_path)

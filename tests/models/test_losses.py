@@ -114,8 +114,8 @@ def test_faint_rooms_count_less():
     faint = Truth(ONE.pair, ONE.side, ONE.same, ONE.piece, clear)
     embedding, bins = torch.nn.functional.normalize(torch.tensor([[1.0, 0.5], [0, 1], [1, 0], [0.3, 1]]), dim=1), torch.zeros(4)
     single, _ = info_nce(embedding, torch.tensor(1.0), ONE, 0.3)
-    told = matching_loss(LossSettings(faint=0.25, dustbin=0.0), embedding, bins, torch.tensor(1.0), faint)
-    assert told["loss"].item() == pytest.approx(((0.25 * single[0] + single[2]) / 1.25).item())
+    losses = matching_loss(LossSettings(faint=0.25, dustbin=0.0), embedding, bins, torch.tensor(1.0), faint)
+    assert losses["loss"].item() == pytest.approx(((0.25 * single[0] + single[2]) / 1.25).item())
 
 
 def test_bad_settings_name_their_key():

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from topomerge.embedding.schema import KINDS
+from topomerge.embedding.schema import EDGE_KINDS
 from topomerge.errors import InputError
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import Array, TopometricMap
@@ -105,7 +105,7 @@ def _floors(map: TopometricMap) -> tuple[Array, Array, Array]:
 
 def _room_features(map: TopometricMap, index: Array, doors: Array, spread: Array, sides: Array) -> Array:
     rooms, count = map.rooms, len(map.rooms)
-    of_kind = [np.bincount(index[0][doors["kind"] == kind], minlength=count) for kind in KINDS]
+    of_kind = [np.bincount(index[0][doors["kind"] == kind], minlength=count) for kind in EDGE_KINDS]
     degree = np.bincount(np.unique(index, axis=1)[0], minlength=count)
     flat = doors["kind"] != "stairs"
     widths = np.bincount(index[0][flat], doors["width"][flat], count)
@@ -136,7 +136,7 @@ def _edge_features(middle: Array, index: Array, doors: Array, floors: Array) -> 
     source, target = index
     way_in = (doors["centre"] - middle[source])[:, :2]
     way_out = (middle[target] - doors["centre"])[:, :2]
-    kinds = [doors["kind"] == kind for kind in KINDS]
+    kinds = [doors["kind"] == kind for kind in EDGE_KINDS]
     straight = np.linalg.norm(way_in + way_out, axis=1)
     lengths = [np.linalg.norm(way, axis=1) for way in (way_in, way_out)]
     climb = floors[target] - floors[source]

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from topomerge.embedding.schema import KINDS, column, width
+from topomerge.embedding.schema import EDGE_KINDS, column, width
 from topomerge.types import Array
 
 STOREY_CLIMB = 2.0  # m at most, between the middles of rooms of one storey
 DISTANCE, CLIMB, TURN_COS = (column("edge_attr", feature) for feature in ("distance", "climb", "turn_cos"))
-KIND_COLUMNS = [column("edge_attr", kind) for kind in KINDS]
+KIND_COLUMNS = [column("edge_attr", kind) for kind in EDGE_KINDS]
 
 
 def with_rooms_around(graph: Mapping[str, Array], reach: float) -> dict[str, Array]:

@@ -6,7 +6,7 @@ feature takes a line here and its value in `embedding.graph`; weights that were 
 
 from __future__ import annotations
 
-KINDS = ("door", "opening", "stairs")  # of edges
+EDGE_KINDS = ("door", "opening", "stairs")  # of edges
 ROOM_FEATURES = (
     "area",  # m2
     "height",  # m; 0: no ceiling seen
@@ -28,7 +28,7 @@ ROOM_FEATURES = (
 EDGE_FEATURES = (
     "width",  # m
     "height",  # m; 0: nothing seen above
-    *KINDS,  # one of them is 1
+    *EDGE_KINDS,  # one of them is 1
     "distance",  # m, between the middles of the rooms, seen from above
     "climb",  # m, from floor to floor
     "from_middle",  # m, from the first room's middle to the door, seen from above
