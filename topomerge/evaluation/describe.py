@@ -15,7 +15,7 @@ import numpy as np
 import topomerge
 from topomerge.code_digest import code_digest
 from topomerge.embedding.embedders import EMBEDDERS, embedder
-from topomerge.embedding.learned import EXTRAS
+from topomerge.embedding.learned import POINT_TABLES
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.evaluation.settings import Evaluation, Variant
 from topomerge.io import archive
@@ -46,11 +46,11 @@ class Inputs:
             self.arrays[key] = learned.arrays(m)
             self.seconds[*key, ""] = time.process_time() - began
         known = self.arrays[key]
-        extras = [name for name in EXTRAS if name in learned.network.geometry.parts]
+        extras = [name for name in POINT_TABLES if name in learned.network.geometry.parts]
         for name in extras:
             if name not in known and len(known["x"]):
                 began = time.process_time()
-                known[name] = EXTRAS[name](known["room_points"])
+                known[name] = POINT_TABLES[name](known["room_points"])
                 self.seconds[*key, name] = time.process_time() - began
         began = time.process_time()
         rows = np.asarray(learned.graph(known)[0])
