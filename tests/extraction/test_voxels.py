@@ -48,7 +48,7 @@ def test_order_and_chunks_do_not_matter(seed, parts):
 
 def test_many_chunks_are_merged_on_the_way(monkeypatch):
     points = np.random.default_rng(3).uniform(0, 4, (4000, 3)).astype(np.float32)
-    monkeypatch.setattr(voxels, "MERGE_AT", 500)
+    monkeypatch.setattr(voxels, "PENDING_CELLS", 500)
     grid = voxelise([PointCloud(p) for p in np.array_split(points, 40)])
     assert int(grid.properties["count"].sum()) == 4000
     assert (grid.cells == voxelise(points).cells).all()
