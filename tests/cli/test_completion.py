@@ -27,7 +27,7 @@ def typed(words: list[str], folder: Path, keys: str, wanted: str, setup: str) ->
     try:
         for text, until in ((setup + "; echo set''up\n", "setup"), (keys, wanted.strip())):
             os.write(terminal, text.encode())
-            end, start = time.monotonic() + 8, len(shown)
+            end, start = time.monotonic() + 30, len(shown)
             while until not in shown[start:] and time.monotonic() < end:
                 if select.select([terminal], [], [], 0.2)[0]:
                     shown += re.sub("[\x00-\x09\x0b-\x1f]", "", os.read(terminal, 4096).decode(errors="replace"))

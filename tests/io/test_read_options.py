@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -127,9 +128,9 @@ def test_progress_runs_from_start_to_end(samples: dict[str, Path]) -> None:
 
 
 def test_formats_that_know_their_frame_say_that_options_are_not_applied(samples: dict[str, Path]) -> None:
-    plain, told = read_points(samples["plan.yaml"]), read_points(samples["plan.yaml"], up="y", unit="mm")
-    np.testing.assert_array_equal(plain.points, told.points)
-    assert any("--unit and --up are not applied" in w for w in told.warnings)
+    plain, other = read_points(samples["plan.yaml"]), read_points(samples["plan.yaml"], up="y", unit="mm")
+    np.testing.assert_array_equal(plain.points, other.points)
+    assert any("--unit and --up are not applied" in w for w in other.warnings)
 
 
 @pytest.mark.parametrize(
@@ -139,13 +140,16 @@ def test_formats_that_know_their_frame_say_that_options_are_not_applied(samples:
         ({"unit": "km"}, "not known"),
         ({"scale": 0.0}, "above 0"),
         ({"scale": float("nan")}, "above 0"),
+        ({"scale": "2"}, "--scale '2' can't be used; give a number above 0"),
+        ({"units": "mm"}, "units is no option of reading; give one of up, unit, scale"),
         ({"spacing": -1.0}, "above 0"),
         ({"chunk": 0}, "1 or more"),
     ],
 )
 def test_bad_options_are_refused_at_once(samples: dict[str, Path], options: dict[str, object], says: str) -> None:
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=re.escape(says)) as refusal:
         read_chunks(samples["table.xyz"], **options)  # type: ignore[arg-type]
+    assert str(samples["table.xyz"]) in str(refusal.value) and "\n" not in str(refusal.value)
 
 
 def test_missing_unknown_empty_and_locked_files(tmp_path: Path) -> None:

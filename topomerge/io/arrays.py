@@ -15,7 +15,8 @@ from typing import IO
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import BLOCK, Piece, bytes8, cut_short, damaged
 from topomerge.types import Array
 
 LARGEST = 64 << 30  # bytes a packed array may become
@@ -23,7 +24,7 @@ RATIO, MODEST = 200, 1 << 28  # packed arrays above the second size that shrank 
 POINTS, COLORS, LABELS = ("points", "xyz", "pts", "positions"), ("colors", "rgb", "colours"), ("labels",)
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Blocks of an npy file, which is mapped, or the contents of an npz file."""
     del options
     with path.open("rb") as stream:

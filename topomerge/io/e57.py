@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.io.options import ReadOptions
 from topomerge.io.pcd import pose
-from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
-from topomerge.io.subprocess_reader import read_apart
+from topomerge.io.piece import BLOCK, Piece, bytes8, cut_short, damaged, read_head
+from topomerge.io.subprocess_reader import read_in_subprocess
 from topomerge.kernels.codecs import crc32c
 from topomerge.types import Array
 
@@ -30,15 +31,15 @@ COLORS = ("colorRed", "colorGreen", "colorBlue")
 INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Blocks of the points of all scans, in the file's common frame."""
     if find_spec("pye57") is None:
         raise ImportError("no pye57", name="pye57")
     _check_pages(path)
-    yield from read_apart("e57", "an E57 file", path, options, SECONDS, ROOM)
+    yield from read_in_subprocess("e57", "an E57 file", path, options, SECONDS, ROOM)
 
 
-def read_here(path: Path, options: Options) -> Iterator[Piece]:
+def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """The same in this process, which the library may end."""
     del options
     import pye57
@@ -108,19 +109,14 @@ def _cartesian(spherical: Array) -> Array:
 
 def _check_pages(path: Path) -> None:
     """Refuse a file whose header or any page is damaged."""
+    head = read_head(path, "an E57 file", b"ASTM-E57", 48)
+    length, xml, xml_length, page = struct.unpack("<QQQQ", head[16:48])
+    size = path.stat().st_size
+    if size < length:
+        raise InputError(f"{path}: holds {size:,} of {length:,} bytes; the file is cut short, copy it again")
+    if page != 1024 or length % page or length == 0 or xml + xml_length > length:
+        raise damaged(path, "an E57 file", "its header contradicts itself")
     with path.open("rb") as stream:
-        head = stream.read(48)
-        if head[:8] != b"ASTM-E57":
-            raise InputError(f"{path}: is not an E57 file (it does not start with ASTM-E57); check the file's suffix")
-        if len(head) < 48:
-            raise damaged(path, "an E57 file", "its header is cut short")
-        length, xml, xml_length, page = struct.unpack("<QQQQ", head[16:48])
-        size = path.stat().st_size
-        if size < length:
-            raise InputError(f"{path}: holds {size:,} of {length:,} bytes; the file is cut short, copy it again")
-        if page != 1024 or length % page or length == 0 or xml + xml_length > length:
-            raise damaged(path, "an E57 file", "its header contradicts itself")
-        stream.seek(0)
         for first in range(0, length // page, PAGES):
             data = stream.read(min(PAGES, length // page - first) * page)
             pages = np.frombuffer(data, np.uint8).reshape(-1, page)

@@ -20,7 +20,8 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.io.piece import BLOCK, LIMIT, Options, Piece, damaged, too_many
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import BLOCK, LIMIT, Piece, damaged, too_many
 from topomerge.types import Array
 
 PIXELS = 100_000_000  # more is refused
@@ -43,7 +44,7 @@ class Plan:
     warnings: tuple[str, ...] = ()
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Floor points, then walls layer by layer, in metres."""
     if path.suffix.lower() in (".yaml", ".yml"):
         plan = read_yaml(path)
@@ -170,7 +171,7 @@ def classify(image: tuple[Array, Array], plan: Plan) -> tuple[Array, Array]:
     return (share > plan.occupied) & ~clear, (share < plan.free) & ~clear
 
 
-def _extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: Options) -> Iterator[Piece]:
+def _extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: ReadOptions) -> Iterator[Piece]:
     """Floor, walls and, if asked for, ceiling."""
     spacing = (options.spacing or plan.resolution * options.factor) / options.factor
     height = options.extrude / options.factor

@@ -16,9 +16,10 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.mesh import sample
-from topomerge.io.piece import Options, Piece, damaged
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import Piece, damaged
 from topomerge.io.step import check_references
-from topomerge.io.subprocess_reader import read_apart
+from topomerge.io.subprocess_reader import read_in_subprocess
 from topomerge.types import Array, TrueRoom
 
 # What has a shape but is not built, or is cut out of something else.
@@ -27,7 +28,7 @@ END = b"END-ISO-10303-21"
 WELD = 1e-3  # m, corners closer than this are one
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """The true rooms, then points on every built element, in the order of their ids.
 
     The library is in a process of its own: a reference to an entity of another kind can make it break down.
@@ -36,10 +37,10 @@ def read(path: Path, options: Options) -> Iterator[Piece]:
         raise ImportError("no ifcopenshell", name="ifcopenshell")
     _check_ends(path)
     check_references(path)
-    yield from read_apart("ifc", "an IFC model", path, options)
+    yield from read_in_subprocess("ifc", "an IFC model", path, options)
 
 
-def read_here(path: Path, options: Options) -> Iterator[Piece]:
+def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """The same in this process."""
     import ifcopenshell
 
@@ -118,7 +119,7 @@ def _spaces(model: Any) -> list[tuple[Any, Array, Array]]:
 
 
 def _missing_floors(
-    path: Path, spaces: list[tuple[Any, Array, Array]], shapes: list[tuple[Array, Array]], options: Options, first: int
+    path: Path, spaces: list[tuple[Any, Array, Array]], shapes: list[tuple[Array, Array]], options: ReadOptions, first: int
 ) -> Iterator[Piece]:
     """Floors of spaces on a level that has no slab: some models hold walls and ceilings only, and nobody could stand in them."""
     slabs = np.concatenate([_level_areas(v, f, _flat(v, f)) for v, f in shapes])

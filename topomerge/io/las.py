@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from topomerge.errors import InputError
-from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import BLOCK, Piece, bytes8, cut_short, damaged, read_head
 from topomerge.types import Array
 
 LASZIP = b"laszip encoded"
@@ -17,7 +17,7 @@ LARGEST_HEAD = 64 << 20  # bytes searched for the record of the compression
 SMALLEST_CHUNK = 20  # bytes: a compressed chunk starts with one point as it is
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Blocks of points with their colours."""
     import laspy
 
@@ -49,12 +49,7 @@ def _colors(rows: object) -> Array | None:
 
 def _check_head(path: Path) -> None:
     """What the library would trust: the magic and the number of records before the points."""
-    with path.open("rb") as stream:
-        head = stream.read(227)
-    if head[:4] != b"LASF":
-        raise InputError(f"{path}: is not a LAS file (it does not start with LASF); check the file's suffix")
-    if len(head) < 227:
-        raise damaged(path, "a LAS file", "its header is cut short")
+    head = read_head(path, "a LAS file", b"LASF", 227)
     start, records = int.from_bytes(head[96:100], "little"), int.from_bytes(head[100:104], "little")
     size = path.stat().st_size
     if start > size or records * 54 > size:

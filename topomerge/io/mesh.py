@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.piece import BLOCK, LIMIT, Options, Piece, damaged, too_many
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import BLOCK, LIMIT, Piece, damaged, too_many
 from topomerge.kernels.lattice import areas, points_on_triangles
 from topomerge.types import Array
 
@@ -23,7 +24,7 @@ LONGEST = 10_000.0  # m, edge of a triangle beyond any building
 MOST_SHARED = 4  # times that the bytes of a scene may be shown by its views
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Vertices of every part of a scene, then points sampled on its faces. Materials and textures are not loaded."""
     found = 0
     for vertices, faces in _parts(path):
@@ -39,7 +40,7 @@ def read(path: Path, options: Options) -> Iterator[Piece]:
 
 
 def sample(
-    path: Path, vertices: Array, faces: Array, options: Options, colors: Array | None = None, first: int = 0
+    path: Path, vertices: Array, faces: Array, options: ReadOptions, colors: Array | None = None, first: int = 0
 ) -> Iterator[Piece]:
     """Pieces of points on the faces (m, 3) of a mesh, one an area of spacing².
 

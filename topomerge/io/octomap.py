@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.piece import BLOCK, Options, Piece, damaged
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import BLOCK, Piece, damaged
 from topomerge.kernels.codecs import FREE, LEAF_LEVEL, OCCUPIED, octree_leaves
 from topomerge.types import Array, VoxelGrid
 
@@ -24,7 +25,7 @@ MOST = 30_000_000  # smallest cells that leaves may be cut into
 FEW, USUAL = 1 << 20, 100  # beyond so many cells, at most so many a byte: a real map has 7
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Occupied cells as points, free cells as free space."""
     del options
     data = path.read_bytes()

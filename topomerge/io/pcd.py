@@ -14,7 +14,8 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io import text
-from topomerge.io.piece import BLOCK, Options, Piece, cut_short, damaged
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import BLOCK, Piece, cut_short, damaged
 from topomerge.kernels.codecs import lzf_unpack
 from topomerge.types import Array
 
@@ -35,7 +36,7 @@ class Header:
     lines: int
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Blocks of points; the viewpoint, where it is not the default, is the pose of all."""
     del options
     header = _header(path)

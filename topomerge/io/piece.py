@@ -20,27 +20,6 @@ LIMIT = 100_000_000  # points that a sampled or extruded file may become; more i
 
 
 @dataclass(frozen=True)
-class Options:
-    """What a reader may need to know; lengths in metres.
-
-    Args:
-        factor: metres per unit of the file.
-        resolution: m per pixel of a plain image.
-        extrude: height of the walls of a floor plan, m.
-        ceiling: also close a floor plan from above.
-        spacing: distance between sampled points, m; None: 0.05 m for surfaces, the resolution for floor plans.
-        doors: keep the leaves of doors of a building model, which shut its doors.
-    """
-
-    factor: float = 1.0
-    resolution: float | None = None
-    extrude: float = 2.5
-    ceiling: bool = False
-    spacing: float | None = None
-    doors: bool = False
-
-
-@dataclass(frozen=True)
 class Piece:
     """Some of the points of a file. `poses`, `free` and `rooms` describe the whole file and come with its first piece."""
 
@@ -53,6 +32,21 @@ class Piece:
     rooms: tuple[TrueRoom, ...] = ()
     warnings: tuple[str, ...] = ()
     done: float = 0.0  # share of the file read so far
+
+
+def read_head(path: Path, kind: str, magic: bytes, length: int) -> bytes:
+    """The first bytes of a file that must start with `magic`.
+
+    Raises:
+        InputError: it does not, or has fewer than `length` bytes.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(length)
+    if not head.startswith(magic):
+        raise InputError(f"{path}: is not {kind} (it does not start with {magic.decode()}); check the file's suffix")
+    if len(head) < length:
+        raise damaged(path, kind, "its header is cut short")
+    return head
 
 
 def cut_short(path: Path, have: int, promised: int, what: str = "points") -> InputError:

@@ -15,7 +15,8 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io import text
-from topomerge.io.piece import BLOCK, Options, Piece, bytes8, cut_short, damaged
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import BLOCK, Piece, bytes8, cut_short, damaged
 from topomerge.types import Array
 
 LONGEST_HEADER = 1 << 20  # bytes
@@ -63,7 +64,7 @@ class Header:
         return next((e for e in self.elements if e.name == name), None)
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Blocks of vertices, and where there are faces points sampled on them."""
     header = read_header(path)
     vertex, face = header.find("vertex"), header.find("face")
@@ -165,7 +166,7 @@ def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Eleme
         raise cut_short(path, found, vertex.count)
 
 
-def _read_whole(path: Path, options: Options) -> Iterator[Piece]:
+def _read_whole(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Files with faces or with lists before the vertices: read by plyfile, the faces sampled."""
     from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
 

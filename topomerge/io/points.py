@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import importlib
 import logging
-import math
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from topomerge.errors import InputError
-from topomerge.io import frame
 from topomerge.io.gather import Gatherer
-from topomerge.io.piece import Options, Piece, damaged
+from topomerge.io.options import ReadOptions, read_options
+from topomerge.io.piece import Piece, damaged
 from topomerge.types import PointCloud
 
 Progress = Callable[[float, str], None]
-LONGEST = 500  # letters of a message beside the path: what it quotes of a damaged file may be long
+MESSAGE_LETTERS = 500  # of a message beside the path, at most: what it quotes of a damaged file may be long
 log = logging.getLogger(__name__)
 
 
@@ -57,58 +57,23 @@ def suffixes() -> tuple[str, ...]:
     return tuple(s for f in FORMATS for s in f.suffixes)
 
 
-def read_points(
-    path: str | Path,
-    *,
-    up: str | None = None,
-    unit: str | None = None,
-    scale: float = 1.0,
-    resolution: float | None = None,
-    extrude: float = 2.5,
-    ceiling: bool = False,
-    spacing: float | None = None,
-    doors: bool = False,
-    progress: Progress | None = None,
-) -> PointCloud:
-    """The points of a file as one cloud, in metres, z up.
+def read_points(path: str | Path, *, progress: Progress | None = None, **options: Any) -> PointCloud:
+    """The points of a file as one cloud, in metres, z up: ``read_points("a.ply", up="y", unit="mm")``.
 
     Args:
         path: the file; its suffix names the format.
-        up: axis of the file that points up: "z", "y", "x" or "-z", "-y", "-x"; None: what the format says, which is y for
-            glTF and z for all others.
-        unit: of the file's coordinates: "m", "cm", "mm", "ft" or "in"; None: metres.
-        scale: factor on the coordinates, beside the unit.
-        resolution: m per pixel; needed for an image without a map_server file.
-        extrude: height of the walls made from a floor plan, m.
-        ceiling: also close a floor plan from above.
-        spacing: distance between points sampled on meshes, building models and floor plans, m; None: 0.05 m for surfaces
-            and the resolution for floor plans.
-        doors: keep the door leaves of a building model; by default its doors stand open.
         progress: called now and then with the share done and a text.
+        options: those of `topomerge.io.options.ReadOptions`: ``up``, ``unit``, ``scale`` of the coordinates; ``resolution``,
+            ``extrude``, ``ceiling`` of floor plans; ``spacing`` of points on surfaces; ``doors`` of building models.
 
     Raises:
-        InputError: anything that keeps the file from being read, in one line.
+        InputError: anything that keeps the file from being read, or a wrong option, in one line.
     """
-    chunks = read_chunks(
-        path, up=up, unit=unit, scale=scale, resolution=resolution, extrude=extrude, ceiling=ceiling,
-        spacing=spacing, doors=doors, chunk=sys.maxsize, progress=progress,
-    )  # fmt: skip
-    return next(chunks)
+    return next(read_chunks(path, chunk=sys.maxsize, progress=progress, **options))
 
 
 def read_chunks(
-    path: str | Path,
-    *,
-    up: str | None = None,
-    unit: str | None = None,
-    scale: float = 1.0,
-    resolution: float | None = None,
-    extrude: float = 2.5,
-    ceiling: bool = False,
-    spacing: float | None = None,
-    doors: bool = False,
-    chunk: int = 2_000_000,
-    progress: Progress | None = None,
+    path: str | Path, *, chunk: int = 2_000_000, progress: Progress | None = None, **options: Any
 ) -> Iterator[PointCloud]:
     """The points of a file as clouds of at most `chunk` points, for files larger than memory.
 
@@ -117,37 +82,16 @@ def read_chunks(
     """
     path = Path(path)
     file_format = _format_of(path)
-    _check_values(path, up, unit, scale, resolution, extrude, spacing, chunk)
-    warnings: list[str] = []
-    if file_format.fixed and (unit not in (None, "m") or up not in (None, "z")):
-        warnings.append(f"{file_format.name} states its own unit and up axis: --unit and --up are not applied")
-        unit = up = None
-    factor = frame.UNITS[unit or "m"] * scale
-    up = None if file_format.fixed else up or file_format.up
-    options = Options(factor, resolution, extrude, ceiling, spacing, doors)
-    return _chunks(path, file_format, options, up, chunk, warnings, progress)
-
-
-def _check_values(
-    path: Path,
-    up: str | None,
-    unit: str | None,
-    scale: float,
-    resolution: float | None,
-    extrude: float,
-    spacing: float | None,
-    chunk: int,
-) -> None:
-    if up is not None and up not in frame.TURNS:
-        raise InputError(f"{path}: --up {up} is not an axis; give one of {', '.join(frame.TURNS)}")
-    if unit is not None and unit not in frame.UNITS:
-        raise InputError(f"{path}: --unit {unit} is not known; give one of {', '.join(frame.UNITS)}")
-    lengths = {"scale": scale, "resolution": resolution, "extrude": extrude, "spacing": spacing}
-    for name, value in lengths.items():
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise InputError(f"{path}: --{name} {value:g} can't be used; give a number above 0")
+    reading = read_options(path, options)
     if chunk < 1:
         raise InputError(f"{path}: a chunk of {chunk} points can't be read; give 1 or more")
+    warnings: list[str] = []
+    if file_format.fixed and (reading.unit not in (None, "m") or reading.up not in (None, "z")):
+        warnings.append(f"{file_format.name} states its own unit and up axis: --unit and --up are not applied")
+        reading = replace(reading, unit=None, up=None)
+    up = None if file_format.fixed else reading.up or file_format.up
+    gatherer = Gatherer(str(path), up, reading.factor, chunk, warnings)
+    return _chunks(path, _pieces(path, file_format, reading), gatherer, progress)
 
 
 def _format_of(path: Path) -> Format:
@@ -160,8 +104,8 @@ def _format_of(path: Path) -> Format:
     else:
         if path.suffix.lower() == ".tmap":
             raise InputError(f"{path}: is a map already; give the scan that it was made of, or see it with `topomerge info`")
-        known = " ".join(s[1:] for s in suffixes())
-        raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; rename or export it as one of {known}")
+        readable = " ".join(s[1:] for s in suffixes())
+        raise InputError(f"{path}: unknown suffix {path.suffix or '(none)'}; rename or export it as one of {readable}")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is no regular file (a pipe or a device); give the name of a file")
     try:
@@ -176,13 +120,13 @@ def _format_of(path: Path) -> Format:
     return file_format
 
 
-def _pieces(path: Path, file_format: Format, options: Options) -> Iterator[Piece]:
+def _pieces(path: Path, file_format: Format, options: ReadOptions) -> Iterator[Piece]:
     """What the reader hands over. Whatever a damaged file makes it raise leaves here as an InputError."""
     try:
         reader = importlib.import_module(f"topomerge.io.{file_format.module}")
         yield from reader.read(path, options)
     except InputError as error:
-        text, most = str(error), len(str(path)) + LONGEST
+        text, most = str(error), len(str(path)) + MESSAGE_LETTERS
         raise error if len(text) <= most else InputError(f"{text[:most]} ...") from error.__cause__
     except (GeneratorExit, KeyboardInterrupt, SystemExit):
         raise
@@ -198,11 +142,8 @@ def _pieces(path: Path, file_format: Format, options: Options) -> Iterator[Piece
         raise damaged(path, file_format.name, error) from error
 
 
-def _chunks(
-    path: Path, file_format: Format, options: Options, up: str | None, chunk: int, warnings: list[str], progress: Progress | None
-) -> Iterator[PointCloud]:
-    gatherer = Gatherer(str(path), up, options.factor, chunk, warnings)
-    for piece in _pieces(path, file_format, options):
+def _chunks(path: Path, pieces: Iterable[Piece], gatherer: Gatherer, progress: Progress | None) -> Iterator[PointCloud]:
+    for piece in pieces:
         yield from gatherer.add(piece)
         if progress is not None:
             progress(min(piece.done, 1.0), f"reading {path.name}")

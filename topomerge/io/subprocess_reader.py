@@ -19,16 +19,17 @@ from typing import IO, Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.piece import Options, Piece, damaged
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array, TrueRoom
 
 ARRAYS = {"points": np.float64, "colors": np.uint8, "poses": np.float64, "pose_of": np.int32}  # of a piece
 
 
-def read_apart(
-    module: str, kind: str, path: Path, options: Options, seconds: int | None = None, room: int | None = None
+def read_in_subprocess(
+    module: str, kind: str, path: Path, options: ReadOptions, seconds: int | None = None, room: int | None = None
 ) -> Iterator[Piece]:
-    """What ``module.read_here(path, options)`` yields, labels and free space left out.
+    """What ``module.read_in_process(path, options)`` yields, labels and free space left out.
 
     Args:
         module: of `topomerge.io`.
@@ -87,17 +88,17 @@ def main() -> None:
     limit(room=room)
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)  # what a library prints is no piece
-        for told, arrays in _told(reader, Path(path), Options(**options), seconds):
+        for told, arrays in _told(reader, Path(path), ReadOptions(**options), seconds):
             out.write(json.dumps(told).encode() + b"\n")
             for array in arrays:
                 out.write(array.data)
             out.flush()
 
 
-def _told(reader: Any, path: Path, options: Options, seconds: int | None) -> Iterator[tuple[dict[str, Any], list[Array]]]:
+def _told(reader: Any, path: Path, options: ReadOptions, seconds: int | None) -> Iterator[tuple[dict[str, Any], list[Array]]]:
     try:
         limit(seconds=seconds)
-        for piece in reader.read_here(path, options):
+        for piece in reader.read_in_process(path, options):
             arrays = {name: getattr(piece, name) for name in ARRAYS}
             given = {name: np.ascontiguousarray(v, ARRAYS[name]) for name, v in arrays.items() if v is not None}
             rooms = [{**vars(room), "polygon": np.asarray(room.polygon).tolist()} for room in piece.rooms]

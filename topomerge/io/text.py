@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.piece import Options, Piece, bytes8
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import Piece, bytes8
 from topomerge.types import Array
 
 LINES = 1 << 18  # lines parsed at a time
@@ -38,7 +39,7 @@ class _Layout:
     comma: bool = False  # decimal commas
 
 
-def read(path: Path, options: Options) -> Iterator[Piece]:
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Blocks of points of a table."""
     del options
     size = path.stat().st_size

@@ -13,9 +13,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-DEPTH = 8 * 22  # room on the stack: every level leaves at most seven siblings behind
-CHUNK = 64  # queries a task
-BRICKS = 64  # a ball that may touch more bricks than this is searched from the root
+STACK_SIZE = 8 * 22  # room on the stack: every level leaves at most seven siblings behind
+QUERIES_A_TASK = 64
+MOST_BRICKS = 64  # a ball that may touch more than this is searched from the root
 
 
 class Nodes(NamedTuple):
@@ -81,34 +81,6 @@ def _descend(child, j, stack, top):  # type: ignore[no-untyped-def]  # pragma: n
 
 
 @njit(cache=True, error_model="numpy")
-def _in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Rows of the cells low <= cell < high into `out`; returns how many."""
-    n, count, top = len(cells), 0, 1
-    stack[0] = n + len(span) - 1
-    while top:
-        top -= 1
-        j = stack[top] - n
-        outside, inside = False, True
-        for k in range(3):
-            outside |= box[j, k] >= high[k] or box[j, 3 + k] < low[k]
-            inside &= low[k] <= box[j, k] and box[j, 3 + k] < high[k]
-        if outside:
-            continue
-        if inside:
-            for r in range(span[j, 0], span[j, 1]):
-                out[count] = r
-                count += 1
-        elif child[j] < n:
-            for r in range(child[j], child[j + 1]):
-                if low[0] <= cells[r, 0] < high[0] and low[1] <= cells[r, 1] < high[1] and low[2] <= cells[r, 2] < high[2]:
-                    out[count] = r
-                    count += 1
-        else:
-            top = _descend(child, j, stack, top)
-    return count
-
-
-@njit(cache=True, error_model="numpy")
 def _bricks(centre, reach, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """First and last + 1 of the bricks that an axis of the ball may touch; an empty range where it lies outside."""
     low = min(max(np.ceil(centre - reach), 0.0), 8.0 * size)  # clipped as floats: a far point is no integer
@@ -125,7 +97,7 @@ def _start(table, first_brick, centre, reach, root, stack):  # type: ignore[no-u
     x0, x1 = _bricks(centre[0], reach, table.shape[0])
     y0, y1 = _bricks(centre[1], reach, table.shape[1])
     z0, z1 = _bricks(centre[2], reach, table.shape[2])
-    if first_brick < 0 or (x1 - x0) * (y1 - y0) * (z1 - z0) > BRICKS:
+    if first_brick < 0 or (x1 - x0) * (y1 - y0) * (z1 - z0) > MOST_BRICKS:
         return 1
     top = 0
     for x in range(x0, x1):
@@ -177,7 +149,7 @@ def _in_ball(cells, child, span, box, centre, square, top, stack, out, fill):  #
 @njit(cache=True, nogil=True, error_model="numpy")
 def _task(tree, centres, reach, indptr, out, fill, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     cells, child, span, box, table, first_brick = tree
-    root, stack = len(cells) + len(span) - 1, np.empty(DEPTH, np.int64)
+    root, stack = len(cells) + len(span) - 1, np.empty(STACK_SIZE, np.int64)
     for i in range(begin, end):
         part = out[indptr[i] : indptr[i + 1]] if fill else out
         top = _start(table, first_brick, centres[i], reach, root, stack)
@@ -188,8 +160,36 @@ def _task(tree, centres, reach, indptr, out, fill, begin, end):  # type: ignore[
 
 @njit(cache=True, error_model="numpy", parallel=True)
 def _tasks(tree, centres, reach, indptr, out, fill):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    for task in prange((len(centres) + CHUNK - 1) // CHUNK):
-        _task(tree, centres, reach, indptr, out, fill, task * CHUNK, min((task + 1) * CHUNK, len(centres)))
+    for task in prange((len(centres) + QUERIES_A_TASK - 1) // QUERIES_A_TASK):
+        _task(tree, centres, reach, indptr, out, fill, task * QUERIES_A_TASK, min((task + 1) * QUERIES_A_TASK, len(centres)))
+
+
+@njit(cache=True, error_model="numpy")
+def _in_box(cells, child, span, box, low, high, stack, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Rows of the cells low <= cell < high into `out`; returns how many."""
+    n, count, top = len(cells), 0, 1
+    stack[0] = n + len(span) - 1
+    while top:
+        top -= 1
+        j = stack[top] - n
+        outside, inside = False, True
+        for k in range(3):
+            outside |= box[j, k] >= high[k] or box[j, 3 + k] < low[k]
+            inside &= low[k] <= box[j, k] and box[j, 3 + k] < high[k]
+        if outside:
+            continue
+        if inside:
+            for r in range(span[j, 0], span[j, 1]):
+                out[count] = r
+                count += 1
+        elif child[j] < n:
+            for r in range(child[j], child[j + 1]):
+                if low[0] <= cells[r, 0] < high[0] and low[1] <= cells[r, 1] < high[1] and low[2] <= cells[r, 2] < high[2]:
+                    out[count] = r
+                    count += 1
+        else:
+            top = _descend(child, j, stack, top)
+    return count
 
 
 def in_box(cells: NDArray[np.int32], nodes: Nodes, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -197,7 +197,7 @@ def in_box(cells: NDArray[np.int32], nodes: Nodes, low: NDArray[np.int64], high:
     out = np.empty(len(cells), np.int64)
     if not len(cells):
         return out
-    stack = np.empty(DEPTH, np.int64)
+    stack = np.empty(STACK_SIZE, np.int64)
     return out[: _in_box(cells, *nodes[:3], low, high, stack, out)].copy()
 
 
@@ -215,7 +215,7 @@ def in_balls(
         if fill:
             np.cumsum(indptr, out=indptr)
             rows = np.empty(indptr[-1], np.int64)
-        if len(centres) > CHUNK:
+        if len(centres) > QUERIES_A_TASK:
             _tasks(tree, centres, radius, indptr, rows, fill)
         else:  # waking the other cores costs more than so few queries
             _task(tree, centres, radius, indptr, rows, fill, 0, len(centres))

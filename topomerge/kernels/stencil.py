@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from topomerge.kernels.lookup import row
 
-CHUNK = 2048  # cells a task: scratch memory is made once a task, and two cores stay level
+CELLS_A_TASK = 2048  # scratch memory is made once a task, and two cores stay level
+Arrays2 = tuple[NDArray[Any], NDArray[Any]]  # table and bricks of `lookup.build`; offsets and weights of a stencil
 _ONES = np.array([bin(i).count("1") for i in range(256)], np.int64)
 
 
@@ -69,13 +70,13 @@ def _count(table, bits, cells, runs, weights, out):  # type: ignore[no-untyped-d
 def _any(table, bits, cells, runs, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     for i in prange(len(cells)):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
-        found = False
+        occupied = False
         for j in range(len(runs)):
             low, high = z + runs[j, 2], z + runs[j, 3]
             if _column(table, bits, x + runs[j, 0], y + runs[j, 1], low, high, True):
-                found = True
+                occupied = True
                 break
-        out[i] = found
+        out[i] = occupied
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
@@ -96,21 +97,21 @@ def _weigh(table, bricks, cells, offsets, weights, values, largest, out):  # typ
 
 
 @njit(cache=True, error_model="numpy")
-def _winner(found, votes, count, own):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _winner(voted, votes, count, own):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """The label with most votes: of several `own`, else the smallest; -1 where nobody voted."""
     best, most = -1, 0.0
     for k in range(count):
-        if votes[k] > most or (votes[k] == most and best != own and (found[k] == own or found[k] < best)):
-            best, most = found[k], votes[k]
+        if votes[k] > most or (votes[k] == most and best != own and (voted[k] == own or voted[k] < best)):
+            best, most = voted[k], votes[k]
     return best
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
 def _vote(table, bricks, cells, offsets, weights, labels, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for task in prange((len(cells) + CHUNK - 1) // CHUNK):
-        found = np.empty(len(offsets), np.int64)  # labels met, in order of appearance: mostly one or two
+    for task in prange((len(cells) + CELLS_A_TASK - 1) // CELLS_A_TASK):
+        voted = np.empty(len(offsets), np.int64)  # labels met, in order of appearance: mostly one or two
         votes = np.empty(len(offsets), np.float64)
-        for i in range(task * CHUNK, min((task + 1) * CHUNK, len(cells))):
+        for i in range(task * CELLS_A_TASK, min((task + 1) * CELLS_A_TASK, len(cells))):
             x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
             count = 0
             for j in range(len(offsets)):
@@ -118,13 +119,13 @@ def _vote(table, bricks, cells, offsets, weights, labels, out):  # type: ignore[
                 if r < 0 or labels[r] < 0:
                     continue
                 k = 0
-                while k < count and found[k] != labels[r]:
+                while k < count and voted[k] != labels[r]:
                     k += 1
                 if k == count:
-                    found[k], votes[k] = labels[r], 0.0
+                    voted[k], votes[k] = labels[r], 0.0
                     count += 1
                 votes[k] += weights[j]
-            out[i] = _winner(found, votes, count, labels[i])
+            out[i] = _winner(voted, votes, count, labels[i])
 
 
 def count(
@@ -143,25 +144,14 @@ def any_(table: NDArray[Any], bits: NDArray[Any], cells: NDArray[Any], runs: NDA
     return out
 
 
-def weigh(
-    bricks: tuple[NDArray[Any], NDArray[Any]],
-    cells: NDArray[Any],
-    stencil: tuple[NDArray[Any], NDArray[Any]],
-    values: NDArray[Any],
-    largest: bool,
-) -> NDArray[np.float64]:
+def weigh(bricks: Arrays2, cells: NDArray[Any], stencil: Arrays2, values: NDArray[Any], largest: bool) -> NDArray[np.float64]:
     """(n, c) sum, or `largest`, of weight * value over the cells under (k, 3) int64 offsets; values (n, c) float64."""
     out = np.empty(values.shape, np.float64)
     _weigh(*bricks, cells, *stencil, values, largest, out)
     return out
 
 
-def vote(
-    bricks: tuple[NDArray[Any], NDArray[Any]],
-    cells: NDArray[Any],
-    stencil: tuple[NDArray[Any], NDArray[Any]],
-    labels: NDArray[Any],
-) -> NDArray[np.int64]:
+def vote(bricks: Arrays2, cells: NDArray[Any], stencil: Arrays2, labels: NDArray[Any]) -> NDArray[np.int64]:
     """(n,) most voted of the (n,) int64 labels under the stencil; negative labels do not vote."""
     out = np.empty(len(cells), np.int64)
     _vote(*bricks, cells, *stencil, labels, out)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from topomerge.kernels import morton
 
-NEAR = 1 << 10  # cells around the median point that `_split` puts into a table, which is then small enough
+TABLE_REACH = 1 << 10  # cells around the median point that `_split` puts into a table, which is then small enough
 MAX_TABLE = 1 << 26  # bricks of the dense table; larger extents are sorted instead
 
 
@@ -37,15 +37,27 @@ def bounds(points):  # type: ignore[no-untyped-def]  # pragma: no cover - compil
     return low[0], high[0], bad.sum()
 
 
+@njit(cache=True, error_model="numpy")
+def _cell(points, i, shift, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Is point i finite, and its lattice cell floor((p + shift) / edge)."""
+    x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+        return False, 0, 0, 0
+    return (
+        True,
+        np.int64(np.floor((x + shift[0]) / edge)),
+        np.int64(np.floor((y + shift[1]) / edge)),
+        np.int64(np.floor((z + shift[2]) / edge)),
+    )
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
 def to_lattice(points, shift, edge, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Lattice cell floor((p + shift) / edge) of each point; points that are not finite get the lowest integer."""
+    """Lattice cell of each point; points that are not finite get the lowest integer."""
     for i in prange(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        if np.isfinite(x) and np.isfinite(y) and np.isfinite(z):
-            out[i, 0] = np.int64(np.floor((x + shift[0]) / edge))
-            out[i, 1] = np.int64(np.floor((y + shift[1]) / edge))
-            out[i, 2] = np.int64(np.floor((z + shift[2]) / edge))
+        finite, x, y, z = _cell(points, i, shift, edge)
+        if finite:
+            out[i, 0], out[i, 1], out[i, 2] = x, y, z
         else:
             out[i, 0] = out[i, 1] = out[i, 2] = np.iinfo(np.int64).min
 
@@ -54,28 +66,24 @@ def to_lattice(points, shift, edge, out):  # type: ignore[no-untyped-def]  # pra
 def mark(points, shift, edge, base, table):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """First pass: 1 in `table` for each brick that holds a point. Threads may write the same 1 twice."""
     for i in prange(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        if np.isfinite(x) and np.isfinite(y) and np.isfinite(z):
-            cx = np.int64(np.floor((x + shift[0]) / edge)) - base[0]
-            cy = np.int64(np.floor((y + shift[1]) / edge)) - base[1]
-            cz = np.int64(np.floor((z + shift[2]) / edge)) - base[2]
-            table[cx >> 3, cy >> 3, cz >> 3] = 1
+        finite, x, y, z = _cell(points, i, shift, edge)
+        if finite:
+            table[(x - base[0]) >> 3, (y - base[1]) >> 3, (z - base[2]) >> 3] = 1
 
 
 @njit(cache=True, error_model="numpy")
 def count(points, shift, edge, base, table, counts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Second pass: points in each cell of the bricks in use; within a brick cells stand in Morton order."""
     for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        if np.isfinite(x) and np.isfinite(y) and np.isfinite(z):
-            cx = np.int64(np.floor((x + shift[0]) / edge)) - base[0]
-            cy = np.int64(np.floor((y + shift[1]) / edge)) - base[1]
-            cz = np.int64(np.floor((z + shift[2]) / edge)) - base[2]
-            x3, y3, z3 = cx & 7, cy & 7, cz & 7
-            code = (x3 & 1) | (y3 & 1) << 1 | (z3 & 1) << 2
-            code |= (x3 & 2) << 2 | (y3 & 2) << 3 | (z3 & 2) << 4
-            code |= (x3 & 4) << 4 | (y3 & 4) << 5 | (z3 & 4) << 6
-            counts[table[cx >> 3, cy >> 3, cz >> 3], code] += 1
+        finite, x, y, z = _cell(points, i, shift, edge)
+        if not finite:
+            continue
+        cx, cy, cz = x - base[0], y - base[1], z - base[2]
+        x3, y3, z3 = cx & 7, cy & 7, cz & 7
+        code = (x3 & 1) | (y3 & 1) << 1 | (z3 & 1) << 2
+        code |= (x3 & 2) << 2 | (y3 & 2) << 3 | (z3 & 2) << 4
+        code |= (x3 & 4) << 4 | (y3 & 4) << 5 | (z3 & 4) << 6
+        counts[table[cx >> 3, cy >> 3, cz >> 3], code] += 1
 
 
 def occupied(
@@ -120,11 +128,12 @@ def _split(
     to_lattice(points, shift, edge, cells)
     cells = cells[cells[:, 0] != np.iinfo(np.int64).min]
     middle = np.median(cells[:: max(len(cells) // 100_000, 1)], axis=0).astype(np.int64)
-    near = (np.abs(cells - middle) < NEAR).all(axis=1)
-    kept, counts = np.unique(cells[~near], axis=0, return_counts=True)
+    near = (np.abs(cells - middle) < TABLE_REACH).all(axis=1)
+    occupied_cells, counts = np.unique(cells[~near], axis=0, return_counts=True)
     if near.any():
         points_near = (cells[near] - middle + 0.5).astype(np.float32)
         base, inner, inner_counts = occupied(points_near, np.zeros(3), 1.0)
-        kept, counts = np.concatenate([inner + base + middle, kept]), np.concatenate([inner_counts, counts])
-    low = kept.min(axis=0)
-    return low, kept - low, counts
+        occupied_cells = np.concatenate([inner + base + middle, occupied_cells])
+        counts = np.concatenate([inner_counts, counts])
+    low = occupied_cells.min(axis=0)
+    return low, occupied_cells - low, counts
