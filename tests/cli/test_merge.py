@@ -17,7 +17,7 @@ from tests.scenes import Scene
 from topomerge.cli.main import main as cli
 
 Run = Callable[..., tuple[int, str, str]]
-WHOLE = ["map.tmap", "merge.json", "merged.ply", "report.html"]
+MERGE_FILES = ["map.tmap", "merge.json", "merged.ply", "report.html"]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def listing(folder: Path) -> Any:
 
 def test_a_cloud_and_a_map_are_merged(folder: Path) -> None:
     merged = folder / "merged"
-    assert sorted(p.name for p in merged.iterdir()) == WHOLE
+    assert sorted(p.name for p in merged.iterdir()) == MERGE_FILES
     found = listing(merged)
     assert found["status"] == "merged" and found["probability"] >= 0.9
     assert [Path(m["source"]).name for m in found["maps"]] == ["a.npy", "b.tmap"]
@@ -78,7 +78,7 @@ def test_a_refusal_has_status_two(run: Run, folder: Path) -> None:
 def test_force_writes_all_and_keeps_the_status(run: Run, folder: Path) -> None:
     status, out, _ = run("b.tmap", "c.tmap", "-o", "forced", "--force")
     assert status == 2 and "force" in out
-    assert sorted(p.name for p in (folder / "forced").iterdir()) == WHOLE
+    assert sorted(p.name for p in (folder / "forced").iterdir()) == MERGE_FILES
     found = listing(folder / "forced")
     assert found["status"] == "abstained" and list(found["transforms"]) == ["1"]
 
@@ -116,7 +116,7 @@ def test_bad_folders(run: Run, folder: Path) -> None:
         first = "merged/map.tmap" if place == "merged" else "b.tmap"
         status, _, err = run(first, "c.tmap", "-o", place)
         assert status == 1 and told in err and len(err.splitlines()) == 1
-    assert sorted(p.name for p in (folder / "merged").iterdir()) == WHOLE
+    assert sorted(p.name for p in (folder / "merged").iterdir()) == MERGE_FILES
 
 
 def test_the_report_in_a_browser(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

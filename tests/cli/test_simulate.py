@@ -13,14 +13,14 @@ import shapely
 import topomerge
 from topomerge.cli.main import main as cli
 
-SMALL = ("--building", "house", "--seed", "3", "--rooms", "4", "--quiet")
+SMALL_BUILDING = ("--building", "house", "--seed", "3", "--rooms", "4", "--quiet")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One small pair, for all tests that only look at it."""
     path = tmp_path_factory.mktemp("simulate") / "pair"
-    assert cli(["simulate", *SMALL, "--sensors", "tls,depth", "--overlap", "0.5", "-o", str(path)]) == 0
+    assert cli(["simulate", *SMALL_BUILDING, "--sensors", "tls,depth", "--overlap", "0.5", "-o", str(path)]) == 0
     return path
 
 
@@ -80,7 +80,7 @@ def test_points_lie_in_their_rooms(folder: Path) -> None:
 
 
 def test_the_same_seed_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
-    assert cli(["simulate", *SMALL, "--sensors", "tls,depth", "--overlap", "0.5", "-o", str(tmp_path / "again")]) == 0
+    assert cli(["simulate", *SMALL_BUILDING, "--sensors", "tls,depth", "--overlap", "0.5", "-o", str(tmp_path / "again")]) == 0
     for path in folder.iterdir():
         assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes(), path.name
 
@@ -101,7 +101,7 @@ def test_hard_negatives_share_nothing(tmp_path: Path, hard: str) -> None:
 
 
 def test_free_scale(tmp_path: Path) -> None:
-    words = ["simulate", *SMALL, "--sensors", "tls,mono", "--scale", "free", "-o", str(tmp_path)]
+    words = ["simulate", *SMALL_BUILDING, "--sensors", "tls,mono", "--scale", "free", "-o", str(tmp_path)]
     assert cli(words) == 0
     known = truth(tmp_path)
     matrix = np.array(known["T_ab"])
@@ -133,5 +133,5 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: li
 
 def test_a_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "pair").write_text("mine")
-    assert cli(["simulate", *SMALL, "-o", str(tmp_path / "pair")]) == 1
+    assert cli(["simulate", *SMALL_BUILDING, "-o", str(tmp_path / "pair")]) == 1
     assert "is a file" in capsys.readouterr().err and (tmp_path / "pair").read_text() == "mine"

@@ -17,7 +17,7 @@ from tests import samples
 from tests.scenes_map import building
 from topomerge.errors import InputError
 
-MOST = 5_000_000  # points that are taken of a file; the rest of a large surface is no danger, as it comes in portions
+MOST_TAKEN = 5_000_000  # points that are taken of a file; the rest of a large surface is no danger, as it comes in portions
 
 
 PARTNERS = {"plan.yaml": "plan.pgm", "embedder.safetensors": "embedder.json", "embedder.json": "embedder.safetensors"}
@@ -31,7 +31,7 @@ def read_cloud(path: Path) -> int:
     found = 0
     for chunk in read_chunks(path, resolution=0.1 if image else None, spacing=2.0, chunk=1 << 19):
         found += len(chunk)
-        if found > MOST:
+        if found > MOST_TAKEN:
             break
     return found
 

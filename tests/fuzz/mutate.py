@@ -17,16 +17,16 @@ from collections.abc import Callable
 import numpy as np
 
 Rng = np.random.Generator
-WHOLE = (0, 1, -1, 127, 255, 32767, 65535, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**62, -(2**63))
-REAL = (0.0, float("nan"), float("inf"), -float("inf"), 1e308, 1e30, 1e9, -1e9, 5e-324, 1e-30)
-WORDS = ("0", "-1", "1e308", "-1e308", "nan", "inf", "1e-300", "99999999999999", "4294967295", "2147483648", "1000000", "x", "")
-HEADER = 600  # bytes in which most formats keep their counts
-LARGEST = 4 << 20  # bytes of a mutant
+INTEGERS = (0, 1, -1, 127, 255, 32767, 65535, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**62, -(2**63))
+REALS = (0.0, float("nan"), float("inf"), -float("inf"), 1e308, 1e30, 1e9, -1e9, 5e-324, 1e-30)
+TOKENS = ("0", "-1", "1e308", "-1e308", "nan", "inf", "1e-300", "99999999999999", "4294967295", "2147483648", "1000000", "x", "")
+HEADER_BYTES = 600  # bytes in which most formats keep their counts
+LARGEST_MUTANT = 4 << 20  # bytes of a mutant
 
 
 def _reach(data: bytes, rng: Rng) -> int:
     """How far into the file the damage may be: every other time only its header."""
-    return len(data) if rng.random() < 0.5 else min(len(data), HEADER)
+    return len(data) if rng.random() < 0.5 else min(len(data), HEADER_BYTES)
 
 
 def flip(data: bytes, rng: Rng) -> bytes:
@@ -42,9 +42,11 @@ def overwrite(data: bytes, rng: Rng) -> bytes:
     size = int(rng.choice((1, 2, 4, 8)))
     order = "<" if rng.random() < 0.8 else ">"
     if size >= 4 and rng.random() < 0.4:
-        field = np.array(rng.choice(REAL if size == 8 else REAL[:4] + REAL[5:]), f"{order}f{size}").tobytes()
+        field = np.array(rng.choice(REALS if size == 8 else REALS[:4] + REALS[5:]), f"{order}f{size}").tobytes()
     else:
-        field = (int(rng.choice(np.array(WHOLE, object))) % (1 << 8 * size)).to_bytes(size, "little" if order == "<" else "big")
+        field = (int(rng.choice(np.array(INTEGERS, object))) % (1 << 8 * size)).to_bytes(
+            size, "little" if order == "<" else "big"
+        )
     at = int(rng.integers(0, max(_reach(data, rng) - size, 1)))
     return data[:at] + field + data[at + size :]
 
@@ -64,7 +66,7 @@ def repeat(data: bytes, rng: Rng) -> bytes:
     """A piece said up to a thousand times."""
     start = int(rng.integers(0, _reach(data, rng)))
     piece = data[start : start + int(rng.choice((1, 4, 30, 200)))]
-    return (data[:start] + piece * int(rng.choice((2, 10, 1000))) + data[start:])[:LARGEST]
+    return (data[:start] + piece * int(rng.choice((2, 10, 1000))) + data[start:])[:LARGEST_MUTANT]
 
 
 def noise(data: bytes, rng: Rng) -> bytes:
@@ -79,7 +81,7 @@ def number(data: bytes, rng: Rng) -> bytes:
     if not found:
         return flip(data, rng)
     match = found[int(rng.integers(len(found) if rng.random() < 0.5 else min(len(found), 20)))]
-    return data[: match.start()] + str(rng.choice(WORDS)).encode() + data[match.end() :]
+    return data[: match.start()] + str(rng.choice(TOKENS)).encode() + data[match.end() :]
 
 
 def lines(data: bytes, rng: Rng) -> bytes:
@@ -93,7 +95,7 @@ def lines(data: bytes, rng: Rng) -> bytes:
         del parts[a]
     else:
         parts[a:a] = [parts[b]] * int(rng.choice((1, 50)))
-    return b"\n".join(parts)[:LARGEST]
+    return b"\n".join(parts)[:LARGEST_MUTANT]
 
 
 def nest(data: bytes, rng: Rng) -> bytes:
@@ -104,8 +106,21 @@ def nest(data: bytes, rng: Rng) -> bytes:
 
 
 GENERAL: tuple[Callable[[bytes, Rng], bytes], ...] = (
-    flip, flip, overwrite, overwrite, overwrite, truncate, delete, repeat, noise, number, number, number, lines, nest
-)  # fmt: skip
+    flip,
+    flip,
+    overwrite,
+    overwrite,
+    overwrite,
+    truncate,
+    delete,
+    repeat,
+    noise,
+    number,
+    number,
+    number,
+    lines,
+    nest,
+)
 
 
 def general(data: bytes, rng: Rng) -> bytes:
@@ -225,9 +240,15 @@ def in_step(data: bytes, rng: Rng) -> bytes:
 
 
 SPECIAL: dict[str, Callable[[bytes, Rng], bytes]] = {
-    ".npz": in_zip, ".tmap": in_zip, ".e57": in_pages, ".png": in_png, ".glb": in_json, ".gltf": in_json, ".json": in_json,
+    ".npz": in_zip,
+    ".tmap": in_zip,
+    ".e57": in_pages,
+    ".png": in_png,
+    ".glb": in_json,
+    ".gltf": in_json,
+    ".json": in_json,
     ".ifc": in_step,
-}  # fmt: skip
+}
 
 
 def mutant(name: str, corpus: dict[str, bytes], seed: int) -> bytes:

@@ -225,10 +225,10 @@ def test_pipes_and_devices_are_not_waited_for(worker: Worker, tmp_path: Path) ->
     harmless(worker, tmp_path / "a.ply")
 
 
-ELSEWHERE = ["../precious.txt", "{elsewhere}/precious.txt", "maps/../../precious.txt", "link/precious.txt", 5]
+STRAY_PLACES = ["../precious.txt", "{elsewhere}/precious.txt", "maps/../../precious.txt", "link/precious.txt", 5]
 
 
-@pytest.mark.parametrize("name", ELSEWHERE)
+@pytest.mark.parametrize("name", STRAY_PLACES)
 def test_an_atlas_of_a_stranger_deletes_and_writes_nothing_elsewhere(tmp_path: Path, name: object) -> None:
     """What looks like a change that was interrupted names files of other folders."""
     from tests.scenes_map import building

@@ -19,7 +19,7 @@ from tests.fuzz.corpus import beside, reader
 from tests.fuzz.mutate import mutant
 from topomerge.errors import InputError
 
-ROOM = 1 << 30  # bytes that reading a small file may take beyond what the libraries hold
+READER_MEMORY = 1 << 30  # bytes that reading a small file may take beyond what the libraries hold
 
 
 def _size() -> int:
@@ -50,7 +50,7 @@ def main(corpus: Path, folder: Path) -> None:
     for name in told["tried"]:
         state = attempt(Path(told["files"][name]))
         assert state[0] == "read", (name, state)
-    limit = _size() + ROOM
+    limit = _size() + READER_MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     print(json.dumps(["ready"]), flush=True)

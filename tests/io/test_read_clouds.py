@@ -153,8 +153,8 @@ def test_blocks_join_to_the_whole(samples: dict[str, Path], name: str, monkeypat
     from topomerge.io import arrays, e57, grid, las, mesh, octomap, pcd, ply, text
 
     for module in (arrays, e57, grid, las, mesh, octomap, pcd, ply):
-        monkeypatch.setattr(module, "BLOCK", 77)
-    monkeypatch.setattr(text, "LINES", 77)
+        monkeypatch.setattr(module, "BLOCK_POINTS", 77)
+    monkeypatch.setattr(text, "LINES_A_TIME", 77)
     monkeypatch.setattr(e57, "read", e57.read_in_process)  # its process would not know of the smaller blocks
     parts = read_points(samples[name])
     if name == "mesh.obj":  # smaller blocks cut its large triangles, and each part has a lattice of its own

@@ -15,12 +15,12 @@ from topomerge.errors import InputError
 from topomerge.io import read_points
 from topomerge.types import PointCloud
 
-NAMES = (
+SAMPLE_NAMES = (
     *("ascii.ply", "little.ply", "big.ply", "mesh.ply", "ascii.pcd", "binary.pcd", "packed.pcd", "table.xyz", "table.csv"),
     *("array.npz", "array.npy", "cloud.las", "cloud.laz", "cloud.e57", "mesh.obj", "mesh.stl", "mesh.glb", "mesh.gltf"),
     *("tree.bt", "model.ifc", "plan.yaml", "plan.pgm"),
 )
-SELF_CHECKING = set(NAMES) - {"table.xyz", "table.csv", "mesh.obj", "plan.yaml"}  # a part of these is a file of its own
+SELF_CHECKING = set(SAMPLE_NAMES) - {"table.xyz", "table.csv", "mesh.obj", "plan.yaml"}  # a part of these is a file of its own
 
 
 def attempt(path: Path, data: bytes) -> PointCloud | None:
@@ -43,7 +43,7 @@ def source(samples: dict[str, Path], name: str, folder: Path) -> tuple[Path, byt
     return folder / name, path.read_bytes()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SAMPLE_NAMES)
 def test_cut_short(samples: dict[str, Path], tmp_path: Path, name: str) -> None:
     path, data = source(samples, name, tmp_path)
     for length in (1, 3, 10, 60, 200, len(data) // 3, len(data) // 2, len(data) - 40):
@@ -51,7 +51,7 @@ def test_cut_short(samples: dict[str, Path], tmp_path: Path, name: str) -> None:
         assert cloud is None or name not in SELF_CHECKING, f"{name} cut to {length} of {len(data)} bytes was read"
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SAMPLE_NAMES)
 def test_flipped_bytes(samples: dict[str, Path], tmp_path: Path, name: str) -> None:
     path, data = source(samples, name, tmp_path)
     rng = np.random.default_rng(len(name))
@@ -63,14 +63,14 @@ def test_flipped_bytes(samples: dict[str, Path], tmp_path: Path, name: str) -> N
         attempt(path, bytes(broken))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SAMPLE_NAMES)
 @pytest.mark.parametrize("data", [b"", b"hello\nworld\n" * 50, bytes(range(256)) * 8, b"\0" * 500, b"\n"])
 def test_other_data_under_the_suffix(samples: dict[str, Path], tmp_path: Path, name: str, data: bytes) -> None:
     path, _ = source(samples, name, tmp_path)
     assert attempt(path, data) is None
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SAMPLE_NAMES)
 def test_another_format_under_the_suffix(samples: dict[str, Path], tmp_path: Path, name: str) -> None:
     path, _ = source(samples, name, tmp_path)
     for other in ("little.ply", "array.npz", "model.ifc", "cloud.e57"):
@@ -78,7 +78,7 @@ def test_another_format_under_the_suffix(samples: dict[str, Path], tmp_path: Pat
             assert attempt(path, samples[other].read_bytes()) is None
 
 
-MANY = 10**12
+ABSURD = 10**12
 
 
 def npy_header(shape: tuple[int, ...]) -> bytes:
@@ -90,9 +90,9 @@ def npy_header(shape: tuple[int, ...]) -> bytes:
 def boasts(samples: dict[str, Path]) -> dict[str, bytes]:
     """Files whose header promises 10^12 points."""
     columns = "property float x\nproperty float y\nproperty float z\n"
-    ply = f"ply\nformat %s 1.0\nelement vertex {MANY}\n{columns}%send_header\n"
+    ply = f"ply\nformat %s 1.0\nelement vertex {ABSURD}\n{columns}%send_header\n"
     faces = "element face 1\nproperty list uchar int vertex_indices\n"
-    pcd = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {MANY}\nHEIGHT 1\nPOINTS {MANY}\nDATA %s\n"
+    pcd = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {ABSURD}\nHEIGHT 1\nPOINTS {ABSURD}\nDATA %s\n"
     las, stl = bytearray(samples["cloud.las"].read_bytes()), bytearray(samples["mesh.stl"].read_bytes())
     laz = bytearray(samples["cloud.laz"].read_bytes())
     las[107:111] = laz[107:111] = stl[80:84] = struct.pack("<I", 2**32 - 1)
@@ -100,7 +100,7 @@ def boasts(samples: dict[str, Path]) -> dict[str, bytes]:
     las_records[100:104] = struct.pack("<I", 2**32 - 1)
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as packed:
-        packed.writestr("points.npy", npy_header((MANY, 3)) + bytes(64))
+        packed.writestr("points.npy", npy_header((ABSURD, 3)) + bytes(64))
     return {
         "a.ply": (ply % ("ascii", "")).encode() + b"1 2 3\n",
         "b.ply": (ply % ("binary_little_endian", "")).encode() + bytes(120),
@@ -109,13 +109,13 @@ def boasts(samples: dict[str, Path]) -> dict[str, bytes]:
         "a.pcd": (pcd % "ascii").encode() + b"1 2 3\n",
         "b.pcd": (pcd % "binary").encode() + bytes(120),
         "c.pcd": (pcd % "binary_compressed").encode() + struct.pack("<II", 100, 2**32 - 1) + bytes(120),
-        "a.npy": npy_header((MANY, 3)) + bytes(120),
+        "a.npy": npy_header((ABSURD, 3)) + bytes(120),
         "a.npz": archive.getvalue(),
         "a.las": bytes(las),
         "b.las": bytes(las_records),
         "a.laz": bytes(laz),
         "a.stl": bytes(stl),
-        "a.gltf": samples["mesh.gltf"].read_bytes().replace(b'"count":', f'"count":{MANY}'.encode(), 1),
+        "a.gltf": samples["mesh.gltf"].read_bytes().replace(b'"count":', f'"count":{ABSURD}'.encode(), 1),
     }
 
 
@@ -182,7 +182,7 @@ def test_e57_library_that_dies_hangs_or_eats_memory(
     (tmp_path / "pye57.py").write_text(f"import os\n\ndef E57(path):\n    {does}\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pye57", raising=False)
-    monkeypatch.setattr(e57, "SECONDS", 1)
+    monkeypatch.setattr(e57, "BLOCK_SECONDS", 1)
     with pytest.raises(InputError, match=says) as caught:
         read_points(samples["cloud.e57"])
     assert "cloud.e57: " in str(caught.value) and "\n" not in str(caught.value)

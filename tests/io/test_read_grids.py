@@ -12,7 +12,7 @@ from tests.samples import octomap_node, write_octomap
 from topomerge.errors import InputError
 from topomerge.io import grid, read_points
 
-FREE, WALL, UNKNOWN = 254, 0, 205
+FREE_PIXEL, WALL_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 
 
 def write_map(folder: Path, pixels: list[list[int]], *, text: str = "", suffix: str = ".pgm", **values: object) -> Path:
@@ -31,14 +31,14 @@ def floor_and_walls(path: Path, **options: object) -> tuple[set[tuple[float, ...
 
 
 def test_the_origin_is_the_lower_left_corner(tmp_path: Path) -> None:
-    path = write_map(tmp_path, [[WALL, UNKNOWN], [FREE, FREE]], origin=[10.0, 20.0, 0.0])
+    path = write_map(tmp_path, [[WALL_PIXEL, UNKNOWN_PIXEL], [FREE_PIXEL, FREE_PIXEL]], origin=[10.0, 20.0, 0.0])
     floor, walls = floor_and_walls(path)
     assert floor == {(10.25, 20.25), (10.75, 20.25)}
     assert walls == {(10.25, 20.75)}
 
 
 def test_yaw_turns_about_the_origin(tmp_path: Path) -> None:
-    path = write_map(tmp_path, [[WALL, UNKNOWN], [FREE, FREE]], origin=[10.0, 20.0, np.pi / 2])
+    path = write_map(tmp_path, [[WALL_PIXEL, UNKNOWN_PIXEL], [FREE_PIXEL, FREE_PIXEL]], origin=[10.0, 20.0, np.pi / 2])
     floor, walls = floor_and_walls(path)
     assert floor == {(9.75, 20.25), (9.75, 20.75)}
     assert walls == {(9.25, 20.25)}
@@ -83,7 +83,7 @@ def test_images_of_many_kinds(tmp_path: Path, mode: str) -> None:
 
 
 def test_walls_ceiling_and_spacing(tmp_path: Path) -> None:
-    path = write_map(tmp_path, [[WALL, FREE]], resolution=0.1)
+    path = write_map(tmp_path, [[WALL_PIXEL, FREE_PIXEL]], resolution=0.1)
     points = read_points(path, extrude=2.0).points
     np.testing.assert_allclose(points[points[:, 0] < 0.1, 2], np.linspace(0, 2, 21), atol=1e-6)
     assert len(points) == 21 + 1
@@ -98,7 +98,7 @@ def test_walls_ceiling_and_spacing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("named", ["map.pgm", "/home/robot/maps/map.pgm", "C:\\maps\\map.pgm", "other.pgm"])
 def test_the_image_is_found_beside_the_yaml(tmp_path: Path, named: str) -> None:
-    path = write_map(tmp_path, [[WALL, FREE]], suffix=".png")
+    path = write_map(tmp_path, [[WALL_PIXEL, FREE_PIXEL]], suffix=".png")
     path.write_text(path.read_text().replace("map.png", named))
     (warning,) = read_points(path).warnings
     assert "map.png beside it was read" in warning
@@ -120,7 +120,7 @@ def test_the_image_is_found_beside_the_yaml(tmp_path: Path, named: str) -> None:
     ],
 )
 def test_bad_map_files_are_named(tmp_path: Path, text: str, says: str) -> None:
-    path = write_map(tmp_path, [[WALL, FREE]], text=text)
+    path = write_map(tmp_path, [[WALL_PIXEL, FREE_PIXEL]], text=text)
     if not says:
         read_points(path)  # the last image is found by the yaml's stem, and other keys don't matter
         return

@@ -39,7 +39,7 @@ def test_tally_equals_a_slow_twin():
 
 def slow_tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face, open_, bits, origin, pose):
     out = np.zeros(11)
-    out[10] = (kinds == align.WALL).sum()
+    out[10] = (kinds == align.WALL_STATE).sum()
     c, s = np.cos(pose[2]), np.sin(pose[2])
     turn = np.array([[c, -s], [s, c]])
     cells = np.floor((np.exp(pose[3]) * points @ turn.T + pose[:2] - origin) / 0.1).astype(int)
@@ -48,24 +48,24 @@ def slow_tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face
         if not (1 <= x < 29 and 1 <= y < 24):
             continue
         there = kind[x, y]
-        if what == align.WALL:
+        if what == align.WALL_STATE:
             near = to_wall[x, y] <= 0.15
             out[0] += near or there != 0
             alike = (turn @ f) @ face[x, y] > -0.3
             out[1] += near and alike
             out[2] += near and not alike
-            out[3] += not near and there == align.FREE and to_any[x, y] >= 0.25
+            out[3] += not near and there == align.FREE_STATE and to_any[x, y] >= 0.25
             continue
         if there == 0:
             continue
-        if what == align.FREE:
+        if what == align.FREE_STATE:
             out[4] += 1
-            out[5] += there == align.FREE
-        if i and open_[x, y] and what in (align.FREE, align.CLUTTER):
-            there = bits[x - 1 : x + 2, y - 1 : y + 2][kind[x - 1 : x + 2, y - 1 : y + 2] == align.CLUTTER]
+            out[5] += there == align.FREE_STATE
+        if i and open_[x, y] and what in (align.FREE_STATE, align.CLUTTER_STATE):
+            there = bits[x - 1 : x + 2, y - 1 : y + 2][kind[x - 1 : x + 2, y - 1 : y + 2] == align.CLUTTER_STATE]
             alike = [(mine & t).bit_count() / max((mine | t).bit_count(), 1) for t in there.tolist()]
-            close = max([1.0] * len(alike) if what == align.FREE else alike, default=0.0)
-            first = 6 if what == align.CLUTTER else 8
+            close = max([1.0] * len(alike) if what == align.FREE_STATE else alike, default=0.0)
+            first = 6 if what == align.CLUTTER_STATE else 8
             out[first] += 1
             out[first + 1] += close
     return out

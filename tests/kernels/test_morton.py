@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 from tests.grids import COMPILED, interleave
 from topomerge.kernels import morton
 
-AXIS = st.integers(0, morton.LIMIT - 1)
-CELLS = st.lists(st.tuples(AXIS, AXIS, AXIS), min_size=1, max_size=30).map(lambda c: np.array(c, np.int32))
+AXIS = st.integers(0, morton.AXIS_LIMIT - 1)
+CELL_ARRAYS = st.lists(st.tuples(AXIS, AXIS, AXIS), min_size=1, max_size=30).map(lambda c: np.array(c, np.int32))
 
 
 @COMPILED
-@given(CELLS)
+@given(CELL_ARRAYS)
 def test_code_interleaves_the_bits(cells):
     assert morton.encode(cells).tolist() == [interleave(c) for c in cells]
 
 
 @COMPILED
-@given(CELLS)
+@given(CELL_ARRAYS)
 def test_round_trip(cells):
     decoded = morton.decode(morton.encode(cells))
     assert decoded.dtype == np.int32
@@ -31,13 +31,13 @@ def test_round_trip(cells):
 
 
 @COMPILED
-@given(CELLS, st.integers(0, morton.BITS))
+@given(CELL_ARRAYS, st.integers(0, morton.BITS))
 def test_prefix_is_the_octant(cells, level):
     assert np.array_equal(morton.encode(cells) >> np.uint64(3 * level), morton.encode(cells >> level))
 
 
 @COMPILED
-@given(CELLS, st.integers(1, morton.BITS))
+@given(CELL_ARRAYS, st.integers(1, morton.BITS))
 def test_order_keeps_octants_together(cells, level):
     order = np.argsort(morton.encode(cells), kind="stable")
     octants = [tuple(c) for c in (cells[order] >> level).tolist()]
@@ -49,12 +49,12 @@ def test_order_keeps_octants_together(cells, level):
 @given(AXIS, AXIS, AXIS, st.integers(0, 2))
 def test_code_grows_along_each_axis(x, y, z, axis):
     low, high = np.array([[x, y, z]]), np.array([[x, y, z]])
-    high[0, axis] = morton.LIMIT - 1
+    high[0, axis] = morton.AXIS_LIMIT - 1
     assert morton.encode(low)[0] <= morton.encode(high)[0]
 
 
 def test_corners_of_the_range():
-    cells = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [morton.LIMIT - 1] * 3])
+    cells = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [morton.AXIS_LIMIT - 1] * 3])
     assert morton.encode(cells).tolist() == [0, 1, 2, 4, 2**63 - 1]
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from topomerge.kernels.carve import carve, sweep
 from topomerge.kernels.crossing import cover, run, widths
-from topomerge.kernels.profile import BELOW, lowest_bit, profiles
+from topomerge.kernels.profile import PROFILE_BELOW, lowest_bit, profiles
 from topomerge.kernels.watershed import contacts, watershed
 from topomerge.types import Array, VoxelGrid
 
@@ -27,8 +27,8 @@ def test_profiles_are_the_bits_of_the_column() -> None:
     for x in range(4):
         for y in range(3):
             column = cells[(cells[:, 0] == x + 1) & (cells[:, 1] == y + 1), 2]
-            bits = [z - base[x, y] + BELOW for z in column if z <= top[x, y]]
-            expected = sum(1 << int(b) for b in bits if 0 <= b < 64) if base[x, y] > -BELOW else 0
+            bits = [z - base[x, y] + PROFILE_BELOW for z in column if z <= top[x, y]]
+            expected = sum(1 << int(b) for b in bits if 0 <= b < 64) if base[x, y] > -PROFILE_BELOW else 0
             assert int(out[x, y]) == expected
     flat = out.ravel()
     for begin in (0, 7, 30):

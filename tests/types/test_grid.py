@@ -71,7 +71,7 @@ def test_subset_with_cells_and_with_properties():
     assert other.cells.tolist() == [[1, 1, 1], [5, 5, 5]] and other.shape == grid.shape and not other.properties
 
 
-CELLS = np.array([[0, 0, 0], [1, 0, 0]], np.int32)
+TWO_CELLS = np.array([[0, 0, 0], [1, 0, 0]], np.int32)
 
 
 @pytest.mark.parametrize(
@@ -81,25 +81,25 @@ CELLS = np.array([[0, 0, 0], [1, 0, 0]], np.int32)
         ({"edge": np.nan}, "edge length"),
         ({"origin": np.zeros(2)}, "origin"),
         ({"origin": np.array([0, np.inf, 0])}, "origin"),
-        ({"cells": CELLS.astype(np.int64)}, "int32"),
-        ({"cells": CELLS[:, :2]}, r"\(n, 3\)"),
-        ({"cells": CELLS[::-1]}, "Morton order"),
-        ({"cells": CELLS[[0, 0]]}, "unique"),
-        ({"cells": CELLS - 1}, "outside"),
+        ({"cells": TWO_CELLS.astype(np.int64)}, "int32"),
+        ({"cells": TWO_CELLS[:, :2]}, r"\(n, 3\)"),
+        ({"cells": TWO_CELLS[::-1]}, "Morton order"),
+        ({"cells": TWO_CELLS[[0, 0]]}, "unique"),
+        ({"cells": TWO_CELLS - 1}, "outside"),
         ({"shape": (1, 1, 1)}, "outside"),
         ({"shape": (2, 0, 1)}, "shape"),
-        ({"shape": (morton.LIMIT + 1, 1, 1)}, "shape"),
+        ({"shape": (morton.AXIS_LIMIT + 1, 1, 1)}, "shape"),
         ({"properties": {"count": np.zeros(3)}}, "count"),
     ],
 )
 def test_grid_refuses(arguments, message):
-    valid = {"cells": CELLS, "origin": np.zeros(3), "edge": 0.1, "shape": (2, 1, 1)}
+    valid = {"cells": TWO_CELLS, "origin": np.zeros(3), "edge": 0.1, "shape": (2, 1, 1)}
     VoxelGrid(**valid)
     with pytest.raises(ValueError, match=message):
         VoxelGrid(**{**valid, **arguments})
 
 
-@pytest.mark.parametrize("cells", [[[0, 0, -1]], [[0, 0, 0], [morton.LIMIT, 0, 0]], [[2**32, 0, 0]], [[0.5, 0, 0]]])
+@pytest.mark.parametrize("cells", [[[0, 0, -1]], [[0, 0, 0], [morton.AXIS_LIMIT, 0, 0]], [[2**32, 0, 0]], [[0.5, 0, 0]]])
 def test_from_cells_refuses(cells):
     with pytest.raises(ValueError, match="cells"):
         VoxelGrid.from_cells(np.array(cells))

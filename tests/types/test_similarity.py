@@ -12,13 +12,13 @@ from topomerge.types import Sim3
 
 LENGTH = st.floats(-50, 50)
 SIMS = st.builds(Sim3, st.floats(-10, 10), st.tuples(LENGTH, LENGTH, LENGTH), st.floats(0.2, 5))
-POINTS = np.random.default_rng(0).uniform(-20, 20, (40, 3))
+TRIED_POINTS = np.random.default_rng(0).uniform(-20, 20, (40, 3))
 
 
 @COMPILED
 @given(SIMS)
 def test_sim3_inverse(sim):
-    assert np.allclose(sim.inverse().apply(sim.apply(POINTS)), POINTS, atol=1e-8)
+    assert np.allclose(sim.inverse().apply(sim.apply(TRIED_POINTS)), TRIED_POINTS, atol=1e-8)
     assert np.allclose((sim @ sim.inverse()).matrix, np.eye(4), atol=1e-8)
     assert np.allclose(sim.inverse().matrix, np.linalg.inv(sim.matrix), atol=1e-7)
 
@@ -26,7 +26,7 @@ def test_sim3_inverse(sim):
 @COMPILED
 @given(SIMS, SIMS, SIMS)
 def test_sim3_composition(a, b, c):
-    assert np.allclose((a @ b).apply(POINTS), a.apply(b.apply(POINTS)), atol=1e-7)
+    assert np.allclose((a @ b).apply(TRIED_POINTS), a.apply(b.apply(TRIED_POINTS)), atol=1e-7)
     assert np.allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-7)
     assert np.allclose(((a @ b) @ c).matrix, (a @ (b @ c)).matrix, atol=1e-6)
     assert -np.pi <= (a @ b).yaw < np.pi

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+BROWSER_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
@@ -24,7 +24,7 @@ FLAGS = (
 
 def browser() -> str:
     """The program; the test is skipped where there is none."""
-    for name in NAMES:
+    for name in BROWSER_NAMES:
         path = shutil.which(name)
         if path:
             return path

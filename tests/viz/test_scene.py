@@ -13,7 +13,7 @@ from tests.viz.chromium import Page
 from topomerge.viz.report import save_report
 from topomerge.viz.scene import scene_data
 
-WHOLE = "document.querySelector('.stage') && document.querySelector('.stage').dataset.whole === 'true'"
+WHOLE_STAGE = "document.querySelector('.stage') && document.querySelector('.stage').dataset.whole === 'true'"
 # Turns the building and notes ms from picture to picture, how many cells each has, and the longest ms until all are drawn.
 ORBIT = """(async () => {
   const stage = document.querySelector(".stage"), next = () => new Promise(requestAnimationFrame);
@@ -51,11 +51,11 @@ def test_two_million_cells_are_turned(tmp_path: Path) -> None:
     assert size < 6e6 and total == len(map.grid)
     began = time.perf_counter()
     with Page(tmp_path / "a.html", tmp_path / "profile") as page:
-        page.wait(WHOLE)
+        page.wait(WHOLE_STAGE)
         opened = time.perf_counter() - began
         seen = page.run(ORBIT)
         page.theme("dark")
-        page.wait(WHOLE)
+        page.wait(WHOLE_STAGE)
         errors = [line for line in page.console if "GPU stall due to ReadPixels" not in line]  # of software drawing
     took, drawn = np.array(seen["took"][5:]), np.array(seen["drawn"][5:])
     print(

@@ -58,7 +58,7 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
             warn(warnings, f"{said} more than {STRAY_DISTANCE:g} m from the rest: left out")
             cells, counts = cells[connected], counts[connected]
             base, shape = _box(cells)
-    if (shape > morton.LIMIT).any() or _volume(shape) / 512 > lookup.MAX_BRICKS:
+    if (shape > morton.AXIS_LIMIT).any() or _volume(shape) / 512 > lookup.MAX_BRICKS:
         extent = " x ".join(f"{s * edge:.0f}" for s in shape)
         raise InputError(f"the points span {extent} m: too large for {edge:g} m voxels; check --unit, or crop the file")
     size = (int(shape[0]), int(shape[1]), int(shape[2]))
@@ -83,7 +83,7 @@ def _merge(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
         return parts[0] if parts else (np.zeros((0, 3), np.int64), np.zeros(0, np.int64))
     cells, counts = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     base = cells.min(axis=0)
-    if ((cells.max(axis=0) - base) < morton.LIMIT).all():
+    if ((cells.max(axis=0) - base) < morton.AXIS_LIMIT).all():
         _, first, inverse = np.unique(morton.encode(cells - base), return_index=True, return_inverse=True)
     else:
         _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)

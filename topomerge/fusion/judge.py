@@ -136,13 +136,13 @@ class Side:
         flat = fields.plan.sliced or other.plan.sliced  # slices tell nothing of heights
         self.bits = np.ones_like(fields.plan.profile) if flat else fields.plan.profile & np.uint32(common)
         if common and not fields.plan.sliced:
-            kind[(kind == align.CLUTTER) & ((fields.plan.profile & np.uint32(common)) == 0)] = align.FREE
-        clutter_around = ndimage.uniform_filter((kind == align.CLUTTER).astype(np.float32), 3) * 9
-        clutter = kind == align.CLUTTER
+            kind[(kind == align.CLUTTER_STATE) & ((fields.plan.profile & np.uint32(common)) == 0)] = align.FREE_STATE
+        clutter_around = ndimage.uniform_filter((kind == align.CLUTTER_STATE).astype(np.float32), 3) * 9
+        clutter = kind == align.CLUTTER_STATE
         solid = clutter & (clutter_around > 4.5)
-        kind[clutter & ~solid] = align.HAZE
+        kind[clutter & ~solid] = align.HAZE_STATE
         self.kind = kind
-        self.open = (solid | ((kind == align.FREE) & (clutter_around < 1.5))) & (fields.to_wall >= INNER_REACH)
+        self.open = (solid | ((kind == align.FREE_STATE) & (clutter_around < 1.5))) & (fields.to_wall >= INNER_REACH)
         rows = np.argwhere(kind > 0)
         self.weight = fields.plan.edge**2 * max(len(rows) / JUDGED_COLUMNS, 1.0)
         if len(rows) > JUDGED_COLUMNS:

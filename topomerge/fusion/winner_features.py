@@ -60,7 +60,7 @@ def _walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, f
     i, j = np.where(inside[:, None], cells, 0).T
     near = inside & (target.to_wall[i, j] <= SAME_WALL)
     seen = inside & (near | (target.kind[i, j] != 0))
-    clash = inside & (target.kind[i, j] == align.FREE) & (target.to_any[i, j] >= FREE_MARGIN)
+    clash = inside & (target.kind[i, j] == align.FREE_STATE) & (target.to_any[i, j] >= FREE_MARGIN)
     area = source.plan.edge**2
     rows = np.column_stack([at, seen, near, source.directions, np.full(len(at), area)])
     mask = np.zeros(source.plan.wall.shape, bool)

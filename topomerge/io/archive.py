@@ -19,10 +19,10 @@ from topomerge.io.atomic import replacing
 from topomerge.types import Array
 
 DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can tell
-MAX_BYTES = 4 << 30  # of all arrays together; a map of 100 million cells needs 2 GB
+ARCHIVE_LIMIT = 4 << 30  # of all arrays together; a map of 100 million cells needs 2 GB
 MAX_RATIO = 1100  # deflate can't shrink by more than 1032; a file that claims more is damaged or hostile
 USUAL_RATIO, MODEST = 100, 1 << 28  # of a whole file: maps shrink by 12 to 17; small ones may claim more
-HEADER = 4096  # longest header of an array, bytes
+LONGEST_HEADER = 4096  # longest header of an array, bytes
 
 
 def write(arrays: Mapping[str, Array], path: str | Path) -> None:
@@ -83,7 +83,7 @@ def _read(file: io.BufferedReader, size: int) -> dict[str, Array]:
             if entry.compress_size > size or entry.file_size > MAX_RATIO * (entry.compress_size + 16):
                 raise ValueError(f"{entry.filename} claims {entry.file_size} bytes, more than it can hold")
         total = sum(entry.file_size for entry in entries)
-        if total > MAX_BYTES or total > max(MODEST, USUAL_RATIO * size):
+        if total > ARCHIVE_LIMIT or total > max(MODEST, USUAL_RATIO * size):
             raise ValueError(f"claims {total:,} bytes in {size:,}")
         return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
 
@@ -91,11 +91,11 @@ def _read(file: io.BufferedReader, size: int) -> dict[str, Array]:
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
     """One array; its declared shape must fill the entry to the byte before the rest of it is read."""
     with archive.open(entry) as stream:
-        head = io.BytesIO(stream.read(HEADER))
+        head = io.BytesIO(stream.read(LONGEST_HEADER))
         version = np.lib.format.read_magic(head)
         if version != (1, 0):
             raise ValueError(f"{entry.filename} has an array format {version} that maps don't use")
-        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=HEADER)
+        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=LONGEST_HEADER)
         if dtype.hasobject:
             raise ValueError(f"{entry.filename} holds pickled objects, which are not read for safety")
         if by_columns or any(s < 0 for s in shape):

@@ -16,12 +16,12 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK, Piece, bytes8, cut_short, damaged
+from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged
 from topomerge.types import Array
 
-LARGEST = 64 << 30  # bytes a packed array may become
+LARGEST_ARRAY = 64 << 30  # bytes a packed array may become
 RATIO, MODEST = 200, 1 << 28  # packed arrays above the second size that shrank more than the first are refused
-POINTS, COLORS, LABELS = ("points", "xyz", "pts", "positions"), ("colors", "rgb", "colours"), ("labels",)
+POINT_NAMES, COLOR_NAMES, LABEL_NAMES = ("points", "xyz", "pts", "positions"), ("colors", "rgb", "colours"), ("labels",)
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -43,8 +43,8 @@ def _read_npy(path: Path) -> Iterator[Piece]:
         del dtype
     points = np.load(path, mmap_mode="r", allow_pickle=False)
     _check_points(path, "the array", shape)
-    for start in range(0, shape[0], BLOCK):
-        block = np.asarray(points[start : start + BLOCK])
+    for start in range(0, shape[0], BLOCK_POINTS):
+        block = np.asarray(points[start : start + BLOCK_POINTS])
         colors = bytes8(block[:, 3:6]) if shape[1] == 6 and block.dtype.kind in "iu" else None
         yield Piece(block[:, :3], colors, done=(start + len(block)) / shape[0])
 
@@ -76,14 +76,14 @@ def _read_npz(path: Path) -> Piece:
     try:
         with zipfile.ZipFile(path) as archive:
             members = {i.filename.removesuffix(".npy"): i for i in archive.infolist() if i.filename.endswith(".npy")}
-            wanted = {"shift", "poses", "pose_of", *POINTS, *COLORS, *LABELS} & members.keys()
-            if not wanted & set(POINTS) and len(members) == 1:
+            wanted = {"shift", "poses", "pose_of", *POINT_NAMES, *COLOR_NAMES, *LABEL_NAMES} & members.keys()
+            if not wanted & set(POINT_NAMES) and len(members) == 1:
                 wanted = set(members)
             arrays = {name: _member(path, archive, members[name]) for name in sorted(wanted)}
     except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
         raise damaged(path, "an npz archive", error) from error
-    name = next((n for n in (*POINTS, *arrays) if n in arrays), None)
-    if name is None or (name not in POINTS and len(arrays) > 1):
+    name = next((n for n in (*POINT_NAMES, *arrays) if n in arrays), None)
+    if name is None or (name not in POINT_NAMES and len(arrays) > 1):
         held = ", ".join(name[:40] for name in list(members)[:8]) or "none"
         raise InputError(f"{path}: has no array named points (it has {held}); save them under that name")
     return _piece(path, name, arrays)
@@ -92,7 +92,7 @@ def _read_npz(path: Path) -> Piece:
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Array:
     """One array of an archive. The size that the archive states bounds what is unpacked."""
     swollen = info.file_size > MODEST and info.file_size > RATIO * max(info.compress_size, 1)
-    if info.file_size > LARGEST or swollen:
+    if info.file_size > LARGEST_ARRAY or swollen:
         raise InputError(f"{path}: {info.filename} would unpack to {info.file_size:,} bytes; refused, save it unpacked")
     with archive.open(info) as stream:
         _header(path, stream, info.file_size)
@@ -104,11 +104,11 @@ def _piece(path: Path, name: str, arrays: dict[str, Array]) -> Piece:
     """The arrays of an archive as a piece, their shapes checked."""
     points = arrays[name]
     _check_points(path, name, points.shape)
-    found = {c: next((arrays[n] for n in names if n in arrays), None) for c, names in (("c", COLORS), ("l", LABELS))}
+    columns = {c: next((arrays[n] for n in names if n in arrays), None) for c, names in (("c", COLOR_NAMES), ("l", LABEL_NAMES))}
     shift, poses, pose_of = arrays.get("shift"), arrays.get("poses"), arrays.get("pose_of")
     wanted = (
-        ("colors", found["c"], (len(points), 3)),
-        ("labels", found["l"], (len(points),)),
+        ("colors", columns["c"], (len(points), 3)),
+        ("labels", columns["l"], (len(points),)),
         ("pose_of", pose_of, (len(points),)),
         ("shift", shift, (3,)),
         ("poses", poses, (len(poses) if poses is not None and poses.ndim else 0, 4, 4)),
@@ -121,8 +121,8 @@ def _piece(path: Path, name: str, arrays: dict[str, Array]) -> Piece:
     xyz = points[:, :3] if shift is None else points[:, :3].astype(np.float64) + shift
     return Piece(
         xyz,
-        None if found["c"] is None else bytes8(found["c"]),
-        None if found["l"] is None else found["l"].astype(np.int32),
+        None if columns["c"] is None else bytes8(columns["c"]),
+        None if columns["l"] is None else columns["l"].astype(np.int32),
         poses,
         None if pose_of is None else pose_of.astype(np.int32),
         done=1.0,

@@ -8,10 +8,10 @@ from topomerge.io.frame import turn
 from topomerge.types import Array
 
 LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
-SLAB = 0.1  # m
-STOREY = 4.5  # m
-STANDING, WIDE = 2.0, 3.6  # m, usual heights of a room
-ENOUGH = 200  # points below which nothing is judged
+SLAB_THICKNESS = 0.1  # m
+STOREY_HEIGHT = 4.5  # m
+LOWEST_ROOM, HIGHEST_ROOM = 2.0, 3.6  # m, usual heights of a room
+JUDGED_POINTS = 200  # points below which nothing is judged
 
 
 class Sample:
@@ -42,7 +42,7 @@ def warn_about(points: Array, up: str | None) -> list[str]:
         points: (n, 3), metres, z up.
         up: the axis of the file that was taken as up; None where the format states its own unit and up axis.
     """
-    if len(points) < ENOUGH:
+    if len(points) < JUDGED_POINTS:
         return []
     low, high = np.percentile(points, (1, 99), axis=0)
     if up is None:
@@ -73,9 +73,9 @@ def _up_warning(points: Array, low: Array, high: Array, up: str) -> list[str]:
     # a tower is, but flat across both pairs of its walls.
     second = sorted(scores)[1]
     clear = scores[best] >= max(0.12, 1.8 * second) or scores[best] >= max(0.08, 2.5 * second)
-    if STOREY <= tall <= 2 * STOREY and not clear and STANDING <= narrow <= WIDE:
+    if STOREY_HEIGHT <= tall <= 2 * STOREY_HEIGHT and not clear and LOWEST_ROOM <= narrow <= HIGHEST_ROOM:
         return [f"{tall:.1f} m tall, but only {narrow:.1f} m wide: if another axis than {up} is up in this file, give --up"]
-    if best == 2 or not clear or tall < STOREY:
+    if best == 2 or not clear or tall < STOREY_HEIGHT:
         return []
     axis = "xyz"[int(np.abs(turn(up)[best]).argmax())]
     return [
@@ -86,8 +86,8 @@ def _up_warning(points: Array, low: Array, high: Array, up: str) -> list[str]:
 
 def flatness(points: Array, low: Array, high: Array) -> list[float]:
     """Share of the surface that lies in the strongest slab across x, y and z; the surface is counted in occupied cells."""
-    inside = points[((points >= low - SLAB) & (points <= high + SLAB)).all(axis=1)]
-    cells = np.floor((inside - inside.min(axis=0)) / SLAB).astype(np.int64)
+    inside = points[((points >= low - SLAB_THICKNESS) & (points <= high + SLAB_THICKNESS)).all(axis=1)]
+    cells = np.floor((inside - inside.min(axis=0)) / SLAB_THICKNESS).astype(np.int64)
     ny, nz = (int(n) for n in cells.max(axis=0)[1:] + 1)
     codes = np.unique((cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2])
     slabs = (codes // (ny * nz), codes // nz % ny, codes % nz)

@@ -18,17 +18,18 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io.options import ReadOptions
 from topomerge.io.pcd import pose
-from topomerge.io.piece import BLOCK, Piece, bytes8, cut_short, damaged, read_head
+from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, read_head
 from topomerge.io.subprocess_reader import read_in_subprocess
 from topomerge.kernels.codecs import crc32c
 from topomerge.types import Array
 
-PAGES = 1 << 15  # checked at a time
-SECONDS, ROOM = 30, 2 << 30  # of the processor for one block, which takes 0.2; bytes of memory for all, which takes 0.2 GB
+PAGES_A_TIME = 1 << 15  # checked at a time
+BLOCK_SECONDS = 30  # of the processor for one block, which takes 0.2
+LIBRARY_MEMORY = 2 << 30  # bytes for all blocks, which take 0.2 GB
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-COLORS = ("colorRed", "colorGreen", "colorBlue")
-INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+COLOR_FIELDS = ("colorRed", "colorGreen", "colorBlue")
+INVALID_FIELDS = ("cartesianInvalidState", "sphericalInvalidState")
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -36,7 +37,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     if find_spec("pye57") is None:
         raise ImportError("no pye57", name="pye57")
     _check_pages(path)
-    yield from read_in_subprocess("e57", "an E57 file", path, options, SECONDS, ROOM)
+    yield from read_in_subprocess("e57", "an E57 file", path, options, BLOCK_SECONDS, LIBRARY_MEMORY)
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -79,9 +80,9 @@ def _scan(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | N
     axes = next((a for a in (CARTESIAN, SPHERICAL) if fields >= set(a)), None)
     if axes is None:
         raise InputError(f"{path}: a scan has neither x y z nor range and angles; export it with coordinates")
-    shades = COLORS if fields >= set(COLORS) else ()
-    flags = [f for f in INVALID if f in fields]
-    data, buffers = file.make_buffers([*axes, *shades, *flags], min(BLOCK, max(header.point_count, 1)))
+    shades = COLOR_FIELDS if fields >= set(COLOR_FIELDS) else ()
+    flags = [f for f in INVALID_FIELDS if f in fields]
+    data, buffers = file.make_buffers([*axes, *shades, *flags], min(BLOCK_POINTS, max(header.point_count, 1)))
     reader = header.points.reader(buffers)
     left = header.point_count
     try:
@@ -117,8 +118,8 @@ def _check_pages(path: Path) -> None:
     if page != 1024 or length % page or length == 0 or xml + xml_length > length:
         raise damaged(path, "an E57 file", "its header contradicts itself")
     with path.open("rb") as stream:
-        for first in range(0, length // page, PAGES):
-            data = stream.read(min(PAGES, length // page - first) * page)
+        for first in range(0, length // page, PAGES_A_TIME):
+            data = stream.read(min(PAGES_A_TIME, length // page - first) * page)
             pages = np.frombuffer(data, np.uint8).reshape(-1, page)
             stored = np.ascontiguousarray(pages[:, -4:]).view(">u4")[:, 0]
             bad = np.flatnonzero(crc32c(pages[:, :-4]) != stored)

@@ -7,7 +7,7 @@ import numpy as np
 from topomerge.types import Array, TrueRoom, VoxelGrid
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
-FAR = 1e4  # m from the origin from where float32 would lose millimetres
+FLOAT32_REACH = 1e4  # m from the origin from where float32 would lose millimetres
 
 # Right-handed turns that bring the named axis of the file up. Rows are the new axes in terms of the old ones.
 TURNS = {
@@ -67,6 +67,6 @@ def choose_shift(points: Array) -> Array:
 
     The median, not the first point: one stray first point must not cost all the others their precision.
     """
-    if not len(points) or float(np.abs(points).max()) <= FAR:
+    if not len(points) or float(np.abs(points).max()) <= FLOAT32_REACH:
         return np.zeros(3)
     return np.round(np.median(points, axis=0) / 100.0) * 100.0

@@ -38,11 +38,11 @@ def _join(parts: list[_Part]) -> _Part:
     columns: list[Array | None] = []
     for name, blank in (("points", 0), ("colors", 0), ("labels", -1), ("pose_of", -1)):
         values = [getattr(p, name) for p in parts]
-        known = next((v for v in values if v is not None), None)
-        if known is None:
+        present = next((v for v in values if v is not None), None)
+        if present is None:
             columns.append(None)
             continue
-        shape, kind = known.shape[1:], known.dtype
+        shape, kind = present.shape[1:], present.dtype
         full = (np.full((n, *shape), blank, kind) if v is None else v for v, n in zip(values, rows, strict=True))
         columns.append(np.concatenate(list(full)))
     parts.clear()
@@ -82,11 +82,11 @@ class Gatherer:
             self.parts.append(part)
             self.size += len(part.points)
         while self.size >= self.chunk:
-            whole = _join(self.parts)
+            joined = _join(self.parts)
             if self.size > self.chunk:
-                self.parts.append(whole.at(slice(self.chunk, None)))
+                self.parts.append(joined.at(slice(self.chunk, None)))
             self.size -= self.chunk
-            yield from self._hand_out(whole.at(slice(None, self.chunk)))
+            yield from self._hand_out(joined.at(slice(None, self.chunk)))
 
     def finish(self) -> Iterator[PointCloud]:
         """The clouds that are left; the last one carries all warnings."""

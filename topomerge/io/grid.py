@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK, LIMIT, Piece, damaged, too_many
+from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, Piece, damaged, too_many
 from topomerge.types import Array
 
 PIXELS = 100_000_000  # more is refused
@@ -164,8 +164,8 @@ def classify(image: tuple[Array, Array], plan: Plan) -> tuple[Array, Array]:
     bright, clear = image
     if plan.mode == "raw":
         share = bright * 255.0 / 100.0  # the value itself is the probability in percent; above 100 is unknown
-        known = share <= 1.0
-        return known & (share >= plan.occupied), known & (share <= plan.free)
+        decided = share <= 1.0
+        return decided & (share >= plan.occupied), decided & (share <= plan.free)
     share = bright if plan.negate else 1.0 - bright
     # In mode "scale" the values between the thresholds are kept by map_server; here they stay unknown in every mode.
     return (share > plan.occupied) & ~clear, (share < plan.free) & ~clear
@@ -180,7 +180,7 @@ def _extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: Read
     occupied = occupied & ndimage.binary_dilation(~occupied, np.ones((3, 3)))
     walls, floor = int(occupied.sum()), int(free.sum())
     total = parts**2 * (walls * float(len(levels)) + floor * (1 + options.ceiling))
-    if total > LIMIT:
+    if total > MOST_POINTS:
         raise too_many(path, total, spacing * options.factor)
     ground, high = _pixels(free), _pixels(occupied)
     layers = [(ground, 0.0)] + [(high, z) for z in levels] + ([(ground, height)] if options.ceiling else [])
@@ -192,7 +192,7 @@ def _extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: Read
 
 def _pixels(mask: Array) -> Array:
     """(n,) int32 numbers of the masked pixels, row after row."""
-    step = max(1, BLOCK // mask.shape[1])  # rows at a time: NumPy's numbers take 8 bytes each
+    step = max(1, BLOCK_POINTS // mask.shape[1])  # rows at a time: NumPy's numbers take 8 bytes each
     starts = range(0, len(mask), step)
     return np.concatenate([(np.flatnonzero(mask[i : i + step]) + i * mask.shape[1]).astype(np.int32) for i in starts])
 
@@ -203,7 +203,7 @@ def _layer(pixels: Array, shape: tuple[int, ...], plan: Plan, parts: int) -> Ite
     dx, dy = (d.ravel() for d in np.meshgrid(inner, inner))
     x0, y0, yaw = plan.origin
     cos, sin = math.cos(yaw), math.sin(yaw)
-    step = max(1, BLOCK // parts**2)
+    step = max(1, BLOCK_POINTS // parts**2)
     for start in range(0, len(pixels), step):
         rows, columns = np.divmod(pixels[start : start + step], shape[1])
         x = (columns[:, None] + dx).ravel() * plan.resolution

@@ -24,7 +24,7 @@ from topomerge.types import Array, TrueRoom
 
 # What has a shape but is not built, or is cut out of something else.
 NOT_BUILT = ("IfcSpace", "IfcFeatureElement", "IfcSite", "IfcAnnotation", "IfcGrid", "IfcVirtualElement", "IfcSpatialZone")
-END = b"END-ISO-10303-21"
+STEP_END = b"END-ISO-10303-21"
 WELD = 1e-3  # m, corners closer than this are one
 
 
@@ -82,8 +82,8 @@ def _check_ends(path: Path) -> None:
         end = stream.read()
     if b"ISO-10303-21" not in start:
         raise InputError(f"{path}: is not an IFC file (no ISO-10303-21 in its first lines); check the file's suffix")
-    if END not in end:
-        raise InputError(f"{path}: has no end ({END.decode()}); the file is cut short, copy it again")
+    if STEP_END not in end:
+        raise InputError(f"{path}: has no end ({STEP_END.decode()}); the file is cut short, copy it again")
 
 
 def _is_built(product: Any, doors: bool) -> bool:
@@ -128,17 +128,17 @@ def _missing_floors(
     levels = np.round([v[:, 2].min() for _, v, _ in spaces], 1)
     added = 0
     for level in np.unique(levels):
-        here = np.flatnonzero(levels == level)
-        needed = sum(float(floors[i][:, 1].sum()) for i in here)
+        spaces_of_level = np.flatnonzero(levels == level)
+        needed = sum(float(floors[i][:, 1].sum()) for i in spaces_of_level)
         near = (slabs[:, 0] > level - 0.4) & (slabs[:, 0] < level + 0.15)
         if float(slabs[near, 1].sum()) >= 0.5 * needed:
             continue
-        for i in here:
+        for i in spaces_of_level:
             _, vertices, faces = spaces[i]
             for piece in sample(path, vertices, faces[lows[i]], options, first=first):
                 yield Piece(piece.points, done=0.95)
             first += len(faces)
-        added += len(here)
+        added += len(spaces_of_level)
     if added:
         said = f"the model has no floors under {added} of its spaces; the lower faces of the spaces were taken for floors"
         yield Piece(np.empty((0, 3)), warnings=(said,), done=0.95)
@@ -166,14 +166,14 @@ def _low(vertices: Array, faces: Array) -> Array:
 
 def _rooms(spaces: list[tuple[Any, Array, Array]]) -> tuple[TrueRoom, ...]:
     """Every space with a shape, in the order of its storey and name."""
-    found = []
+    outlined = []
     for space, vertices, faces in spaces:
         floor, ceiling = float(vertices[:, 2].min()), float(vertices[:, 2].max())
-        found.append((space, outline(vertices, faces), floor, ceiling))
-    storeys = _storeys([(_storey_of(space), floor) for space, _, floor, _ in found])
+        outlined.append((space, outline(vertices, faces), floor, ceiling))
+    storeys = _storeys([(_storey_of(space), floor) for space, _, floor, _ in outlined])
     rooms = [
         TrueRoom(str(space.Name or ""), polygon, floor, ceiling, storey, str(space.LongName or ""))
-        for (space, polygon, floor, ceiling), storey in zip(found, storeys, strict=True)
+        for (space, polygon, floor, ceiling), storey in zip(outlined, storeys, strict=True)
         if len(polygon) >= 3
     ]
     return tuple(sorted(rooms, key=lambda r: (r.storey, r.name, r.floor, *r.polygon[0])))

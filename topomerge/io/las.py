@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK, Piece, bytes8, cut_short, damaged, read_head
+from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, read_head
 from topomerge.types import Array
 
 LASZIP = b"laszip encoded"
@@ -32,7 +32,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         if not header.are_points_compressed and promised * size > room:
             raise cut_short(path, max(room, 0) // size, promised)
         colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
-        for rows in reader.chunk_iterator(BLOCK):
+        for rows in reader.chunk_iterator(BLOCK_POINTS):
             if not len(rows):
                 break
             done += len(rows)

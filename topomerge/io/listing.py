@@ -31,7 +31,7 @@ import numpy as np
 from topomerge.io.atomic import replacing
 from topomerge.types import TopometricMap
 
-FORMAT = 1
+LISTING_FORMAT = 1
 DIGITS = 6  # micrometres: the digits behind are noise
 
 
@@ -71,7 +71,7 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
     areas = [{"id": i, **{name: a[name] for name in a.dtype.names}} for i, a in enumerate(map.areas)]
     storeys = [{"id": i, **{name: s[name] for name in s.dtype.names}} for i, s in enumerate(map.storeys)]
     listing = {
-        "format": FORMAT,
+        "format": LISTING_FORMAT,
         "source": map.source,
         "voxel_size": float(map.grid.edge),
         "rooms": rooms,

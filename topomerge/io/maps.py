@@ -33,9 +33,9 @@ from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.kernels import morton
 from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
 
-__all__ = ["FORMAT", "load_map", "map_to_json", "save_json", "save_map", "save_rooms_ply"]
+__all__ = ["TMAP_FORMAT", "load_map", "map_to_json", "save_json", "save_map", "save_rooms_ply"]
 
-FORMAT = 2
+TMAP_FORMAT = 2
 KIND = "map of topomerge (.tmap)"
 
 
@@ -63,7 +63,7 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
         "warnings": list(map.warnings),
         "arrays": list(arrays),
     }
-    arrays = {"format": np.array(FORMAT, "<i4"), "about": np.array(json.dumps(about).encode()), **arrays}
+    arrays = {"format": np.array(TMAP_FORMAT, "<i4"), "about": np.array(json.dumps(about).encode()), **arrays}
     archive.write(arrays, path)
 
 
@@ -77,10 +77,10 @@ def load_map(path: str | Path) -> TopometricMap:
     if "format" not in arrays or "about" not in arrays:
         raise InputError(f"{path}: is not a {KIND}: make one with `topomerge extract SCAN -o A.tmap`")
     number = arrays["format"]
-    if number.shape != () or number.dtype.kind not in "iu" or int(number) != FORMAT:
-        older = number.shape == () and number.dtype.kind in "iu" and int(number) < FORMAT
+    if number.shape != () or number.dtype.kind not in "iu" or int(number) != TMAP_FORMAT:
+        older = number.shape == () and number.dtype.kind in "iu" and int(number) < TMAP_FORMAT
         advice = "make it again with `topomerge extract`" if older else "update topomerge"
-        raise InputError(f"{path}: is of format {number}, and this topomerge reads format {FORMAT}; {advice}")
+        raise InputError(f"{path}: is of format {number}, and this topomerge reads format {TMAP_FORMAT}; {advice}")
     try:
         return _map(arrays)
     except KeyError as error:

@@ -15,27 +15,27 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK, LIMIT, Piece, damaged, too_many
+from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, Piece, damaged, too_many
 from topomerge.kernels.lattice import areas, points_on_triangles
 from topomerge.types import Array
 
-SPACING = 0.05  # m between points sampled on surfaces
-LONGEST = 10_000.0  # m, edge of a triangle beyond any building
+SURFACE_SPACING = 0.05  # m between points sampled on surfaces
+LONGEST_EDGE = 10_000.0  # m, edge of a triangle beyond any building
 MOST_SHARED = 4  # times that the bytes of a scene may be shown by its views
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Vertices of every part of a scene, then points sampled on its faces. Materials and textures are not loaded."""
-    found = 0
+    count = 0
     for vertices, faces in _parts(path):
         yield Piece(vertices, done=0.3)
-        found += len(vertices)
+        count += len(vertices)
         for piece in sample(path, vertices, faces, options):
             yield piece
-            found += len(piece.points)
-            if found > LIMIT:  # one part can stand in a scene a thousand times
-                raise too_many(path, found, options.spacing or SPACING)
-    if not found:
+            count += len(piece.points)
+            if count > MOST_POINTS:  # one part can stand in a scene a thousand times
+                raise too_many(path, count, options.spacing or SURFACE_SPACING)
+    if not count:
         raise InputError(f"{path}: holds no vertices; export it again")
 
 
@@ -51,17 +51,17 @@ def sample(
         return
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise damaged(path, "a mesh", "a face names a vertex that does not exist")
-    spacing = (options.spacing or SPACING) / options.factor
+    spacing = (options.spacing or SURFACE_SPACING) / options.factor
     triangles = np.asarray(vertices, np.float64)[faces]
-    kept = np.flatnonzero(np.isfinite(triangles).all(axis=(1, 2)))
-    _check_size(path, triangles[kept], spacing, options.factor)
-    triangles, kept = _halved(triangles[kept], kept, BLOCK * spacing**2)
+    numbers = np.flatnonzero(np.isfinite(triangles).all(axis=(1, 2)))
+    _check_size(path, triangles[numbers], spacing, options.factor)
+    triangles, numbers = _halved(triangles[numbers], numbers, BLOCK_POINTS * spacing**2)
     ends = np.cumsum(areas(triangles)) / spacing**2
-    cuts = np.searchsorted(ends, np.arange(BLOCK, ends[-1] if len(ends) else 0, BLOCK))
+    cuts = np.searchsorted(ends, np.arange(BLOCK_POINTS, ends[-1] if len(ends) else 0, BLOCK_POINTS))
     bounds = np.unique(np.concatenate([[0], cuts, [len(triangles)]]))
     for low, high in itertools.pairwise(bounds.tolist()):
         points, owner = points_on_triangles(triangles[low:high], spacing, first + low)
-        shades = None if colors is None else colors[faces[kept[low:high][owner]]].mean(axis=1).astype(np.uint8)
+        shades = None if colors is None else colors[faces[numbers[low:high][owner]]].mean(axis=1).astype(np.uint8)
         yield Piece(points, shades, done=0.5 + 0.5 * high / len(triangles))
 
 
@@ -70,20 +70,20 @@ def _check_size(path: Path, triangles: Array, spacing: float, factor: float) -> 
     if not len(triangles):
         return
     longest = float(np.ptp(triangles, axis=1).max()) * factor
-    if not longest <= LONGEST or np.abs(triangles).max() > 1e12 * spacing:
+    if not longest <= LONGEST_EDGE or np.abs(triangles).max() > 1e12 * spacing:
         raise InputError(f"{path}: has a triangle of {longest:.3g} m; check --unit, or export it again")
     total = float(areas(triangles).sum()) / spacing**2
-    if not total <= LIMIT:
+    if not total <= MOST_POINTS:
         raise too_many(path, total, spacing * factor)
 
 
 def _halved(triangles: Array, numbers: Array, largest: float) -> tuple[Array, Array]:
     """Triangles (m, 3, 3) and their numbers (m,), those above the largest area cut across their longest edges."""
     while (large := areas(triangles) > largest).any():
-        whole = triangles[large]
-        edge = np.linalg.norm(np.roll(whole, -1, axis=1) - whole, axis=2).argmax(axis=1)
-        each = np.arange(len(whole))
-        a, b, c = (whole[each, (edge + i) % 3] for i in range(3))
+        cut = triangles[large]
+        edge = np.linalg.norm(np.roll(cut, -1, axis=1) - cut, axis=2).argmax(axis=1)
+        each = np.arange(len(cut))
+        a, b, c = (cut[each, (edge + i) % 3] for i in range(3))
         middle = (a + b) / 2
         halves = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
         triangles = np.concatenate([triangles[~large], halves])

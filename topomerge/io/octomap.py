@@ -15,14 +15,14 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK, Piece, damaged
-from topomerge.kernels.codecs import FREE, LEAF_LEVEL, OCCUPIED, octree_leaves
+from topomerge.io.piece import BLOCK_POINTS, Piece, damaged
+from topomerge.kernels.codecs import FREE_LEAF, LEAF_LEVEL, OCCUPIED_LEAF, octree_leaves
 from topomerge.types import Array, VoxelGrid
 
 MAGIC = b"# Octomap OcTree binary file"
 CENTRE = 1 << (LEAF_LEVEL - 1)  # the cell whose lower corner is the origin of coordinates
-MOST = 30_000_000  # smallest cells that leaves may be cut into
-FEW, USUAL = 1 << 20, 100  # beyond so many cells, at most so many a byte: a real map has 7
+MOST_OCTOMAP_CELLS = 30_000_000  # smallest cells that leaves may be cut into
+TRUSTED_CELLS, CELLS_A_BYTE = 1 << 20, 100  # beyond so many cells, at most so many a byte: a real map has 7
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -34,8 +34,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     if leaves is None:
         raise damaged(path, "an OctoMap", f"its tree does not end where the file ends, after {len(data):,} bytes")
     keys, depths, states = leaves
-    occupied, free = states == OCCUPIED, states == FREE
-    most = min(MOST, max(FEW, USUAL * len(data)))
+    occupied, free = states == OCCUPIED_LEAF, states == FREE_LEAF
+    most = min(MOST_OCTOMAP_CELLS, max(TRUSTED_CELLS, CELLS_A_BYTE * len(data)))
     cells = _smallest(keys[occupied], depths[occupied], most)
     if cells is None:
         raise InputError(f"{path}: has more than {most:,} occupied cells; store it at a coarser resolution")
@@ -43,8 +43,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     said = () if space is not None else (f"more than {most:,} free cells: free space is left out",)
     grid = None if space is None else _grid(space, resolution)
     yield Piece(np.empty((0, 3)), free=grid, warnings=said, done=0.8)
-    for start in range(0, len(cells), BLOCK):
-        yield Piece((cells[start : start + BLOCK] - CENTRE + 0.5) * resolution, done=0.9)
+    for start in range(0, len(cells), BLOCK_POINTS):
+        yield Piece((cells[start : start + BLOCK_POINTS] - CENTRE + 0.5) * resolution, done=0.9)
 
 
 def _split(path: Path, data: bytes) -> tuple[float, Array]:

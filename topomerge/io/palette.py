@@ -12,7 +12,7 @@ from topomerge.types import Array, TopometricMap
 
 LIGHT = ("77AADD", "EE8866", "EEDD88", "FFAABB", "44BB99", "BBCC33", "99DDFF", "AAAA00")
 NO_ROOM = (150, 150, 150)
-GAP = 0.4  # m: rooms with this much wall between them stand side by side
+WALL_BETWEEN = 0.4  # m: rooms with this much wall between them stand side by side
 
 
 def _palette() -> Array:
@@ -40,7 +40,7 @@ def _touching(map: TopometricMap, axis: int) -> Array:
     storey = map.rooms["storey"][room]
     order = np.lexsort((room, along, across, storey))
     room, along, line = room[order], along[order], np.stack([storey[order], across[order]])
-    near = (np.diff(along) <= GAP / map.grid.edge + 1) & (np.diff(line, axis=1) == 0).all(axis=0)
+    near = (np.diff(along) <= WALL_BETWEEN / map.grid.edge + 1) & (np.diff(line, axis=1) == 0).all(axis=0)
     return np.sort(np.stack([room[:-1], room[1:]], axis=1)[near], axis=1).reshape(-1, 2)
 
 

@@ -15,13 +15,13 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io import text
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK, Piece, cut_short, damaged
+from topomerge.io.piece import BLOCK_POINTS, Piece, cut_short, damaged
 from topomerge.kernels.codecs import lzf_unpack
 from topomerge.types import Array
 
 LONGEST_HEADER = 1 << 16  # bytes
 BEST_PACKING = 100  # LZF can't shrink more than that
-TYPES = {("F", 4), ("F", 8), ("U", 1), ("U", 2), ("U", 4), ("U", 8), ("I", 1), ("I", 2), ("I", 4), ("I", 8)}
+PCD_TYPES = {("F", 4), ("F", 8), ("U", 1), ("U", 2), ("U", 4), ("U", 8), ("I", 1), ("I", 2), ("I", 4), ("I", 8)}
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def _dtype(names: list[str], sizes: list[int], kinds: list[str], counts: list[in
     """Type of a row. Padding fields are all named "_", so names that repeat get a number."""
     columns = []
     for i, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
-        if (kind, size) not in TYPES or not 0 < count <= 1 << 16:
+        if (kind, size) not in PCD_TYPES or not 0 < count <= 1 << 16:
             raise ValueError(f"field {name} of type {kind}{size} x {count}")
         unique = name if name != "_" and name not in names[:i] else f"{name}{i}"
         code = f"<{kind.lower()}{size}"
@@ -99,8 +99,8 @@ def _binary(path: Path, header: Header) -> Iterator[Array]:
         raise cut_short(path, have, header.points)
     if header.points:
         rows = np.memmap(path, header.dtype, "r", header.start, (header.points,))
-        for first in range(0, header.points, BLOCK):
-            yield np.asarray(rows[first : first + BLOCK])
+        for first in range(0, header.points, BLOCK_POINTS):
+            yield np.asarray(rows[first : first + BLOCK_POINTS])
 
 
 def _packed(path: Path, header: Header) -> Iterator[Array]:
@@ -121,8 +121,8 @@ def _packed(path: Path, header: Header) -> Iterator[Array]:
         length = column.itemsize * header.points
         rows[name] = unpacked[at : at + length].view(column.base).reshape(header.points, *column.shape)
         at += length
-    for first in range(0, len(rows), BLOCK):
-        yield rows[first : first + BLOCK]
+    for first in range(0, len(rows), BLOCK_POINTS):
+        yield rows[first : first + BLOCK_POINTS]
 
 
 def _ascii(path: Path, header: Header) -> Iterator[Array]:
@@ -135,9 +135,9 @@ def _ascii(path: Path, header: Header) -> Iterator[Array]:
         for values in text.rows(path, stream, columns, skip=header.lines):
             rows = np.empty(len(values), kind)
             for i, name in enumerate(wanted):
-                whole = kind[name].kind in "iu"
+                integers = kind[name].kind in "iu"
                 column = values[:, i]
-                rows[name] = np.nan_to_num(column).clip(0, 2**32 - 1).astype(np.int64) if whole and i > 2 else column
+                rows[name] = np.nan_to_num(column).clip(0, 2**32 - 1).astype(np.int64) if integers and i > 2 else column
             yield rows
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.types import Array, TrueRoom, VoxelGrid
 
-BLOCK = 1 << 19  # points a reader hands over at a time
-LIMIT = 100_000_000  # points that a sampled or extruded file may become; more is a wrong unit, not a building
+BLOCK_POINTS = 1 << 19  # points a reader hands over at a time
+MOST_POINTS = 100_000_000  # points that a sampled or extruded file may become; more is a wrong unit, not a building
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io import text
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK, Piece, bytes8, cut_short, damaged
+from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged
 from topomerge.types import Array
 
 LONGEST_HEADER = 1 << 20  # bytes
-TYPES = {
+PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
@@ -107,7 +107,7 @@ def read_header(path: Path) -> Header:
                 elements.append(Element(words[1], int(words[2]), []))
             elif words[:1] == ["property"]:
                 is_list = words[1] == "list"
-                elements[-1].properties.append((words[-1], None if is_list else TYPES[words[1]]))
+                elements[-1].properties.append((words[-1], None if is_list else PLY_TYPES[words[1]]))
         except (KeyError, IndexError, ValueError) as error:
             raise damaged(path, "a PLY file", f"header line {' '.join(words)!r}") from error
     if order is None or any(e.count < 0 or len({n for n, _ in e.properties}) < len(e.properties) for e in elements):
@@ -117,7 +117,7 @@ def read_header(path: Path) -> Header:
 
 def color_names(names: list[str]) -> tuple[str, ...]:
     """The names of the colour channels, or none."""
-    return next((c for c in text.COLORS if all(n in names for n in c)), ())
+    return next((c for c in text.COLOR_COLUMNS if all(n in names for n in c)), ())
 
 
 def _read_binary(path: Path, header: Header, before: list[Element], vertex: Element) -> Iterator[Piece]:
@@ -130,8 +130,8 @@ def _read_binary(path: Path, header: Header, before: list[Element], vertex: Elem
         return
     rows = np.memmap(path, dtype, "r", start, (vertex.count,))
     colors = color_names([n for n, _ in vertex.properties])
-    for first in range(0, vertex.count, BLOCK):
-        block = rows[first : first + BLOCK]
+    for first in range(0, vertex.count, BLOCK_POINTS):
+        block = rows[first : first + BLOCK_POINTS]
         yield Piece(_stack(block, ("x", "y", "z")), _colors(block, colors), done=(first + len(block)) / vertex.count)
 
 
@@ -152,18 +152,18 @@ def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Eleme
     names = [n for n, _ in vertex.properties]
     wanted = ("x", "y", "z", *color_names(names))
     columns = tuple(names.index(n) for n in wanted)
-    found = 0
+    count = 0
     with path.open(encoding="latin-1") as stream:
         skip = header.lines + sum(e.count for e in before)
         lines = itertools.islice(stream, skip + vertex.count)
         for values in text.rows(path, lines, columns, skip=skip):
-            found += len(values)
+            count += len(values)
             colors = values[:, 3:] if len(wanted) == 6 else None
             if colors is not None and vertex.properties[columns[3]][1] not in ("f4", "f8"):
                 colors = colors.clip(0, 65535).astype(np.int64)
-            yield Piece(values[:, :3], None if colors is None else bytes8(colors), done=found / vertex.count)
-    if found < vertex.count:
-        raise cut_short(path, found, vertex.count)
+            yield Piece(values[:, :3], None if colors is None else bytes8(colors), done=count / vertex.count)
+    if count < vertex.count:
+        raise cut_short(path, count, vertex.count)
 
 
 def _read_whole(path: Path, options: ReadOptions) -> Iterator[Piece]:

@@ -10,12 +10,12 @@ from topomerge.io.atomic import replacing
 from topomerge.io.palette import NO_ROOM, room_colours
 from topomerge.types import Array, TopometricMap
 
-FAR = 1e4  # m: beyond, float32 rounds by a millimetre and, soon after, by centimetres
+FLOAT32_FAR = 1e4  # m: beyond, float32 rounds by a millimetre and, soon after, by centimetres
 
 
 def _vertices(map: TopometricMap) -> Array:
     points = map.grid.centroids()
-    real = "<f8" if len(points) and np.abs(points).max() > FAR else "<f4"
+    real = "<f8" if len(points) and np.abs(points).max() > FLOAT32_FAR else "<f4"
     layout = [("x", real), ("y", real), ("z", real), ("room", "<i4"), ("storey", "<i4")]
     layout += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
     vertices = np.zeros(len(points), layout)

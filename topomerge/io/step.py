@@ -16,7 +16,7 @@ from topomerge.types import Array
 
 NOT_SAID = re.compile(rb"'[^']*'|/\*.*?\*/", re.DOTALL)  # strings and comments
 STATEMENT = re.compile(rb"#(\d+)\s*=([^;]*)")
-REFERENCE = re.compile(rb"#(\d+)")
+ENTITY_REFERENCE = re.compile(rb"#(\d+)")
 DEEPEST = 250  # references one behind the other; models of buildings have 15
 
 
@@ -46,11 +46,11 @@ def check_references(path: Path) -> None:
 def references(text: bytes) -> tuple[Array, Array, int]:
     """(m,) rows that refer, (m,) rows that they refer to, and the number of entities; what does not exist is left out."""
     text = NOT_SAID.sub(b"", text)
-    found = [(match[1], REFERENCE.findall(match[2])) for match in STATEMENT.finditer(text)]
-    row = {name: i for i, (name, _) in enumerate(found)}
+    statements = [(match[1], ENTITY_REFERENCE.findall(match[2])) for match in STATEMENT.finditer(text)]
+    row = {name: i for i, (name, _) in enumerate(statements)}
     owners, targets = array("q"), array("q")
-    for name, others in found:
-        known = [row[other] for other in others if other in row]
-        owners.extend([row[name]] * len(known))
-        targets.extend(known)
-    return np.array(owners, np.int64), np.array(targets, np.int64), len(found)
+    for name, others in statements:
+        existing = [row[other] for other in others if other in row]
+        owners.extend([row[name]] * len(existing))
+        targets.extend(existing)
+    return np.array(owners, np.int64), np.array(targets, np.int64), len(statements)

@@ -40,8 +40,8 @@ def read_in_subprocess(
     Raises:
         InputError: as the reader; or the child came to an end before it was done.
     """
-    told = json.dumps([module, str(path), asdict(options), seconds, room])
-    words = [sys.executable, "-c", f"from {__name__} import main; main()", told]
+    task = json.dumps([module, str(path), asdict(options), seconds, room])
+    words = [sys.executable, "-c", f"from {__name__} import main; main()", task]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL, env=environment)
     assert child.stdout is not None
@@ -62,16 +62,16 @@ def _piece(path: Path, kind: str, stream: IO[bytes]) -> Piece | None:
     line = stream.readline()
     if not line.endswith(b"\n"):
         raise EOFError
-    told = json.loads(line)
-    if "end" in told:
+    header = json.loads(line)
+    if "end" in header:
         return None
-    if "refused" in told:
-        raise InputError(told["refused"])
-    if "fault" in told:
-        raise damaged(path, kind, told["fault"])
-    arrays: dict[str, Any] = {name: _array(stream, ARRAYS[name], shape) for name, shape in told["arrays"].items()}
-    rooms = tuple(TrueRoom(**{**room, "polygon": np.array(room["polygon"], float).reshape(-1, 2)}) for room in told["rooms"])
-    return replace(Piece(**arrays), rooms=rooms, warnings=tuple(told["warnings"]), done=told["done"])
+    if "refused" in header:
+        raise InputError(header["refused"])
+    if "fault" in header:
+        raise damaged(path, kind, header["fault"])
+    arrays: dict[str, Any] = {name: _array(stream, ARRAYS[name], shape) for name, shape in header["arrays"].items()}
+    rooms = tuple(TrueRoom(**{**room, "polygon": np.array(room["polygon"], float).reshape(-1, 2)}) for room in header["rooms"])
+    return replace(Piece(**arrays), rooms=rooms, warnings=tuple(header["warnings"]), done=header["done"])
 
 
 def _array(stream: IO[bytes], kind: Any, shape: list[int]) -> Array:
@@ -88,22 +88,22 @@ def main() -> None:
     limit(room=room)
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)  # what a library prints is no piece
-        for told, arrays in _told(reader, Path(path), ReadOptions(**options), seconds):
-            out.write(json.dumps(told).encode() + b"\n")
+        for header, arrays in _messages(reader, Path(path), ReadOptions(**options), seconds):
+            out.write(json.dumps(header).encode() + b"\n")
             for array in arrays:
                 out.write(array.data)
             out.flush()
 
 
-def _told(reader: Any, path: Path, options: ReadOptions, seconds: int | None) -> Iterator[tuple[dict[str, Any], list[Array]]]:
+def _messages(reader: Any, path: Path, options: ReadOptions, seconds: int | None) -> Iterator[tuple[dict[str, Any], list[Array]]]:
     try:
         limit(seconds=seconds)
         for piece in reader.read_in_process(path, options):
             arrays = {name: getattr(piece, name) for name in ARRAYS}
             given = {name: np.ascontiguousarray(v, ARRAYS[name]) for name, v in arrays.items() if v is not None}
             rooms = [{**vars(room), "polygon": np.asarray(room.polygon).tolist()} for room in piece.rooms]
-            told = {"arrays": {name: v.shape for name, v in given.items()}, "rooms": rooms}
-            yield {**told, "warnings": piece.warnings, "done": piece.done}, list(given.values())
+            header = {"arrays": {name: v.shape for name, v in given.items()}, "rooms": rooms}
+            yield {**header, "warnings": piece.warnings, "done": piece.done}, list(given.values())
             limit(seconds=seconds)
     except InputError as error:
         yield {"refused": str(error)}, []

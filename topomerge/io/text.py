@@ -22,11 +22,11 @@ from topomerge.io.options import ReadOptions
 from topomerge.io.piece import Piece, bytes8
 from topomerge.types import Array
 
-LINES = 1 << 18  # lines parsed at a time
-HEAD = 1 << 16  # bytes from which the layout is found
+LINES_A_TIME = 1 << 18  # lines parsed at a time
+HEAD_BYTES = 1 << 16  # bytes from which the layout is found
 COMMENTS = ("#", "//", "%", "!")
 AXES = (("x", "y", "z"), ("x[m]", "y[m]", "z[m]"), ("x_m", "y_m", "z_m"), ("easting", "northing", "height"))
-COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         lines = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
         for values in rows(path, lines, layout.columns, layout.delimiter, layout.skip, layout.comma):
             colors = values[:, 3:].clip(0, 65535) if values.shape[1] == 6 else None
-            whole = colors is not None and bool((colors == np.rint(colors)).all())
-            if colors is not None and whole:
+            integers = colors is not None and bool((colors == np.rint(colors)).all())
+            if colors is not None and integers:
                 colors = colors.astype(np.int64)
             yield Piece(values[:, :3], None if colors is None else bytes8(colors), done=stream.tell() / size)
 
@@ -69,7 +69,7 @@ def rows(
     """
     lines = iter(lines)
     before = sum(1 for _ in itertools.islice(lines, skip))
-    while block := list(itertools.islice(lines, LINES)):
+    while block := list(itertools.islice(lines, LINES_A_TIME)):
         if comma:
             block = [line.replace(",", ".") for line in block]
         try:
@@ -115,11 +115,11 @@ def _first_bad(block: list[str], columns: tuple[int, ...], delimiter: str | None
 def _sniff(path: Path) -> _Layout:
     """Delimiter, columns and first row of a table, from its first lines."""
     with path.open("rb") as stream:
-        head = stream.read(HEAD)
+        head = stream.read(HEAD_BYTES)
     if b"\0" in head:
         raise InputError(f"{path}: is not text; export it as a table of x y z, or give it the suffix of its format")
     lines = head.decode("utf-8-sig", errors="replace").splitlines()
-    if len(head) == HEAD and len(lines) > 1:
+    if len(head) == HEAD_BYTES and len(lines) > 1:
         lines.pop()  # perhaps half a line
     header: list[str] = []
     for number, line in enumerate(lines):
@@ -146,14 +146,14 @@ def _delimiter(text: str) -> tuple[str | None, bool]:
 
 def _numbers(fields: list[str], comma: bool) -> list[int]:
     """Which of the fields are numbers."""
-    found = []
+    numeric_columns = []
     for column, text in enumerate(fields):
         try:
             float(text.replace(",", ".") if comma else text)
         except ValueError:
             continue
-        found.append(column)
-    return found
+        numeric_columns.append(column)
+    return numeric_columns
 
 
 def _named(header: list[str], width: int) -> tuple[int, ...]:
@@ -161,7 +161,7 @@ def _named(header: list[str], width: int) -> tuple[int, ...]:
     if len(header) != width:
         return ()
     axes = next(names for names in AXES if all(n in header for n in names))
-    colors = next((names for names in COLORS if all(n in header for n in names)), ())
+    colors = next((names for names in COLOR_COLUMNS if all(n in header for n in names)), ())
     return tuple(header.index(n) for n in (*axes, *colors))
 
 

@@ -26,8 +26,8 @@ def _private_folder() -> Path:
     """
     folder = Path(tempfile.gettempdir(), f"topomerge-{os.getuid()}")
     folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
         reason = "others may write to it; set NUMBA_CACHE_DIR to a folder of yours"
         raise OSError(errno.EPERM, reason, str(folder))
     return folder

@@ -84,7 +84,7 @@ def _alike(p, q):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     return both / max(either, 1)
 
 
-WALL, FREE, CLUTTER, HAZE = 1, 2, 3, 4
+WALL_STATE, FREE_STATE, CLUTTER_STATE, HAZE_STATE = 1, 2, 3, 4
 
 
 @njit(cache=True, nogil=True)
@@ -103,14 +103,14 @@ def tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face, ope
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for i in range(len(points)):
         what = kinds[i]
-        if what == WALL:
+        if what == WALL_STATE:
             out[10] += 1
         x = int(np.floor((size * (c * points[i, 0] - s * points[i, 1]) + pose[0] - origin[0]) / cell))
         y = int(np.floor((size * (s * points[i, 0] + c * points[i, 1]) + pose[1] - origin[1]) / cell))
         if x < 1 or y < 1 or x >= kind.shape[0] - 1 or y >= kind.shape[1] - 1:
             continue
         there = kind[x, y]
-        if what == WALL:
+        if what == WALL_STATE:
             if to_wall[x, y] <= near:
                 fx, fy = c * facing[i, 0] - s * facing[i, 1], s * facing[i, 0] + c * facing[i, 1]
                 agree = fx * face[x, y, 0] + fy * face[x, y, 1]
@@ -121,25 +121,25 @@ def tally(points, kinds, facing, inner, filled, kind, to_wall, to_any, face, ope
                     out[2] += 1
             elif there != 0:
                 out[0] += 1
-                if there == FREE and to_any[x, y] >= far:
+                if there == FREE_STATE and to_any[x, y] >= far:
                     out[3] += 1
             continue
         if there == 0:
             continue
-        if what == FREE:
+        if what == FREE_STATE:
             out[4] += 1
-            out[5] += there == FREE
+            out[5] += there == FREE_STATE
         if not inner[i] or not open_[x, y]:
             continue
         close = 0.0
         for a in range(-1, 2):
             for b in range(-1, 2):
-                if kind[x + a, y + b] == CLUTTER:
-                    close = max(close, 1.0 if what == FREE else _alike(filled[i], bits[x + a, y + b]))
-        if what == CLUTTER:
+                if kind[x + a, y + b] == CLUTTER_STATE:
+                    close = max(close, 1.0 if what == FREE_STATE else _alike(filled[i], bits[x + a, y + b]))
+        if what == CLUTTER_STATE:
             out[6] += 1
             out[7] += close
-        elif what == FREE:
+        elif what == FREE_STATE:
             out[8] += 1
             out[9] += close
     return out

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 LEAF_LEVEL = 16  # depth of the smallest cells of an OctoMap
-UNKNOWN, FREE, OCCUPIED, INNER = 0, 1, 2, 3
+UNKNOWN_CHILD, FREE_LEAF, OCCUPIED_LEAF, INNER_CHILD = 0, 1, 2, 3
 
 
 @njit(cache=True)
@@ -80,7 +80,7 @@ def crc32c(pages: NDArray[np.uint8]) -> NDArray[np.uint32]:
 @njit(cache=True)
 def _octree(data, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Walk the nodes; returns (leaves, bytes read), leaves -1 where the tree is broken."""
-    found, at = 0, 0
+    count, at = 0, 0
     top = 1
     stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, 0, 0
     while top > 0:
@@ -93,31 +93,31 @@ def _octree(data, keys, depths, states, stack):  # type: ignore[no-untyped-def] 
         side = 1 << (LEAF_LEVEL - depth - 1)
         for child in range(7, -1, -1):  # the stack turns the order around
             state = (bits >> (2 * child)) & 3
-            if state == UNKNOWN:
+            if state == UNKNOWN_CHILD:
                 continue
             cx, cy, cz = x + (child & 1) * side, y + ((child >> 1) & 1) * side, z + ((child >> 2) & 1) * side
-            if state == INNER:
+            if state == INNER_CHILD:
                 stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = cx, cy, cz, depth + 1
                 top += 1
                 continue
-            keys[found, 0], keys[found, 1], keys[found, 2] = cx, cy, cz
-            depths[found] = depth + 1
-            states[found] = state
-            found += 1
-    return found, at
+            keys[count, 0], keys[count, 1], keys[count, 2] = cx, cy, cz
+            depths[count] = depth + 1
+            states[count] = state
+            count += 1
+    return count, at
 
 
 def octree_leaves(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
     """Leaves of an OctoMap's nodes in depth-first order, or None where they are cut short or broken.
 
     Returns:
-        (n, 3) int32 smallest cell of each leaf in 0..65535, (n,) int8 depth 1..16 and (n,) int8 FREE or OCCUPIED.
+        (n, 3) int32 smallest cell of each leaf in 0..65535, (n,) int8 depth 1..16 and (n,) int8 FREE_LEAF or OCCUPIED_LEAF.
     """
     pairs = np.stack([(data >> s) & 3 for s in (0, 2, 4, 6)], axis=1)
-    room = int(((pairs == FREE) | (pairs == OCCUPIED)).sum())
+    room = int(((pairs == FREE_LEAF) | (pairs == OCCUPIED_LEAF)).sum())
     keys, depths, states = np.empty((room, 3), np.int32), np.empty(room, np.int8), np.empty(room, np.int8)
     stack = np.empty((8 * LEAF_LEVEL + 8, 4), np.int32)
-    found, read = _octree(data, keys, depths, states, stack)
-    if found < 0 or read != len(data):
+    count, read = _octree(data, keys, depths, states, stack)
+    if count < 0 or read != len(data):
         return None
-    return keys[:found], depths[:found], states[:found]
+    return keys[:count], depths[:count], states[:count]

@@ -48,7 +48,7 @@ def gather(table, bricks, origin, edge, points, normal, moving, moving_normal, p
     partners, and the sums of weights and of weighted squared distances.
     """
     h, g = np.zeros((5, 5)), np.zeros(5)
-    many, weight, square = 0, 0.0, 0.0
+    partners, weight, square = 0, 0.0, 0.0
     size = np.exp(pose[4])
     c, s = np.cos(pose[3]), np.sin(pose[3])
     jac = np.zeros(5)
@@ -92,7 +92,7 @@ def gather(table, bricks, origin, edge, points, normal, moving, moving_normal, p
             g[u] += w * r * jac[u]
             for v in range(5):
                 h[u, v] += w * jac[u] * jac[v]
-        many += 1
+        partners += 1
         weight += w
         square += w * r * r
-    return h, g, many, weight, square
+    return h, g, partners, weight, square

@@ -29,7 +29,7 @@ def step(indptr, indices, values, inflation, threshold, most):  # type: ignore[n
                     touched[m] = i
                     m += 1
                 total[i] += w * values[b]
-        mass, highest, kept = 0.0, 0.0, 0
+        mass, highest, entries = 0.0, 0.0, 0
         for t in range(m):
             mass += total[touched[t]] ** inflation
         cut = threshold
@@ -37,27 +37,27 @@ def step(indptr, indices, values, inflation, threshold, most):  # type: ignore[n
             i = touched[t]
             total[i] = total[i] ** inflation / mass
             highest = max(highest, total[i])
-            kept += total[i] >= threshold
-        if kept > most:
+            entries += total[i] >= threshold
+        if entries > most:
             ordered = np.sort(total[touched[:m]])
             cut = max(threshold, ordered[m - most])
         cut = min(cut, highest)  # a column never loses its largest entry
-        mass, kept = 0.0, 0
-        found = np.sort(touched[:m])
+        mass, entries = 0.0, 0
+        ascending = np.sort(touched[:m])
         for t in range(m):
-            i = found[t]
-            if total[i] >= cut and kept < most:
-                rows[j, kept], cells[j, kept] = i, total[i]
+            i = ascending[t]
+            if total[i] >= cut and entries < most:
+                rows[j, entries], cells[j, entries] = i, total[i]
                 mass += total[i]
-                kept += 1
+                entries += 1
             total[i] = 0.0
         squares, top = 0.0, 0.0
-        for t in range(kept):
+        for t in range(entries):
             cells[j, t] /= mass
             squares += cells[j, t] ** 2
             top = max(top, cells[j, t])
         chaos = max(chaos, top - squares)
-        counts[j] = kept
+        counts[j] = entries
     out = np.zeros(n + 1, np.int64)
     for j in range(n):
         out[j + 1] = out[j] + counts[j]

@@ -9,7 +9,7 @@ from numba import njit, uint64
 from numpy.typing import NDArray
 
 BITS = 21
-LIMIT = 1 << BITS  # cells along an axis
+AXIS_LIMIT = 1 << BITS  # cells along an axis
 DIGIT = 11  # bits a pass of the radix sort: its 2048 counters stay in the first-level cache
 
 

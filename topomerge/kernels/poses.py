@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-NEAR, FAR = 0.1, 0.3  # m from a wall column: floor there stands in the wall; a wall beyond it stands on free floor
+WALL_NEAR, WALL_FAR = 0.1, 0.3  # m from a wall column: floor there stands in the wall; a wall beyond it stands on free floor
 
 
 @njit(cache=True, parallel=True)
@@ -39,11 +39,11 @@ def pose_evidence(poses, storeys, points, storey, is_wall, distance, floor, orig
             if is_wall[i]:
                 if d < 3 * sigma:
                     agree += np.exp(-0.5 * (d / sigma) ** 2)
-                if free and d > FAR:
+                if free and d > WALL_FAR:
                     against += 1
             elif free:
                 common += 1
-            elif d < NEAR:
+            elif d < WALL_NEAR:
                 against += 1
         out[h, 0], out[h, 1], out[h, 2] = agree, against, common
     return out

@@ -10,14 +10,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-FAR = 255  # the distance field is a byte
+FIELD_LIMIT = 255  # the distance field is a byte
 
 
 @njit(cache=True, nogil=True)
 def distance_field(cells, low, size):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(size) uint8 Chebyshev distance, in cells, to the nearest of (n, 3) occupied cells of the window at `low`; at most 255."""
     sx, sy, sz = size
-    field = np.full((sx + 2, sy + 2, sz + 2), FAR, np.uint8)  # a border of one cell spares the tests for the edge
+    field = np.full((sx + 2, sy + 2, sz + 2), FIELD_LIMIT, np.uint8)  # a border of one cell spares the tests for the edge
     for i in range(len(cells)):
         field[cells[i, 0] - low[0] + 1, cells[i, 1] - low[1] + 1, cells[i, 2] - low[2] + 1] = 0
     for x in range(1, sx + 1):
@@ -28,7 +28,7 @@ def distance_field(cells, low, size):  # type: ignore[no-untyped-def]  # pragma:
                     near = min(field[x, y, z - 1], field[x, y - 1, z - 1], field[x, y - 1, z], field[x, y - 1, z + 1])
                     for dy in range(-1, 2):
                         near = min(near, field[x - 1, y + dy, z - 1], field[x - 1, y + dy, z], field[x - 1, y + dy, z + 1])
-                    if near < FAR:
+                    if near < FIELD_LIMIT:
                         field[x, y, z] = min(best, np.uint8(near + 1))
     for x in range(sx, 0, -1):
         for y in range(sy, 0, -1):
@@ -38,7 +38,7 @@ def distance_field(cells, low, size):  # type: ignore[no-untyped-def]  # pragma:
                     near = min(field[x, y, z + 1], field[x, y + 1, z - 1], field[x, y + 1, z], field[x, y + 1, z + 1])
                     for dy in range(-1, 2):
                         near = min(near, field[x + 1, y + dy, z - 1], field[x + 1, y + dy, z], field[x + 1, y + dy, z + 1])
-                    if near < FAR:
+                    if near < FIELD_LIMIT:
                         field[x, y, z] = min(best, np.uint8(near + 1))
     return field[1 : sx + 1, 1 : sy + 1, 1 : sz + 1].copy()
 

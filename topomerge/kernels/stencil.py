@@ -97,11 +97,11 @@ def _weigh(table, bricks, cells, offsets, weights, values, largest, out):  # typ
 
 
 @njit(cache=True, error_model="numpy")
-def _winner(voted, votes, count, own):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _winner(voted, votes, count, present):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """The label with most votes: of several `own`, else the smallest; -1 where nobody voted."""
     best, most = -1, 0.0
     for k in range(count):
-        if votes[k] > most or (votes[k] == most and best != own and (voted[k] == own or voted[k] < best)):
+        if votes[k] > most or (votes[k] == most and best != present and (voted[k] == present or voted[k] < best)):
             best, most = voted[k], votes[k]
     return best
 

@@ -20,16 +20,16 @@ def _clip(corners, owner, count, x, y, half, name):  # type: ignore[no-untyped-d
     m = 0
     for c in range(count):
         d = (c + 1) % count
-        here = corners[c, 0] * x + corners[c, 1] * y - half
-        there = corners[d, 0] * x + corners[d, 1] * y - half
-        if here <= 0:
+        side = corners[c, 0] * x + corners[c, 1] * y - half
+        next_side = corners[d, 0] * x + corners[d, 1] * y - half
+        if side <= 0:
             cut[m, 0], cut[m, 1], cut_owner[m] = corners[c, 0], corners[c, 1], owner[c]
             m += 1
-        if (here <= 0) != (there <= 0):
-            t = here / (here - there)
+        if (side <= 0) != (next_side <= 0):
+            t = side / (side - next_side)
             for a in range(2):
                 cut[m, a] = corners[c, a] + t * (corners[d, a] - corners[c, a])
-            cut_owner[m] = name if here <= 0 else owner[c]
+            cut_owner[m] = name if side <= 0 else owner[c]
             m += 1
     for c in range(m):
         corners[c, 0], corners[c, 1], owner[c] = cut[c, 0], cut[c, 1], cut_owner[c]

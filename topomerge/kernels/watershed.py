@@ -67,7 +67,7 @@ def contacts(label, clearance):  # type: ignore[no-untyped-def]  # pragma: no co
     """(k, 3) int64 pairs of neighbouring cells of different labels: the two labels, ascending, and the flat index of the
     narrower cell."""
     nx, ny = label.shape
-    found = []
+    pairs = []
     for x in range(nx):
         for y in range(ny):
             a = label[x, y]
@@ -78,8 +78,8 @@ def contacts(label, clearance):  # type: ignore[no-untyped-def]  # pragma: no co
                 if 0 <= u < nx and 0 <= v < ny and label[u, v] >= 0 and label[u, v] != a:
                     b = label[u, v]
                     place = x * ny + y if clearance[x, y] <= clearance[u, v] else u * ny + v
-                    found.append((min(a, b), max(a, b), place))
-    out = np.empty((len(found), 3), np.int64)
-    for i in range(len(found)):
-        out[i, 0], out[i, 1], out[i, 2] = found[i]
+                    pairs.append((min(a, b), max(a, b), place))
+    out = np.empty((len(pairs), 3), np.int64)
+    for i in range(len(pairs)):
+        out[i, 0], out[i, 1], out[i, 2] = pairs[i]
     return out

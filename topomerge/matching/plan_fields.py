@@ -31,7 +31,7 @@ class PlanFields:
     def kind(self) -> Array:
         """(nx, ny) uint8: 0 unknown, 1 wall, 2 free, 3 clutter."""
         p = self.plan
-        return (align.WALL * p.wall + align.FREE * p.free + align.CLUTTER * p.clutter).astype(np.uint8)
+        return (align.WALL_STATE * p.wall + align.FREE_STATE * p.free + align.CLUTTER_STATE * p.clutter).astype(np.uint8)
 
     @cached_property
     def to_wall(self) -> Array:

@@ -42,7 +42,7 @@ class VoxelGrid:
         require(np.shape(self.origin) == (3,) and bool(np.isfinite(self.origin).all()), f"origin must be (3,), not {self.origin}")
         require(self.cells.ndim == 2 and self.cells.shape[1] == 3, f"cells must be (n, 3), not {self.cells.shape}")
         require(self.cells.dtype == np.int32, f"cells must be int32, not {self.cells.dtype}")
-        require(all(0 < s <= morton.LIMIT for s in self.shape), f"grid shape {self.shape} is outside 1..{morton.LIMIT}")
+        require(all(0 < s <= morton.AXIS_LIMIT for s in self.shape), f"grid shape {self.shape} is outside 1..{morton.AXIS_LIMIT}")
         if len(self.cells):
             low, high = _extent(self.cells)
             require(bool((low >= 0).all() and (high < self.shape).all()), f"cells {low}..{high} outside {self.shape}")
@@ -63,7 +63,8 @@ class VoxelGrid:
         if len(cells):  # before the codes: they hold 21 bits an axis, and a cell beyond would take the place of another
             require(np.issubdtype(cells.dtype, np.integer), f"cells must be integers, not {cells.dtype}")
             low, high = _extent(cells)
-            require(bool((low >= 0).all() and (high < morton.LIMIT).all()), f"cells {low}..{high} not in 0..{morton.LIMIT}")
+            inside = bool((low >= 0).all() and (high < morton.AXIS_LIMIT).all())
+            require(inside, f"cells {low}..{high} not in 0..{morton.AXIS_LIMIT}")
         cells = np.ascontiguousarray(cells, np.int32)
         first = morton.unique_rows(morton.encode(cells))
         unique_cells = np.ascontiguousarray(cells[first])

@@ -19,15 +19,15 @@ from topomerge.io.palette import room_colours
 from topomerge.types import TopometricMap
 from topomerge.viz.plan import Frame, Place, StoreyPlan, frame_of, places, storey_plans
 
-PAPER, NO_ROOM, WALL, INK = "#ffffff", "#e4e4e4", "#333333", "#222222"
-LINES: dict[str, dict[str, Any]] = {
+PAPER, NO_ROOM, WALL_INK, TEXT_INK = "#ffffff", "#e4e4e4", "#333333", "#222222"
+EDGE_LINES: dict[str, dict[str, Any]] = {
     "door": {"color": "#1b1b1b", "linestyle": "-", "marker": "s"},
     "opening": {"color": "#1b1b1b", "linestyle": (0, (4, 2)), "marker": "o"},
     "stairs": {"color": "#a00060", "linestyle": (0, (1, 1.2)), "marker": "^"},
 }
 PAGE = (15.0, 10.0)  # inches: panels are arranged to fill this
-LARGEST = 24.0  # inches along an axis, of a figure that needs more for its room numbers to be read
-MARGIN = (0.6, 0.4, 0.3, 0.4)  # inches around a panel's plan: left, bottom, right, top
+LARGEST_FIGURE = 24.0  # inches along an axis, of a figure that needs more for its room numbers to be read
+PANEL_MARGIN = (0.6, 0.4, 0.3, 0.4)  # inches around a panel's plan: left, bottom, right, top
 TOP, BOTTOM = 0.55, 0.85  # inches for the title, and for the scale bar with the legend
 NARROWEST = 3.0  # inches of a panel, which must hold its caption
 DPI = 150
@@ -80,7 +80,7 @@ def save_figure(map: TopometricMap, path: str | Path) -> None:
 def _arrange(panels: int, frame: Frame, named: list[dict[int, Place]]) -> tuple[int, float]:
     """Columns of panels, and inches a metre, so that the page is filled and most room numbers fit into their rooms."""
     width, height = (frame.high - frame.low).tolist()
-    left, bottom, right, top = MARGIN
+    left, bottom, right, top = PANEL_MARGIN
 
     def inches(columns: int, page: tuple[float, float]) -> float:
         rows = math.ceil(panels / columns)
@@ -92,13 +92,13 @@ def _arrange(panels: int, frame: Frame, named: list[dict[int, Place]]) -> tuple[
     clear = sorted(place.clear for of_storey in named for place in of_storey.values())
     wanted = 0.09 / clear[len(clear) // 4] if clear else 0.0  # a number of 6 points in three of four rooms
     fitting = inches(columns, PAGE)
-    return columns, max(fitting, min(wanted, inches(columns, (LARGEST, LARGEST))), 1e-6)
+    return columns, max(fitting, min(wanted, inches(columns, (LARGEST_FIGURE, LARGEST_FIGURE))), 1e-6)
 
 
 def _panels(count: int, columns: int, inches: float, frame: Frame) -> tuple[Figure, list[Axes]]:
     """A figure with one panel a storey, sized so that a metre measures `inches` everywhere."""
     width, height = ((frame.high - frame.low) * inches).tolist()
-    left, bottom, right, top = MARGIN
+    left, bottom, right, top = PANEL_MARGIN
     rows = math.ceil(count / columns)
     pitch = max(width + left + right, NARROWEST)
     across, down = max(columns * pitch, 6.0), rows * (height + bottom + top) + TOP + BOTTOM
@@ -122,7 +122,7 @@ def _draw_cells(ax: Axes, plan: StoreyPlan, frame: Frame, colours: Any) -> None:
     image[plan.floor] = mpl.colors.to_rgba(NO_ROOM)
     inside = plan.room >= 0
     image[inside, :3] = colours[plan.room[inside]]
-    image[plan.wall] = mpl.colors.to_rgba(WALL)
+    image[plan.wall] = mpl.colors.to_rgba(WALL_INK)
     (left, bottom), (right, top) = frame.low, frame.high
     extent = (float(left), float(right), float(bottom), float(top))
     ax.imshow(image.transpose(1, 0, 2), origin="lower", extent=extent, interpolation="nearest", aspect="auto")
@@ -130,23 +130,23 @@ def _draw_cells(ax: Axes, plan: StoreyPlan, frame: Frame, colours: Any) -> None:
 
 def _draw_edges(ax: Axes, map: TopometricMap, storey: int, places: dict[int, Place]) -> None:
     """Lines from room to door to room; of stairs the half that lies on this storey, with the room that they lead to."""
-    told: set[int] = set()  # rooms above or below that a label names already
+    labelled: set[int] = set()  # rooms above or below that a label names already
     for edge in map.edges:
         a, b = edge["rooms"].tolist()
-        here = [room for room in (a, b) if map.rooms["storey"][room] == storey and room in places]
-        if not here:
+        rooms = [room for room in (a, b) if map.rooms["storey"][room] == storey and room in places]
+        if not rooms:
             continue
         x, y = edge["centre"][:2].tolist()
-        style = LINES.get(str(edge["kind"]), LINES["door"])
-        ends = [(places[room].x, places[room].y) for room in here]
+        style = EDGE_LINES.get(str(edge["kind"]), EDGE_LINES["door"])
+        ends = [(places[room].x, places[room].y) for room in rooms]
         path = [ends[0], (x, y), *ends[1:]]
         look = {"color": style["color"], "linestyle": style["linestyle"], "linewidth": 1.0}
         ax.plot([p[0] for p in path], [p[1] for p in path], zorder=3, solid_capstyle="round", **look)
         marker = {"marker": style["marker"], "markersize": 4.5, "markerfacecolor": PAPER, "markeredgewidth": 1.0}
         ax.plot([x], [y], linestyle="none", color=style["color"], zorder=4, **marker)
-        other = b if here[0] == a else a
-        if len(here) == 1 and other not in told:
-            told.add(other)
+        other = b if rooms[0] == a else a
+        if len(rooms) == 1 and other not in labelled:
+            labelled.add(other)
             up = map.rooms["storey"][other] > storey
             text = f"{'up' if up else 'down'} to {other}"
             box = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "edgecolor": "none", "alpha": 0.85}
@@ -160,8 +160,8 @@ def _draw_rooms(ax: Axes, named: dict[int, Place], inches: float) -> None:
         digits = 0.32 * len(str(room)) + 0.4  # half the width of the node, of a number one point high
         size = float(np.clip(place.clear * inches * 72 / digits, 6.0, 8.5))
         shape = "circle,pad=0.25" if room < 10 else "round,pad=0.3,rounding_size=0.8"
-        disc = {"boxstyle": shape, "facecolor": PAPER, "edgecolor": INK, "linewidth": 0.8}
-        ax.text(place.x, place.y, str(room), fontsize=size, ha="center", va="center", color=INK, zorder=5, bbox=disc)
+        disc = {"boxstyle": shape, "facecolor": PAPER, "edgecolor": TEXT_INK, "linewidth": 0.8}
+        ax.text(place.x, place.y, str(room), fontsize=size, ha="center", va="center", color=TEXT_INK, zorder=5, bbox=disc)
 
 
 def _label(ax: Axes, map: TopometricMap, storey: int) -> None:
@@ -173,7 +173,7 @@ def _label(ax: Axes, map: TopometricMap, storey: int) -> None:
         count = int((map.rooms["storey"] == storey).sum())
         rooms = f"{count} room{'' if count == 1 else 's'}"
         text = f"Storey {storey} · {rooms} · floor at {map.storeys['floor'][storey]:.2f} m"
-        ax.set_title(text, fontsize=9, color=INK, loc="left", pad=5)
+        ax.set_title(text, fontsize=9, color=TEXT_INK, loc="left", pad=5)
 
 
 def _scale_bar(figure: Figure, frame: Frame, inches: float) -> None:
@@ -182,9 +182,9 @@ def _scale_bar(figure: Figure, frame: Frame, inches: float) -> None:
     length = max((s for s in (0.1, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if s <= 0.2 * width), default=0.1)
     across, down = figure.get_size_inches()
     half, y = length * inches / across / 2, 0.62 / down
-    bar = Line2D([0.5 - half, 0.5 + half], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt")
+    bar = Line2D([0.5 - half, 0.5 + half], [y, y], color=TEXT_INK, linewidth=2.5, solid_capstyle="butt")
     figure.add_artist(bar)
-    figure.text(0.5 + half + 0.08 / across, y, f"{length:g} m", ha="left", va="center", fontsize=8, color=INK)
+    figure.text(0.5 + half + 0.08 / across, y, f"{length:g} m", ha="left", va="center", fontsize=8, color=TEXT_INK)
 
 
 def _title(figure: Figure, map: TopometricMap) -> None:
@@ -193,10 +193,12 @@ def _title(figure: Figure, map: TopometricMap) -> None:
     high = figure.get_size_inches()[1]
     name = Path(map.source).name or "map"
     text = f"{name}: {counts}".replace("$", r"\$")  # a dollar would start a formula
-    figure.text(0.5, 1 - 0.3 / high, text, ha="center", va="center", fontsize=13, color=INK, weight="bold")
-    kinds = [kind for kind in LINES if kind in set(map.edges["kind"].tolist())]
-    handles = [Line2D([], [], label=kind, linewidth=1.2, markersize=5, markerfacecolor=PAPER, **LINES[kind]) for kind in kinds]
+    figure.text(0.5, 1 - 0.3 / high, text, ha="center", va="center", fontsize=13, color=TEXT_INK, weight="bold")
+    kinds = [kind for kind in EDGE_LINES if kind in set(map.edges["kind"].tolist())]
+    handles = [
+        Line2D([], [], label=kind, linewidth=1.2, markersize=5, markerfacecolor=PAPER, **EDGE_LINES[kind]) for kind in kinds
+    ]
     square: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 8}
-    handles += [Line2D([], [], color=WALL, label="wall", **square), Line2D([], [], color=NO_ROOM, label="no room", **square)]
+    handles += [Line2D([], [], color=WALL_INK, label="wall", **square), Line2D([], [], color=NO_ROOM, label="no room", **square)]
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=8.5,
                   bbox_to_anchor=(0.5, 0.05 / high))  # fmt: skip

@@ -15,8 +15,8 @@ from topomerge.viz.plan import StoreyPlan, places
 from topomerge.viz.scene import hex_colour
 from topomerge.viz.sheet import Sheet
 
-GAP = 0.12  # of the width, between the two maps and between storeys
-WIDE = 1100  # pixels that the drawing is expected to have
+MAP_GAP = 0.12  # of the width, between the two maps and between storeys
+LINES_WIDTH = 1100  # pixels that the drawing is expected to have
 Drawn = tuple[Sheet, list[StoreyPlan]]
 
 
@@ -31,7 +31,7 @@ def lines_view(
         colours: (R, 3) uint8 of the rooms of either map; neighbours differ if None.
     """
     sizes = [np.array(sheet.size) for sheet, _ in drawn]
-    gap = round(GAP * (sizes[0][0] + sizes[1][0]))
+    gap = round(MAP_GAP * (sizes[0][0] + sizes[1][0]))
     tall = [len(plans) * size[1] + (len(plans) - 1) * gap // 2 for (_, plans), size in zip(drawn, sizes, strict=True)]
     width, height = int(sizes[0][0] + gap + sizes[1][0]), int(max(tall))
     parts, at = [], []
@@ -46,7 +46,7 @@ def lines_view(
                 spots[room] = (u + x, v + y)
         at.append(spots)
     parts.append(element("g", *_lines(matches, at[0], at[1]), class_="matches"))
-    unit = max(width / WIDE, height / 600)
+    unit = max(width / LINES_WIDTH, height / 600)
     margin = round(20 * unit)
     view = f"{-margin} {-margin} {width + 2 * margin} {height + 2 * margin}"
     words = f"{len(matches)} pairs of rooms that are one, each joined by a line"
@@ -55,9 +55,9 @@ def lines_view(
 
 
 def _storey(map: TopometricMap, sheet: Sheet, plan: StoreyPlan, colours: Array | None) -> list[Markup]:
-    own = room_colours(map) if colours is None else colours
+    shades = room_colours(map) if colours is None else colours
     rooms = [
-        element("path", class_="room", d=d, fill=hex_colour(own[i]), fill_rule="evenodd", data_room=sheet.id(i))
+        element("path", class_="room", d=d, fill=hex_colour(shades[i]), fill_rule="evenodd", data_room=sheet.id(i))
         for i, d in room_outlines(plan, sheet).items()
     ]
     return [*rooms, element("path", class_="wall", d=wall_outline(plan, sheet), fill_rule="evenodd")]

@@ -15,8 +15,8 @@ from topomerge.viz.sheet import Sheet, lay_out
 from topomerge.viz.svg import drawing
 
 Drawn = tuple[Sheet, list[StoreyPlan]]
-LEVEL = 0.7  # m by which floors of one storey may differ
-FAR = 10_000  # cm: places on the paper are rounded, so an affine map is measured over a long way
+LEVEL_TOLERANCE = 0.7  # m by which floors of one storey may differ
+AFFINE_REACH = 10_000  # cm: places on the paper are rounded, so an affine map is measured over a long way
 
 
 def laid_alike(a: TopometricMap, b: TopometricMap, pose: Sim3 | None) -> tuple[Drawn, Drawn]:
@@ -52,8 +52,8 @@ def blend_view(a: TopometricMap, b: TopometricMap, drawn: tuple[Drawn, Drawn], p
     bar = element("div", _source("a", a), slider, _source("b", b), class_="blend")
     groups = [bar, *([element("div", *choices, class_="choices")] if choices else [])]
     controls = element("div", *groups, element("div", *zoom_buttons(), class_="zoom"), class_="controls")
-    told = element("p", "Walls of one map that lie on walls of the other speak for the merge.", class_="told", aria_live="polite")
-    return element("div", controls, element("div", *figures, class_="sheet", tabindex=0), told, class_="plan-view")
+    hint = element("p", "Walls of one map that lie on walls of the other speak for the merge.", class_="told", aria_live="polite")
+    return element("div", controls, element("div", *figures, class_="sheet", tabindex=0), hint, class_="plan-view")
 
 
 def levels(a: TopometricMap, b: TopometricMap, pose: Sim3) -> list[tuple[int | None, int | None]]:
@@ -63,7 +63,11 @@ def levels(a: TopometricMap, b: TopometricMap, pose: Sim3) -> list[tuple[int | N
     pairs: list[tuple[int | None, int | None]] = []
     taken: set[int] = set()
     for i, floor in enumerate(floors_a):
-        near = [j for j in np.argsort(np.abs(floors_b - floor)).tolist() if abs(floors_b[j] - floor) <= LEVEL and j not in taken]
+        near = [
+            j
+            for j in np.argsort(np.abs(floors_b - floor)).tolist()
+            if abs(floors_b[j] - floor) <= LEVEL_TOLERANCE and j not in taken
+        ]
         taken.update(near[:1])
         pairs.append((i, near[0] if near else None))
     pairs += [(None, j) for j in range(len(floors_b)) if j not in taken]
@@ -76,9 +80,9 @@ def onto(sheet: Sheet, paper: Sheet, pose: Sim3) -> Array:
     Args:
         pose: of the first paper's map in the frame of the other's.
     """
-    corners = np.array([[0, 0], [FAR, 0], [0, FAR]], float)
+    corners = np.array([[0, 0], [AFFINE_REACH, 0], [0, AFFINE_REACH]], float)
     to = paper.cm(pose.apply(np.column_stack([metres(sheet, corners), np.zeros(3)]))).astype(float)
-    return np.column_stack([(to[1] - to[0]) / FAR, (to[2] - to[0]) / FAR, to[0]])
+    return np.column_stack([(to[1] - to[0]) / AFFINE_REACH, (to[2] - to[0]) / AFFINE_REACH, to[0]])
 
 
 def metres(sheet: Sheet, places: Array) -> Array:
@@ -95,8 +99,8 @@ def _around(a: Sheet, b: Sheet, pose: Sim3) -> Sheet:
         width, height = sheet.size
         corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], float)
         ends.append(a.cm(move.apply(np.column_stack([metres(sheet, corners), np.zeros(4)]))))
-    every = np.concatenate(ends)
-    low, high = every.min(axis=0), every.max(axis=0)
+    corners_of_both = np.concatenate(ends)
+    low, high = corners_of_both.min(axis=0), corners_of_both.max(axis=0)
     x, y = low.tolist()
     wide, tall = (high - low).tolist()
     return replace(a, key="ab", corner=a.corner + np.array([x, -y]) / 100, size=(wide, tall))

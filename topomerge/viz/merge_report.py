@@ -32,7 +32,7 @@ from topomerge.viz.tables import cell, facts, room_link, rooms_table, share_bar,
 
 FILES = ("merge.json", "report.html", "merged.ply", "map.tmap")
 ALONE = (196, 196, 190)  # rooms without a partner
-SEEN = {0: "#9a9a9a", 1: "#4a90d9", 2: "#ef8a3c", 3: "#4fae74"}  # cells that were assumed, of a, of b, of both
+SEEN_OF_COLOURS = {0: "#9a9a9a", 1: "#4a90d9", 2: "#ef8a3c", 3: "#4fae74"}  # cells that were assumed, of a, of b, of both
 HYPOTHESES = 6
 
 
@@ -43,7 +43,7 @@ def save_merge(result: MergeResult, folder: str | Path) -> None:
         InputError: the folder can't be made or written.
     """
     folder = Path(folder)
-    made = not folder.exists()
+    is_new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -60,7 +60,7 @@ def save_merge(result: MergeResult, folder: str | Path) -> None:
                 write(stack.enter_context(replacing(folder / name)))
             (folder / "merge.json").unlink(missing_ok=True)  # renamed last: a kill leaves no list of another run's files
     except BaseException:
-        if made and not any(folder.iterdir()):
+        if is_new and not any(folder.iterdir()):
             folder.rmdir()
         raise
     for name in set(FILES) - {name for name, _ in writers}:  # of an earlier merge: they would belong to nothing here
@@ -77,8 +77,8 @@ def merge_html(result: MergeResult) -> str:
         names = " + ".join(Path(m.source).name or "map" for m in result.maps)
         return atlas_html(result.atlas, {} if result.map is None else {result.atlas.component_of(0): result.map}, names)
     a, b = result.maps
-    found = result.registration
-    pose = found.transform if found else None
+    registration = result.registration
+    pose = registration.transform if registration else None
     drawn = laid_alike(a, b, pose)
     sections = [_verdict(result), warnings(result.warnings), _maps(result, drawn)]
     data: dict[str, Any] = {}
@@ -90,8 +90,8 @@ def merge_html(result: MergeResult) -> str:
         sections.append(section("The joined map, rooms found anew", view, "joined"))
         sections.append(_space(result))
         data = {"scene-data": _scene(result, sheet.turn), "mates": _mates(result)}
-    if found is not None:
-        sections.append(_evidence(result, found))
+    if registration is not None:
+        sections.append(_evidence(result, registration))
     sections.append(_made(result))
     names = " + ".join(Path(m.source).name or "map" for m in result.maps)
     return page(names, "Merge of two maps", sections, data)
@@ -128,9 +128,9 @@ def _maps(result: MergeResult, drawn: tuple[Drawn, Drawn]) -> Markup:
     """Both plans side by side, rooms that are one in one colour, and the table of them."""
     colours = _colours(result) if result.map is not None else (None, None)
     views = []
-    for name, m, (sheet, plans), own in zip("ab", result.maps, drawn, colours, strict=True):
+    for name, m, (sheet, plans), shades in zip("ab", result.maps, drawn, colours, strict=True):
         head = element("h3", f"{name}: {Path(m.source).name or 'map'} ", element("small", f"{len(m.rooms)} rooms"))
-        views.append(element("div", head, plan_view(m, sheet, plans, own)))
+        views.append(element("div", head, plan_view(m, sheet, plans, shades)))
     parts: list[Markup] = []
     if result.map is not None:
         words = "Rooms of one colour are one room; grey ones were found in one map only. Point at a room to see its partners."
@@ -147,14 +147,14 @@ def _colours(result: MergeResult) -> tuple[Array, Array]:
     """(R, 3) uint8 of the rooms of both maps: matched ones have the colour of the joined map's room in which they lie."""
     assert result.map is not None
     palette = room_colours(result.map)
-    found = []
+    of_maps = []
     for k, (m, within) in enumerate(zip(result.maps, _within(result), strict=True)):
         colour = np.tile(np.array(ALONE, np.uint8), (len(m.rooms), 1))
-        own = sorted({match.rooms[k] for match in result.matches})
-        own = [i for i in own if within[i] >= 0]
-        colour[own] = palette[within[own]]
-        found.append(colour)
-    return found[0], found[1]
+        matched = sorted({match.rooms[k] for match in result.matches})
+        matched = [i for i in matched if within[i] >= 0]
+        colour[matched] = palette[within[matched]]
+        of_maps.append(colour)
+    return of_maps[0], of_maps[1]
 
 
 def _within(result: MergeResult) -> tuple[Array, Array]:
@@ -224,7 +224,7 @@ def _seen(result: MergeResult) -> Array:
 def _scene(result: MergeResult, turn: float) -> dict[str, Any]:
     assert result.map is not None
     data = scene_data(result.map, turn=turn, seen=_seen(result))
-    data["colours"]["map"] = [SEEN[group[2]] for group in data["groups"]]
+    data["colours"]["map"] = [SEEN_OF_COLOURS[group[2]] for group in data["groups"]]
     return data
 
 
@@ -234,22 +234,22 @@ def _space(result: MergeResult) -> Markup:
     items = []
     for k, name in names.items():
         if share[k]:
-            sign = element("i", style=f"background:{SEEN[k]}")
+            sign = element("i", style=f"background:{SEEN_OF_COLOURS[k]}")
             items.append(element("li", sign, f"{name}: {100 * share[k] / share.sum():.0f} %"))
     legend = element("ul", *items, class_="legend")
     words = element("p", "Colour by “map” shows which map saw what.", class_="note")
     return section("In three dimensions", join([words, scene_view("scene-data"), legend]), "space")
 
 
-def _evidence(result: MergeResult, found: Registration) -> Markup:
+def _evidence(result: MergeResult, registration: Registration) -> Markup:
     title = "Why it is believed" if result.merged else "Why it is not believed"
-    rows = evidence_rows(found)
+    rows = evidence_rows(registration)
     if not rows:
         return section(title, element("p", result.reason), "why")
     parts = [_texts(("evidence", "measured", "what it says"), rows, "Evidence for the best hypothesis")]
-    if len(found.alternatives) > 1:
-        best, middle = found.alternatives[0], result.maps[1].grid.centroids().mean(axis=0)
-        others = [hypothesis_row(k, other, best, middle) for k, other in enumerate(found.alternatives[:HYPOTHESES])]
+    if len(registration.alternatives) > 1:
+        best, middle = registration.alternatives[0], result.maps[1].grid.centroids().mean(axis=0)
+        others = [hypothesis_row(k, other, best, middle) for k, other in enumerate(registration.alternatives[:HYPOTHESES])]
         heads = ("place", "turn °", "from the best m", "odds", "walls m²", "free floor m²", "walls on free floor")
         words = "The odds are against the best place, each seen by itself; 1 is as good."
         more = [element("h3", "Other places that were tried"), element("p", words, class_="note")]

@@ -10,10 +10,10 @@ from topomerge.viz.plan import Frame, StoreyPlan
 from topomerge.viz.sheet import Sheet
 
 CLOSED = 0.3  # m: gaps in a room's cells up to twice this are closed: scan lines on a floor, legs of tables
-HOLE = 6.0  # m2: holes in a room up to this are furniture or shadows, larger ones are courtyards and cores
+ROOM_HOLE = 6.0  # m2: holes in a room up to this are furniture or shadows, larger ones are courtyards and cores
 SMOOTH = 0.8  # pixels: standard deviation of the blur before an outline is traced
 TOLERANCE = 0.5  # pixels that an outline may be off for having fewer corners
-WALL = (0.6, 0.36)  # blur and level for walls: lines of one pixel stay whole, single pixels go
+WALL_TRACE = (0.6, 0.36)  # blur and level for walls: lines of one pixel stay whole, single pixels go
 SPECK = 0.3  # m2: smaller patches of what was seen outside rooms are left out
 
 
@@ -28,7 +28,7 @@ def whole_rooms(plan: StoreyPlan, frame: Frame) -> Array:
         wide = tuple(slice(a, s.stop + reach + 1) for a, s in zip(low, box, strict=True))
         mask = np.pad(plan.room[wide] == i, reach)  # away from the rim, where closing would eat the mask
         closed = ndimage.binary_closing(mask, ndimage.generate_binary_structure(2, 1), iterations=reach)
-        inner = _without_holes(closed, HOLE / frame.size**2)[reach:-reach, reach:-reach]
+        inner = _without_holes(closed, ROOM_HOLE / frame.size**2)[reach:-reach, reach:-reach]
         part = room[wide]
         part[inner & (part < 0)] = i
     return room
@@ -44,13 +44,13 @@ def _without_holes(mask: Array, most: float) -> Array:
 def room_outlines(plan: StoreyPlan, sheet: Sheet) -> dict[int, str]:
     """Room -> its outline as the `d` of an SVG path."""
     room = whole_rooms(plan, sheet.frame)
-    found = {}
+    outlines = {}
     for i, box in enumerate(ndimage.find_objects(room + 1)):
         if box is not None:
             start = np.array([s.start for s in box])
             share = (room[box] == i).astype(np.float32)
-            found[i] = trace(share, sheet, start) or trace(share, sheet, start, blur=0.0)
-    return found
+            outlines[i] = trace(share, sheet, start) or trace(share, sheet, start, blur=0.0)
+    return outlines
 
 
 def wall_outline(plan: StoreyPlan, sheet: Sheet) -> str:
@@ -60,7 +60,7 @@ def wall_outline(plan: StoreyPlan, sheet: Sheet) -> str:
     if near:
         padded = np.pad(wall, near)
         wall = ndimage.binary_closing(padded, np.ones((3, 3), bool), iterations=near)[near:-near, near:-near]
-    blur, level = WALL
+    blur, level = WALL_TRACE
     return trace(wall.astype(np.float32), sheet, blur=blur, level=level)
 
 

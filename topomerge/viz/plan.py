@@ -10,7 +10,7 @@ from scipy import ndimage
 from topomerge.types import Array, TopometricMap
 
 CUT = (1.0, 1.9)  # m above the floor: what fills this band is drawn as wall, as architects cut a plan
-FILLED = 0.5  # share of the band that must be occupied
+WALL_SHARE = 0.5  # share of the band that must be occupied
 MAX_PIXELS = 1500  # along an axis; cells of larger buildings are drawn together
 
 
@@ -92,7 +92,7 @@ def _walls(map: TopometricMap, frame: Frame, storey: int, cells: Array, at: Arra
     filled = np.zeros(frame.shape, np.int64)
     np.add.at(filled, (cut[:, 0], cut[:, 1]), 1)
     # A pixel of step x step cells shows a wall that is one cell wide.
-    return filled >= max(FILLED * (CUT[1] - CUT[0]) / map.grid.edge * frame.step, 1)
+    return filled >= max(WALL_SHARE * (CUT[1] - CUT[0]) / map.grid.edge * frame.step, 1)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Place:
 
 def places(plan: StoreyPlan, frame: Frame) -> dict[int, Place]:
     """Room -> the point of its area with most space around it; of nearly equal ones the nearest to the middle."""
-    found = {}
+    of_rooms = {}
     for i, box in enumerate(ndimage.find_objects(plan.room + 1)):
         if box is None:
             continue
@@ -118,5 +118,5 @@ def places(plan: StoreyPlan, frame: Frame) -> dict[int, Place]:
         middle = np.argwhere(mask).mean(axis=0)
         best = options[np.argmin(((options - middle) ** 2).sum(axis=1))]
         x, y = frame.centre(best - 1 + np.array([box[0].start, box[1].start])).tolist()
-        found[i] = Place(x, y, float(space[tuple(best)]) * frame.size)
-    return found
+        of_rooms[i] = Place(x, y, float(space[tuple(best)]) * frame.size)
+    return of_rooms

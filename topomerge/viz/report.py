@@ -46,14 +46,14 @@ def report_html(map: TopometricMap) -> str:
     title = Path(map.source).name or "map"
     sheet, plans = lay_out(map)
     rooms = element("div", plan_view(map, sheet, plans), scroller(rooms_table(map)), class_="beside")
-    made = element("div", storeys_table(map), seconds_table(map), parameters(map), class_="facts-row")
+    origin = element("div", storeys_table(map), seconds_table(map), parameters(map), class_="facts-row")
     sections = [
         summary(map),
         warnings(map.warnings),
         section("Plan and rooms", rooms, "plan"),
         section("In three dimensions", scene_view("scene-data"), "space"),
         section("Doors and stairs", scroller(doors_table(map)), "doors"),
-        section("How it was made", made, "made"),
+        section("How it was made", origin, "made"),
     ]
     return page(title, "Topometric map", sections, {"scene-data": scene_data(map, turn=sheet.turn)})
 
@@ -80,7 +80,7 @@ def page(title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, A
         "version": Markup(__version__),
     }
     # In one pass: what is put in is not searched again.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _template("report.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _template("report.html"))
 
 
 def _template(name: str) -> str:
@@ -166,8 +166,8 @@ def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], col
         element("figure", element("figcaption", element("b", name), f" {words}"), drawing, data_storey=i)
         for i, ((name, words), drawing) in enumerate(zip(names, plan_svgs(map, sheet, plans, colours), strict=True))
     ]
-    told = element("p", "Point at a room. Drag to move; click, then scroll to zoom.", class_="told", aria_live="polite")
-    return element("div", bar, element("div", *figures, class_="sheet", tabindex=0), told, legend(map), class_="plan-view")
+    hint = element("p", "Point at a room. Drag to move; click, then scroll to zoom.", class_="told", aria_live="polite")
+    return element("div", bar, element("div", *figures, class_="sheet", tabindex=0), hint, legend(map), class_="plan-view")
 
 
 def zoom_buttons() -> list[Markup]:

@@ -10,12 +10,12 @@ import numpy as np
 from topomerge.io.palette import NO_ROOM, room_colours
 from topomerge.types import Array, TopometricMap
 
-MOST = 2_500_000  # cells that are drawn once the view rests; of a map with more, neighbours are merged
-LONGEST = 65_535  # cells along an axis that 16 bits can number
+MOST_DRAWN = 2_500_000  # cells that are drawn once the view rests; of a map with more, neighbours are merged
+LONGEST_AXIS = 65_535  # cells along an axis that 16 bits can number
 
 
 def scene_data(
-    map: TopometricMap, key: str = "", turn: float = 0.0, most: int = MOST, seen: Array | None = None
+    map: TopometricMap, key: str = "", turn: float = 0.0, most: int = MOST_DRAWN, seen: Array | None = None
 ) -> dict[str, Any]:
     """What the 3D view needs, as plain values.
 
@@ -84,7 +84,7 @@ def _middle(map: TopometricMap, room: Any) -> list[float]:
 def _merged(cells: Array, labels: Array, most: int) -> tuple[int, Array, list[int], Array, Array]:
     """Cells along an axis that become one, then for each drawn cell its number, the shape, kinds and each cell's kind."""
     longest = int(cells.max(initial=0)) + 1
-    factor = -(-longest // LONGEST)
+    factor = -(-longest // LONGEST_AXIS)
     base = labels.max(axis=0, initial=0) + 1
     code, kind = np.unique((labels[:, 0] * base[1] + labels[:, 1]) * base[2] + labels[:, 2], return_inverse=True)
     kinds = np.stack([code // (base[1] * base[2]), code // base[2] % base[1] - 1, code % base[2]], axis=1)

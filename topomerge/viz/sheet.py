@@ -10,7 +10,7 @@ import numpy as np
 from topomerge.types import Array, TopometricMap
 from topomerge.viz.plan import Frame, StoreyPlan, frame_of, storey_plans
 
-UPRIGHT = np.radians(3.0)  # buildings that stand this nearly upright are drawn as they are
+UPRIGHT_ANGLE = np.radians(3.0)  # buildings that stand this nearly upright are drawn as they are
 TALL = 1.15  # turned buildings that are taller than wide by this are laid down
 
 
@@ -83,7 +83,7 @@ def sheet_for(plans: list[StoreyPlan], frame: Frame, key: str = "", turn: float 
     points = frame.centre(pixels) if len(pixels) else frame.low[None]
     if turn is None:
         turn = -direction(np.any([plan.wall for plan in plans], axis=0))
-        turn = 0.0 if abs(turn) < UPRIGHT else turn
+        turn = 0.0 if abs(turn) < UPRIGHT_ANGLE else turn
         wide, high = np.ptp(points @ rotation(turn).T, axis=0)
         if turn and high > TALL * wide:
             turn -= np.copysign(np.pi / 2, turn)

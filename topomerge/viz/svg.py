@@ -21,8 +21,8 @@ from topomerge.viz.scene import hex_colour
 from topomerge.viz.sheet import Sheet
 
 SCREEN = (840, 560)  # pixels that the drawing is expected to have: the page's script knows better
-MARGIN = 0.04  # of the longer side, around the building
-LEVEL = 0.5  # m: stairs whose ends are nearer to each other, seen from above, are drawn as a sign
+PLAN_MARGIN = 0.04  # of the longer side, around the building
+SHORTEST_FLIGHT = 0.5  # m: stairs whose ends are nearer to each other, seen from above, are drawn as a sign
 
 
 def plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], colours: Array | None = None) -> list[Markup]:
@@ -62,7 +62,7 @@ def _layer(name: str, parts: list[Markup]) -> Markup:
 def drawing(map: TopometricMap, sheet: Sheet, storey: int, layers: list[Markup]) -> Markup:
     """One `<svg class="plan">` of what its layers hold, with scale bar and axes, that the page's script can zoom."""
     width, height = sheet.size
-    margin = round(MARGIN * max(width, height)) + 30
+    margin = round(PLAN_MARGIN * max(width, height)) + 30
     unit = max((width + 2 * margin) / SCREEN[0], (height + 2 * margin) / SCREEN[1])
     hatch = f"hatch-{sheet.key}{storey}"
     stripe = element("line", x1=0, y1=0, x2=0, y2=24)
@@ -141,13 +141,13 @@ def _line(sheet: Sheet, a: Any, b: Any, **attributes: Any) -> Markup:
 
 def _doors(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
     parts = []
-    told: set[int] = set()  # rooms above or below that a word names already
+    labelled: set[int] = set()  # rooms above or below that a word names already
     for i, edge in enumerate(map.edges):
-        here = [room for room in edge["rooms"].tolist() if map.rooms["storey"][room] == storey]
-        if not here:
+        rooms = [room for room in edge["rooms"].tolist() if map.rooms["storey"][room] == storey]
+        if not rooms:
             continue
         if edge["kind"] in ("stairs", "ramp"):
-            parts.append(_stairs(map, sheet, storey, i, told))
+            parts.append(_stairs(map, sheet, storey, i, labelled))
             continue
         state = f"door {edge['kind']} {'open' if edge['open'] else 'shut'}"
         lines = [_line(sheet, *_ends(edge), class_=name) for name in ("gap", "leaf")]
@@ -155,7 +155,7 @@ def _doors(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
     return parts
 
 
-def _stairs(map: TopometricMap, sheet: Sheet, storey: int, i: int, told: set[int]) -> Markup:
+def _stairs(map: TopometricMap, sheet: Sheet, storey: int, i: int, labelled: set[int]) -> Markup:
     """Treads from the lower to the upper end with an arrow up, and a word where they lead, once for each room."""
     edge = map.edges[i]
     a, b = edge["rooms"].tolist()
@@ -163,12 +163,12 @@ def _stairs(map: TopometricMap, sheet: Sheet, storey: int, i: int, told: set[int
     level = int(map.rooms["storey"][other])
     parts: list[Markup] = []
     spot = edge["centre"]
-    if np.hypot(*(edge["upper"] - edge["lower"])[:2]) >= LEVEL:
+    if np.hypot(*(edge["upper"] - edge["lower"])[:2]) >= SHORTEST_FLIGHT:
         parts = _flight(sheet.at(edge["lower"]), sheet.at(edge["upper"]), float(edge["width"]), edge["kind"] == "stairs")
         spot = (edge["lower"] + edge["upper"]) / 2
     words = [] if parts else [element("path", class_="sign", d="M-6 5L0 -6L6 5z")]
-    if other not in told:
-        told.add(other)
+    if other not in labelled:
+        labelled.add(other)
         words.append(element("text", f"{'up ' if level > storey else 'down ' if level < storey else ''}to {other}"))
     x, y = sheet.at(spot)
     place = element("g", *words, class_="to", transform=f"translate({x} {y})")
@@ -194,10 +194,10 @@ def _graph(map: TopometricMap, sheet: Sheet, storey: int, named: dict[int, Place
     """Lines from room to door to room; of stairs the half that lies on this storey."""
     parts = []
     for edge in map.edges:
-        here = [room for room in edge["rooms"].tolist() if room in named and map.rooms["storey"][room] == storey]
-        if not here:
+        rooms = [room for room in edge["rooms"].tolist() if room in named and map.rooms["storey"][room] == storey]
+        if not rooms:
             continue
-        spots = [sheet.at((named[room].x, named[room].y)) for room in here]
+        spots = [sheet.at((named[room].x, named[room].y)) for room in rooms]
         spots.insert(1, sheet.at(edge["centre"]))
         path = "M" + "L".join(f"{x} {y}" for x, y in spots)
         parts.append(element("path", class_=f"link {edge['kind']}", d=path))

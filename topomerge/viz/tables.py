@@ -30,9 +30,9 @@ def cell(content: str, value: float | None = None, kind: str = "number", **attri
     return element("td", content, class_=kind, data_value=number, **attributes)
 
 
-def measure(value: float, digits: int, known: bool = True) -> Markup:
+def measure(value: float, digits: int, measured: bool = True) -> Markup:
     """A cell with a number, or a dash where it is not known."""
-    if not known or not math.isfinite(value):
+    if not measured or not math.isfinite(value):
         return cell("–", -1.0)
     return cell(f"{value:.{digits}f}", float(value))
 
@@ -53,8 +53,8 @@ def rooms_table(map: TopometricMap, key: str = "") -> Markup:
     """All rooms; rows carry `data-room` and `data-storey`."""
     names = ("room", "storey", "area m²", "height m", "seen", "doors")
     columns = [*((name, "number") for name in names), ("leads to", "text")]
-    many = len(map.storeys) > 1
-    columns = [column for column in columns if many or column[0] != "storey"]
+    several_storeys = len(map.storeys) > 1
+    columns = [column for column in columns if several_storeys or column[0] != "storey"]
     colours = room_colours(map)
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
     rows = []
@@ -66,7 +66,7 @@ def rooms_table(map: TopometricMap, key: str = "") -> Markup:
         leads = join([*words, *(room_link(key, other) for other in beside)], " ")
         cells = [
             cell(join([swatch, str(i)]), i),
-            *([cell(str(room["storey"]), int(room["storey"]))] if many else []),
+            *([cell(str(room["storey"]), int(room["storey"]))] if several_storeys else []),
             measure(room["area"], 1),
             measure(room["height"], 2, room["height"] > 0),
             cell(seen, float(room["completeness"])),

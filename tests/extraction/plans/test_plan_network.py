@@ -9,7 +9,7 @@ import pytest
 
 from topomerge.errors import InputError
 from topomerge.extraction.classified_storey import COLUMN_CLASSES, ClassifiedStorey, leads_through_wall
-from topomerge.extraction.plans.plan import BELOW, profile_bands
+from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.plan_network import (
     EVIDENCE_CHANNELS,
     column_probabilities,
@@ -20,9 +20,10 @@ from topomerge.extraction.plans.plan_network import (
     without_furniture,
 )
 from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.kernels.profile import PROFILE_BELOW
 from topomerge.types import Array
 
-WALL, FLOOR = ((1 << 24) - 1) << BELOW, 1 << BELOW
+WALL, FLOOR = ((1 << 24) - 1) << PROFILE_BELOW, 1 << PROFILE_BELOW
 
 
 def drawn(wall: Array) -> StoreyPlan:

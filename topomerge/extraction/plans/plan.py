@@ -21,7 +21,7 @@ from topomerge.extraction.plans.storey_plan import (
     wall_columns,
 )
 from topomerge.extraction.storeys import lowest_of_column
-from topomerge.kernels.profile import BELOW, LEVELS, profiles
+from topomerge.kernels.profile import PROFILE_BELOW, PROFILE_LEVELS, profiles
 from topomerge.types import Array, VoxelGrid
 
 WALLS = WallRule(lacking=2, neighbours=8, least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
@@ -61,7 +61,7 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
     size = mine[:, :2].max(axis=0) + margin + 1 - low
     base, seen, far = _heights(mine, low, size)
     above = cells[storey[floor] == k + 1]
-    top = base + LEVELS
+    top = base + PROFILE_LEVELS
     if len(above):
         nominal = int(np.median(above[:, 2]))
         upper, _, near = _heights(above[_within(above[:, :2] - low, size)], low, size, nominal)
@@ -101,7 +101,7 @@ def _heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[A
 
 def profile_bands(edge: float) -> HeightBands:
     """What the bits of a profile (`kernels.profile`) mean: a band is as high as a cell, m."""
-    return HeightBands(edge, BELOW, LEVELS)
+    return HeightBands(edge, PROFILE_BELOW, PROFILE_LEVELS)
 
 
 def _filled_like_walls(profile: Array, bands: HeightBands) -> Array:

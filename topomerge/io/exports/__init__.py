@@ -50,14 +50,14 @@ def formats(text: str) -> list[str]:
         InputError: none, an unknown one, or one twice.
     """
     names = [name.strip().lower() for name in text.split(",") if name.strip()]
-    known = ", ".join(FORMATS)
+    choices = ", ".join(FORMATS)
     for name in names:
         if name not in FORMATS:
-            raise InputError(f"--to {name}: is no format that can be written; choose from {known}")
+            raise InputError(f"--to {name}: is no format that can be written; choose from {choices}")
         if names.count(name) > 1:
             raise InputError(f"--to {text}: names {name} twice; once is enough")
     if not names:
-        raise InputError(f"--to {text!r}: names no format; choose from {known}")
+        raise InputError(f"--to {text!r}: names no format; choose from {choices}")
     return names
 
 

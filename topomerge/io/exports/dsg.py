@@ -21,10 +21,10 @@ from topomerge.io.palette import room_colours
 from topomerge.types import Array, TopometricMap
 
 VERSION = {"major": 1, "minor": 1, "patch": 3}
-PLACES, ROOMS, BUILDINGS = 3, 4, 5
-LAYERS = {"AGENTS": 2, "OBJECTS": 2, "PLACES": PLACES, "ROOMS": ROOMS, "BUILDINGS": BUILDINGS}
+PLACE_LAYER, ROOM_LAYER, BUILDING_LAYER = 3, 4, 5
+LAYERS = {"AGENTS": 2, "OBJECTS": 2, "PLACES": PLACE_LAYER, "ROOMS": ROOM_LAYER, "BUILDINGS": BUILDING_LAYER}
 NO_LABEL = 2**32 - 1
-UPRIGHT = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+NO_ROTATION = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
 GREY = (128, 128, 128)
 Json = dict[str, Any]
 
@@ -43,7 +43,7 @@ def save(map: TopometricMap, path: Path) -> None:
         "SPARK_DSG_header": {"project_name": "main", "version": VERSION},
         "directed": False,
         "multigraph": False,
-        "layer_keys": [{"layer": k, "partition": 0} for k in (2, PLACES, ROOMS, BUILDINGS)],
+        "layer_keys": [{"layer": k, "partition": 0} for k in (2, PLACE_LAYER, ROOM_LAYER, BUILDING_LAYER)],
         "layer_names": {name: {"layer": k, "partition": 0} for name, k in LAYERS.items()},
         "metadata": {"source": map.source, "voxel_size": float(map.grid.edge), "unit": "m", "written_by": "topomerge"},
         "nodes": nodes,
@@ -79,27 +79,27 @@ def _node(layer: int, id: int, kind: str, name: str, at: Array, colour: Any = GR
 def _box(low: Any = None, high: Any = None) -> Json:
     none = low is None
     middle, size = (np.zeros(3), np.zeros(3)) if none else ((low + high) / 2, high - low)
-    place = {"world_P_center": middle.tolist(), "world_R_center": UPRIGHT}
+    place = {"world_P_center": middle.tolist(), "world_R_center": NO_ROTATION}
     return {"type": "INVALID" if none else "AABB", "dimensions": size.tolist(), **place}
 
 
 def _edge(a: int, b: int, metadata: Json | None = None, weight: float | None = None) -> Json:
-    known = {"weighted": weight is not None, "weight": 1.0 if weight is None else float(weight)}
-    return {"source": a, "target": b, "info": {"type": "EdgeAttributes", "metadata": metadata or {}, **known}}
+    weighting = {"weighted": weight is not None, "weight": 1.0 if weight is None else float(weight)}
+    return {"source": a, "target": b, "info": {"type": "EdgeAttributes", "metadata": metadata or {}, **weighting}}
 
 
 def _building(map: TopometricMap) -> Iterator[Json]:
     if len(map.rooms):
         low, high = map.rooms["lo"].min(axis=0), map.rooms["hi"].max(axis=0)
         box = _box(low, high)
-        yield _node(BUILDINGS, symbol("B", 0), "SemanticNodeAttributes", "building", (low + high) / 2, bounding_box=box)
+        yield _node(BUILDING_LAYER, symbol("B", 0), "SemanticNodeAttributes", "building", (low + high) / 2, bounding_box=box)
 
 
 def _rooms(map: TopometricMap) -> Iterator[Json]:
     for r, (room, colour) in enumerate(zip(map.rooms, room_colours(map), strict=True)):
-        known = {name: room[name].tolist() for name in ("storey", "area", "height", "volume", "completeness", "glimpsed")}
-        more = {"metadata": known, "bounding_box": _box(room["lo"], room["hi"]), "semantic_class_probabilities": {}}
-        yield _node(ROOMS, symbol("R", r), "RoomNodeAttributes", f"room {r}", room["centroid"], colour, **more)
+        properties = {name: room[name].tolist() for name in ("storey", "area", "height", "volume", "completeness", "glimpsed")}
+        more = {"metadata": properties, "bounding_box": _box(room["lo"], room["hi"]), "semantic_class_probabilities": {}}
+        yield _node(ROOM_LAYER, symbol("R", r), "RoomNodeAttributes", f"room {r}", room["centroid"], colour, **more)
 
 
 def _room_edges(map: TopometricMap) -> Iterator[Json]:
@@ -135,9 +135,9 @@ def _places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
         place = _place(number, kind, way["centre"], way["width"] / 2, GREY, {**metadata, "rooms": ends})
         edges = [_edge(symbol("R", ends[0]), symbol("p", number))]  # a node has one parent
         for r in ends:
-            own = np.flatnonzero(owner == r)
-            apart = np.linalg.norm(centres[own] - way["centre"], axis=1)
-            near = int(own[apart.argmin()])
+            areas_of_room = np.flatnonzero(owner == r)
+            apart = np.linalg.norm(centres[areas_of_room] - way["centre"], axis=1)
+            near = int(areas_of_room[apart.argmin()])
             edges.append(_edge(symbol("p", near), symbol("p", number), metadata, float(apart.min())))
         yield place, edges
 
@@ -162,11 +162,11 @@ def _place(number: int, name: str, at: Any, clear: float, colour: Any, metadata:
         "anti_frontier": False,
         "num_frontier_voxels": 0,
         "frontier_scale": [0.0, 0.0, 0.0],
-        "orientation": UPRIGHT,
+        "orientation": NO_ROTATION,
         "pcl_mesh_connections": [],
         "voxblox_mesh_connections": [],
         "deformation_connections": [],
         "mesh_vertex_labels": [],
         "metadata": metadata,
     }
-    return _node(PLACES, symbol("p", number), "PlaceNodeAttributes", name, at, colour, **more)
+    return _node(PLACE_LAYER, symbol("p", number), "PlaceNodeAttributes", name, at, colour, **more)

@@ -17,14 +17,14 @@ from scipy import ndimage
 
 from topomerge.types import Array, TopometricMap
 
-GAP = 0.1  # m: gaps in a floor up to twice this are closed: scan lines
-HOLE = 1.0  # m2: smaller holes in a floor are furniture, shadows or columns
-STEP = 1.6  # cells: smaller jogs of an outline are steps of its cells
+CLOSED_GAP = 0.1  # m: gaps in a floor up to twice this are closed: scan lines
+FLOOR_HOLE = 1.0  # m2: smaller holes in a floor are furniture, shadows or columns
+OUTLINE_STEP = 1.6  # cells: smaller jogs of an outline are steps of its cells
 BEVEL = 7  # cells: a wall across a corner that is shorter is none
-REACH = 4.0  # cells: so far from the end of a wall it may meet the next
+CORNER_REACH = 4.0  # cells: so far from the end of a wall it may meet the next
 GROWTH = 0.3  # m: a floor is grown to its wall by at most this
 SPECK = 0.05  # m2: smaller pieces of a floor are left out
-HEIGHT = 2.5  # m: of a room whose ceiling nobody saw
+UNSEEN_HEIGHT = 2.5  # m: of a room whose ceiling nobody saw
 
 
 def floor_polygons(map: TopometricMap) -> list[shapely.MultiPolygon]:
@@ -46,7 +46,7 @@ def _floors(map: TopometricMap) -> list[shapely.MultiPolygon]:
     plans = [_plan(map.navigable.cells[rows, :2], edge) for rows in _by_room(map.navigable_room, len(map.rooms))]
     cells = [None if plan is None else _straight(_polygon(plan.cells, plan.low)) for plan in plans]
     growth = _growth(map, plans, cells)
-    found: list[shapely.MultiPolygon] = []
+    floors: list[shapely.MultiPolygon] = []
     beside: dict[int, list[shapely.MultiPolygon]] = {}
     for r, shape in enumerate(cells):
         if shape is None:
@@ -56,9 +56,9 @@ def _floors(map: TopometricMap) -> list[shapely.MultiPolygon]:
             floor = shapely.affinity.affine_transform(grown, [edge, 0, 0, edge, *origin])
         others = beside.setdefault(int(map.rooms["storey"][r]), [])
         taken = [others[k] for k in np.flatnonzero(shapely.intersects(others, floor))] if others else []
-        found.append(_parts(floor.difference(shapely.union_all(taken)) if taken else floor, SPECK))
-        others.append(found[-1])
-    return found
+        floors.append(_parts(floor.difference(shapely.union_all(taken)) if taken else floor, SPECK))
+        others.append(floors[-1])
+    return floors
 
 
 def room_levels(map: TopometricMap) -> tuple[Array, Array]:
@@ -72,7 +72,7 @@ def room_levels(map: TopometricMap) -> tuple[Array, Array]:
         room, storey = map.rooms[r], map.storeys[map.rooms["storey"][r]]
         floor = _median_floor(map.navigable.cells[rows], z[rows]) if len(rows) else float(room["lo"][2])
         height = float(room["height"]) or float(storey["ceiling"]) - floor
-        levels[r] = floor, floor + (height if np.isfinite(height) and height > 0 else HEIGHT)
+        levels[r] = floor, floor + (height if np.isfinite(height) and height > 0 else UNSEEN_HEIGHT)
     return levels, map.rooms["height"] > 0
 
 
@@ -135,16 +135,16 @@ def _plan(columns: Array, edge: float) -> _Plan | None:
     """The floor over columns (n, 2) of a grid."""
     if not len(columns):
         return None
-    reach = max(round(GAP / edge), 1)
+    reach = max(round(CLOSED_GAP / edge), 1)
     low = columns.min(axis=0) - reach - 1
     plan = np.zeros(columns.max(axis=0) - low + reach + 2, bool)
     plan[tuple((columns - low).T)] = True
     closed = ndimage.binary_closing(plan, ndimage.generate_binary_structure(2, 1), iterations=reach) | plan
     holes, _ = ndimage.label(ndimage.binary_fill_holes(closed) & ~closed)
-    small = np.bincount(holes.ravel()) * edge**2 <= HOLE
+    small = np.bincount(holes.ravel()) * edge**2 <= FLOOR_HOLE
     small[0] = False
-    whole = closed | small[holes]
-    return _Plan(whole, low, int(whole.sum() - plan.sum()))
+    filled = closed | small[holes]
+    return _Plan(filled, low, int(filled.sum() - plan.sum()))
 
 
 def _polygon(cells: Array, low: Array) -> shapely.MultiPolygon:
@@ -172,9 +172,9 @@ def _straight(cells: shapely.MultiPolygon) -> shapely.MultiPolygon:
     parts = []
     for part in cells.geoms:
         rings = [_straight_ring(np.asarray(ring.coords)[:-1]) for ring in (part.exterior, *part.interiors)]
-        found = _parts(shapely.make_valid(shapely.Polygon(rings[0], [ring for ring in rings[1:] if len(ring) > 2])), 4.0)
+        straight = _parts(shapely.make_valid(shapely.Polygon(rings[0], [ring for ring in rings[1:] if len(ring) > 2])), 4.0)
         # Fitted walls of a very narrow place can cross each other: there the cells say it better.
-        parts.append(found if abs(found.area - part.area) < 0.1 * part.area + 2 else part)
+        parts.append(straight if abs(straight.area - part.area) < 0.1 * part.area + 2 else part)
     return _parts(shapely.union_all(parts))
 
 
@@ -191,8 +191,8 @@ def _straight_ring(corners: Array) -> Array:
     middle = np.roll(middle, -far, axis=0)
     middle = np.concatenate([middle, middle[:1]])
     number = {tuple(point): i for i, point in reversed(list(enumerate(middle.tolist())))}
-    kept = shapely.simplify(shapely.LineString(middle), STEP, preserve_topology=False).coords
-    cuts = [number[point] for point in kept[:-1]] + [len(middle) - 1]
+    corners_of_walls = shapely.simplify(shapely.LineString(middle), OUTLINE_STEP, preserve_topology=False).coords
+    cuts = [number[point] for point in corners_of_walls[:-1]] + [len(middle) - 1]
     walls = [middle[a : b + 1] for a, b in pairwise(cuts)]
     walls = _without_bevels([wall for wall in walls if len(wall) > 3] if len(walls) > 4 else walls)
     return _corners(walls) if len(walls) > 2 else corners
@@ -201,12 +201,12 @@ def _straight_ring(corners: Array) -> Array:
 def _without_bevels(walls: list[Array]) -> list[Array]:
     """Walls without short ones across a corner, where the two beside them meet: nobody stood in the tip of that corner."""
     lines = [_line(points) for points in walls]
-    kept = []
+    long_walls = []
     for k, points in enumerate(walls):
         met = _meet(lines[k - 1], lines[(k + 1) % len(walls)]) if len(points) <= BEVEL else None
-        if met is None or np.hypot(*(met - points.mean(axis=0))) > REACH:
-            kept.append(points)
-    return kept
+        if met is None or np.hypot(*(met - points.mean(axis=0))) > CORNER_REACH:
+            long_walls.append(points)
+    return long_walls
 
 
 def _corners(walls: list[Array]) -> Array:
@@ -217,7 +217,7 @@ def _corners(walls: list[Array]) -> Array:
         before, after = lines[k - 1], lines[k]
         end, start = walls[k - 1][-1], walls[k][0]
         met = _meet(before, after)
-        if met is not None and np.hypot(*(met - (end + start) / 2)) <= REACH:
+        if met is not None and np.hypot(*(met - (end + start) / 2)) <= CORNER_REACH:
             corners.append(met)
         else:
             corners += [m + d * float((p - m) @ d) for (m, d), p in ((before, end), (after, start))]

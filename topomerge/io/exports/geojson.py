@@ -23,7 +23,7 @@ from topomerge.types import Array, TopometricMap
 
 SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563  # m; the ellipsoid of WGS84
 ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
-FAR = 50e3  # m from the origin: beyond, a map stands in a grid of its country, not in a frame of its own
+OWN_FRAME_REACH = 50e3  # m from the origin: beyond, a map stands in a grid of its country, not in a frame of its own
 DIGITS_M, DIGITS_DEGREES = 4, 9  # a tenth of a millimetre either way
 Place = Callable[[Array], list[list[float]]]  # (n, 3) points of the map -> positions
 
@@ -141,7 +141,7 @@ def _metres(points: Array) -> list[list[float]]:
 
 def _check_near(map: TopometricMap) -> None:
     corners = np.abs(np.concatenate([map.rooms["lo"][:, :2], map.rooms["hi"][:, :2]])).max(initial=0.0)
-    if corners > FAR:
+    if corners > OWN_FRAME_REACH:
         far = f"{corners / 1000:.0f} km from (0, 0) of its frame, as in a national grid"
         raise InputError(f"--origin: the map lies {far}; leave --origin out and name that grid in your GIS")
 

@@ -18,7 +18,7 @@ from topomerge.types import TopometricMap
 
 SPACE = "http://graphml.graphdrawing.org/xmlns"
 Item = tuple[tuple[str, ...], dict[str, Any]]  # the id of a node or the two of an edge, attributes
-TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
+GRAPHML_TYPES = {bool: "boolean", int: "long", float: "double", str: "string"}
 
 
 def save(map: TopometricMap, path: Path) -> None:
@@ -48,7 +48,7 @@ def save(map: TopometricMap, path: Path) -> None:
 
 
 def _type(values: list[Any]) -> str:
-    return TYPES[type(values[0])]
+    return GRAPHML_TYPES[type(values[0])]
 
 
 def _data(parent: Any, where: str, values: dict[str, Any]) -> None:
@@ -59,16 +59,16 @@ def _data(parent: Any, where: str, values: dict[str, Any]) -> None:
 
 def _values(row: Any, *left_out: str) -> dict[str, Any]:
     """The columns of a table's row; points as three numbers, what is not known (nan) left out."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name in row.dtype.names:
         value = row[name].tolist()
         if name in left_out:
             continue
         if isinstance(value, list):
-            found |= {f"{name}_{axis}": number for axis, number in zip("xyz", value, strict=True)}
+            values |= {f"{name}_{axis}": number for axis, number in zip("xyz", value, strict=True)}
         elif not (isinstance(value, float) and math.isnan(value)):
-            found[name] = value
-    return found
+            values[name] = value
+    return values
 
 
 def _place(values: dict[str, Any], name: str) -> dict[str, Any]:

@@ -19,8 +19,8 @@ from topomerge.io.exports.ifc_model import Model
 from topomerge.io.exports.occupancy import storey_occupancy
 from topomerge.types import Array, TopometricMap
 
-LEAF, SLAB, CEILING = 0.1, 0.1, 0.05  # m, thickness
-LINTEL, HEIGHT = 2.0, 2.5  # m, of doors and storeys without anything seen above
+LEAF_THICKNESS, IFC_SLAB, CEILING_THICKNESS = 0.1, 0.1, 0.05  # m, thickness
+IFC_LINTEL, IFC_STOREY_HEIGHT = 2.0, 2.5  # m, of doors and storeys without anything seen above
 LEAST_WALL = 0.03  # m2 seen from above: smaller pieces are legs of tables
 
 
@@ -36,11 +36,11 @@ def save(map: TopometricMap, path: Path) -> None:
     floors, (levels, seen) = floor_polygons(map), room_levels(map)
     spaces = [model.space(r, floors[r], levels[r], bool(seen[r]), storeys) for r in range(len(map.rooms))]
     for s, storey in enumerate(storeys):
-        here = np.flatnonzero(map.rooms["storey"] == s).tolist()
-        model.aggregate(storey, [spaces[r] for r in here])
-        here = [r for r in here if not floors[r].is_empty]
-        built = [model.slab(r, floors[r], float(levels[r, 0]), storey) for r in here]
-        built += [model.ceiling(r, floors[r], float(levels[r, 1]), storey) for r in here if seen[r]]
+        rooms = np.flatnonzero(map.rooms["storey"] == s).tolist()
+        model.aggregate(storey, [spaces[r] for r in rooms])
+        rooms = [r for r in rooms if not floors[r].is_empty]
+        built = [model.slab(r, floors[r], float(levels[r, 0]), storey) for r in rooms]
+        built += [model.ceiling(r, floors[r], float(levels[r, 1]), storey) for r in rooms if seen[r]]
         model.contain(storey, [*built, *model.walls(s, storey)])
     for i, edge in enumerate(map.edges):
         a, b = edge["rooms"].tolist()
@@ -77,18 +77,18 @@ class _Building(Model):
             quantities.append(self.new("IfcQuantityLength", Name="Height", LengthValue=float(room["height"])))
             quantities.append(self.new("IfcQuantityVolume", Name="GrossVolume", VolumeValue=float(room["volume"])))
         self._define(space, self._set("IfcElementQuantity", "Qto_SpaceBaseQuantities", r, Quantities=quantities))
-        known = {"Completeness": ("IfcReal", float(room["completeness"])), "Glimpsed": ("IfcBoolean", bool(room["glimpsed"]))}
-        facts = [self._fact(name, kind, value) for name, (kind, value) in known.items()]
-        self._define(space, self._set("IfcPropertySet", "Topomerge_Room", r, HasProperties=facts))
+        facts = {"Completeness": ("IfcReal", float(room["completeness"])), "Glimpsed": ("IfcBoolean", bool(room["glimpsed"]))}
+        properties = [self._fact(name, kind, value) for name, (kind, value) in facts.items()]
+        self._define(space, self._set("IfcPropertySet", "Topomerge_Room", r, HasProperties=properties))
         return space
 
     def _fact(self, name: str, kind: str, value: Any) -> Any:
         return self.new("IfcPropertySingleValue", Name=name, NominalValue=self.file.create_entity(kind, value))
 
     def _set(self, kind: str, name: str, number: int, **values: Any) -> Any:
-        made = self.root(kind, f"{name} {number}", **values)
-        made.Name = name
-        return made
+        property_set = self.root(kind, f"{name} {number}", **values)
+        property_set.Name = name
+        return property_set
 
     def _define(self, product: Any, facts: Any) -> None:
         name = f"{product.GlobalId} {facts.GlobalId}"
@@ -96,13 +96,13 @@ class _Building(Model):
 
     def slab(self, r: int, floor: Any, z: float, storey: Any) -> Any:
         """The floor of a room."""
-        body = self.prisms(floor, z - storey.Elevation - SLAB, SLAB)
+        body = self.prisms(floor, z - storey.Elevation - IFC_SLAB, IFC_SLAB)
         at = self.place(storey.ObjectPlacement, 0, 0, 0)
         return self.root("IfcSlab", f"floor {r}", ObjectPlacement=at, Representation=body, PredefinedType="FLOOR")
 
     def ceiling(self, r: int, floor: Any, z: float, storey: Any) -> Any:
         """The ceiling of a room in which one was seen."""
-        body = self.prisms(floor, z - storey.Elevation, CEILING)
+        body = self.prisms(floor, z - storey.Elevation, CEILING_THICKNESS)
         at = self.place(storey.ObjectPlacement, 0, 0, 0)
         return self.root("IfcCovering", f"ceiling {r}", ObjectPlacement=at, Representation=body, PredefinedType="CEILING")
 
@@ -110,14 +110,14 @@ class _Building(Model):
         """What was seen of the walls of a storey, a wall for each connected piece, as high as the storey."""
         plan, table = storey_occupancy(self.map, s), self.map.storeys[s]
         height = float(table["ceiling"] - table["floor"])
-        height = height if height > 0 else HEIGHT  # nan: not seen
+        height = height if height > 0 else IFC_STOREY_HEIGHT  # nan: not seen
         pieces = cell_polygons(plan.wall, plan.low, plan.size, LEAST_WALL)
-        found = []
+        walls = []
         for k, piece in enumerate(pieces.geoms):
             body = {"Representation": self.prisms(shapely.MultiPolygon([piece]), 0.0, height), "PredefinedType": "NOTDEFINED"}
             at = self.place(storey.ObjectPlacement, 0, 0, 0)
-            found.append(self.root("IfcWall", f"wall {s}.{k}", ObjectPlacement=at, **body))
-        return found
+            walls.append(self.root("IfcWall", f"wall {s}.{k}", ObjectPlacement=at, **body))
+        return walls
 
     def door(self, i: int, edge: Any, storey: Any) -> Any:
         """A door as a box in its opening, or an opening without one as a line on the floor."""
@@ -131,20 +131,20 @@ class _Building(Model):
             shown = self.shape("FootPrint", "Curve3D", [line])
             return self.root("IfcVirtualElement", f"{edge['kind']} {i}", ObjectPlacement=at, Representation=shown)
         middle = self.new("IfcAxis2Placement2D", Location=self.point(width / 2, 0))
-        box = self.new("IfcRectangleProfileDef", ProfileType="AREA", Position=middle, XDim=width, YDim=LEAF)
+        box = self.new("IfcRectangleProfileDef", ProfileType="AREA", Position=middle, XDim=width, YDim=LEAF_THICKNESS)
         up = self.new("IfcDirection", DirectionRatios=[0.0, 0.0, 1.0])
-        solid = self.new("IfcExtrudedAreaSolid", SweptArea=box, ExtrudedDirection=up, Depth=height or LINTEL)
-        known = {"OverallWidth": width, "PredefinedType": "DOOR", "OperationType": "NOTDEFINED"}
-        known |= {"OverallHeight": height} if height else {}
+        solid = self.new("IfcExtrudedAreaSolid", SweptArea=box, ExtrudedDirection=up, Depth=height or IFC_LINTEL)
+        attributes = {"OverallWidth": width, "PredefinedType": "DOOR", "OperationType": "NOTDEFINED"}
+        attributes |= {"OverallHeight": height} if height else {}
         body = self.shape("Body", "SweptSolid", [solid])
-        return self.root("IfcDoor", f"door {i}", ObjectPlacement=at, Representation=body, **known)
+        return self.root("IfcDoor", f"door {i}", ObjectPlacement=at, Representation=body, **attributes)
 
     def flight(self, i: int, edge: Any, storey: Any) -> Any:
         """Stairs or a ramp, as a sloping plate."""
         low, high = (edge[end] - self.shift - (0, 0, storey.Elevation) for end in ("lower", "upper"))
         views = [self.view("Axis", "Curve3D", [self.new("IfcPolyline", Points=[self.point(*low), self.point(*high)])])]
         run = float(np.hypot(*(high - low)[:2]))
-        if run > LEAF:
+        if run > LEAF_THICKNESS:
             views.append(self.view("Body", "SweptSolid", [self._plate(low, high, run, float(edge["width"]))]))
         kind = "IfcRamp" if edge["kind"] == "ramp" else "IfcStair"
         at = self.place(storey.ObjectPlacement, 0, 0, 0)
@@ -159,7 +159,7 @@ class _Building(Model):
         across, along = (self.new("IfcDirection", DirectionRatios=[*v.tolist(), 0.0]) for v in (aside, ahead))
         where = self.new("IfcAxis2Placement3D", Location=self.point(x, y, low[2]), Axis=across, RefDirection=along)
         rise = float(high[2] - low[2])
-        corners = [self.point(*c) for c in ((0, -SLAB), (run, rise - SLAB), (run, rise), (0, 0))]
+        corners = [self.point(*c) for c in ((0, -IFC_SLAB), (run, rise - IFC_SLAB), (run, rise), (0, 0))]
         ring = self.new("IfcPolyline", Points=[*corners, corners[0]])
         profile = self.new("IfcArbitraryClosedProfileDef", ProfileType="AREA", OuterCurve=ring)
         out = self.new("IfcDirection", DirectionRatios=[0.0, 0.0, 1.0])
@@ -168,6 +168,6 @@ class _Building(Model):
 
     def bound(self, i: int, space: Any, element: Any) -> None:
         """A space is bounded by an element, which leads out of it."""
-        known = {"RelatingSpace": space, "RelatedBuildingElement": element, "InternalOrExternalBoundary": "INTERNAL"}
+        attributes = {"RelatingSpace": space, "RelatedBuildingElement": element, "InternalOrExternalBoundary": "INTERNAL"}
         kind = "VIRTUAL" if element.is_a("IfcVirtualElement") else "PHYSICAL"
-        self.root("IfcRelSpaceBoundary", f"{i} {space.GlobalId}", PhysicalOrVirtualBoundary=kind, **known)
+        self.root("IfcRelSpaceBoundary", f"{i} {space.GlobalId}", PhysicalOrVirtualBoundary=kind, **attributes)

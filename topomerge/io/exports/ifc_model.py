@@ -50,11 +50,11 @@ class Model:
 
     def _context(self) -> None:
         units = {"LENGTHUNIT": "METRE", "AREAUNIT": "SQUARE_METRE", "VOLUMEUNIT": "CUBIC_METRE", "PLANEANGLEUNIT": "RADIAN"}
-        made = [self.new("IfcSIUnit", UnitType=unit, Name=name) for unit, name in units.items()]
-        self.units = self.new("IfcUnitAssignment", Units=made)
+        si_units = [self.new("IfcSIUnit", UnitType=unit, Name=name) for unit, name in units.items()]
+        self.units = self.new("IfcUnitAssignment", Units=si_units)
         world = self.new("IfcAxis2Placement3D", Location=self.point(0, 0, 0))
-        whole = {"ContextType": "Model", "CoordinateSpaceDimension": 3, "Precision": 1e-5, "WorldCoordinateSystem": world}
-        self.context = self.new("IfcGeometricRepresentationContext", **whole)
+        attributes = {"ContextType": "Model", "CoordinateSpaceDimension": 3, "Precision": 1e-5, "WorldCoordinateSystem": world}
+        self.context = self.new("IfcGeometricRepresentationContext", **attributes)
         self.views = {
             name: self.new(
                 "IfcGeometricRepresentationSubContext",
@@ -89,10 +89,10 @@ class Model:
         where = self.new("IfcAxis2Placement3D", **axes)
         return self.new("IfcLocalPlacement", PlacementRelTo=parent, RelativePlacement=where)
 
-    def aggregate(self, whole: Any, parts: list[Any]) -> None:
+    def aggregate(self, parent: Any, parts: list[Any]) -> None:
         """Parts belong to a whole."""
         if parts:
-            self.root("IfcRelAggregates", whole.GlobalId, RelatingObject=whole, RelatedObjects=parts)
+            self.root("IfcRelAggregates", parent.GlobalId, RelatingObject=parent, RelatedObjects=parts)
 
     def contain(self, storey: Any, elements: list[Any]) -> None:
         """Elements stand on a storey."""
@@ -102,8 +102,8 @@ class Model:
 
     def view(self, name: str, kind: str, items: list[Any]) -> Any:
         """A body, an axis or a footprint."""
-        known = {"RepresentationIdentifier": name, "RepresentationType": kind, "Items": items}
-        return self.new("IfcShapeRepresentation", ContextOfItems=self.views[name], **known)
+        attributes = {"RepresentationIdentifier": name, "RepresentationType": kind, "Items": items}
+        return self.new("IfcShapeRepresentation", ContextOfItems=self.views[name], **attributes)
 
     def shape(self, name: str, kind: str, items: list[Any]) -> Any:
         """What a product looks like; None where there is nothing to show."""

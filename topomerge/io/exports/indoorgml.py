@@ -22,7 +22,7 @@ from topomerge.types import Array, TopometricMap
 CORE, GML = "http://www.opengis.net/indoorgml/1.0/core", "http://www.opengis.net/gml/3.2"
 LINK, SCHEMA = "http://www.w3.org/1999/xlink", "http://www.w3.org/2001/XMLSchema-instance"
 XSD = "http://schemas.opengis.net/indoorgml/1.0/indoorgmlcore.xsd"
-LINTEL = 2.0  # m: of a door over which nothing was seen
+UNSEEN_LINTEL = 2.0  # m: of a door over which nothing was seen
 
 
 def save(map: TopometricMap, path: Path) -> None:
@@ -131,7 +131,7 @@ def _boundary(member: Any, i: int, edge: Any) -> None:
     _head(boundary, f"{kind} {i}", kind=kind, width=f"{edge['width']:.2f}", open=str(bool(edge["open"])).lower())
     _link(boundary, "duality", f"T{i}")
     a, b = jambs(edge)
-    up = np.array([0.0, 0.0, float(edge["height"]) or LINTEL])
+    up = np.array([0.0, 0.0, float(edge["height"]) or UNSEEN_LINTEL])
     shape = _new(_new(boundary, "cellSpaceBoundaryGeometry"), "geometry3D")
     _polygon(shape, f"B{i}-face", [np.array([a, b, b + up, a + up, a])])
 

@@ -12,7 +12,7 @@ from topomerge.io.palette import NO_ROOM, room_colours
 from topomerge.types import TopometricMap
 
 SCALE = 0.001  # m
-UNKNOWN = date(1970, 1, 1)  # of creation: the same map gives the same bytes
+NO_DATE = date(1970, 1, 1)  # of creation: the same map gives the same bytes
 
 
 def save(map: TopometricMap, path: Path) -> None:
@@ -28,7 +28,7 @@ def save(map: TopometricMap, path: Path) -> None:
     points = map.grid.centroids()
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.generating_software = "topomerge"
-    header.creation_date = UNKNOWN
+    header.creation_date = NO_DATE
     header.scales = np.full(3, SCALE)
     header.offsets = np.floor(points.min(axis=0)) if len(points) else np.zeros(3)
     for name in ("room", "storey"):

@@ -9,9 +9,9 @@ from scipy import ndimage
 
 from topomerge.types import Array, TopometricMap
 
-BAND = (0.2, 1.8)  # m above the floor beside it: what is occupied there is in the way; lintels and thresholds are not
+OBSTACLE_BAND = (0.2, 1.8)  # m above the floor beside it: what is occupied there is in the way; lintels and thresholds are not
 CUT = (1.0, 1.9)  # m above the floor: what fills most of this band is a wall
-FILLED = 0.5  # share of the band that must be occupied
+BAND_SHARE = 0.5  # share of the band that must be occupied
 STEEP = (0.5, 0.2)  # m across, m up: a floor that rises so much is stairs, or the edge of a platform
 NEVER = np.iinfo(np.int32).max
 
@@ -56,9 +56,9 @@ def storey_occupancy(map: TopometricMap, storey: int) -> Occupancy:
         level = level[tuple(ndimage.distance_transform_edt(~walked, return_distances=False, return_indices=True))]
     i, j = (cells[:, :2] - first).T
     above = cells[:, 2] - level[i, j]
-    filled = [_count((i, j), above, band, edge, (nx, ny)) for band in (BAND, CUT)]
+    filled = [_count((i, j), above, band, edge, (nx, ny)) for band in (OBSTACLE_BAND, CUT)]
     occupied = (filled[0] > 0) | (walked & _steep(level, walked, edge))
-    wall = filled[1] >= max(FILLED * (CUT[1] - CUT[0]) / edge, 1)
+    wall = filled[1] >= max(BAND_SHARE * (CUT[1] - CUT[0]) / edge, 1)
     return Occupancy(map.navigable.origin[:2] + first * edge, edge, walked & ~occupied, occupied, wall, room)
 
 

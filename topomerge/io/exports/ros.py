@@ -18,7 +18,7 @@ from topomerge.io.exports.occupancy import Occupancy, storey_occupancy
 from topomerge.io.exports.route import Route, storey_route
 from topomerge.types import TopometricMap
 
-FREE, OCCUPIED, UNKNOWN = 254, 0, 205
+FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 
 
 def files(map: TopometricMap, folder: Path, stem: str, storey: int | None = None) -> list[tuple[Path, partial[None]]]:
@@ -35,7 +35,7 @@ def files(map: TopometricMap, folder: Path, stem: str, storey: int | None = None
         raise InputError(f"--storey {storey}: the map has no such storey (it has {count})")
     if not count:
         raise InputError("the map has no storeys, so that there is nothing to draw for a robot; extract it from a denser cloud")
-    found: list[tuple[Path, partial[None]]] = []
+    outputs: list[tuple[Path, partial[None]]] = []
     first = 0
     for s in range(count):
         grid = storey_occupancy(map, s)
@@ -43,17 +43,17 @@ def files(map: TopometricMap, folder: Path, stem: str, storey: int | None = None
         if storey not in (None, s):
             continue
         name = f"{stem}storey_{s}"
-        found.append((folder / f"{name}.pgm", partial(_save_image, grid)))
-        found.append((folder / f"{name}.yaml", partial(_save_yaml, grid, f"{name}.pgm")))
+        outputs.append((folder / f"{name}.pgm", partial(_save_image, grid)))
+        outputs.append((folder / f"{name}.yaml", partial(_save_yaml, grid, f"{name}.pgm")))
         if route.edges:
-            found.append((folder / f"{name}_route.geojson", partial(_save_route, route, name)))
-    return found
+            outputs.append((folder / f"{name}_route.geojson", partial(_save_route, route, name)))
+    return outputs
 
 
 def _save_image(grid: Occupancy, path: Path) -> None:
-    image = np.full(grid.free.shape, UNKNOWN, np.uint8)
-    image[grid.free] = FREE
-    image[grid.occupied] = OCCUPIED
+    image = np.full(grid.free.shape, UNKNOWN_PIXEL, np.uint8)
+    image[grid.free] = FREE_PIXEL
+    image[grid.occupied] = OCCUPIED_PIXEL
     image = np.ascontiguousarray(image.T[::-1])  # rows from the top, y up
     height, width = len(image), len(image[0])
     with replacing(path) as beside, beside.open("wb") as file:

@@ -18,8 +18,8 @@ from topomerge.io.exports.floors import is_flight
 from topomerge.io.exports.occupancy import Occupancy
 from topomerge.types import Array, TopometricMap
 
-NEAR = 0.6  # m around the middle of a door through which its ways may lead
-FAR = 2.0  # m: the end of a flight of stairs is looked for this far
+DOOR_REACH = 0.6  # m around the middle of a door through which its ways may lead
+FLIGHT_REACH = 2.0  # m: the end of a flight of stairs is looked for this far
 AWAY = 0.5  # m from walls at which ways are not dearer for being near
 Point = tuple[float, float]
 Pixel = tuple[int, int]
@@ -65,7 +65,7 @@ def storey_route(map: TopometricMap, grid: Occupancy, storey: int, first: int = 
     route = Route(first)
     clear = ndimage.distance_transform_edt(np.pad(grid.free, 1))[1:-1, 1:-1] * grid.size
     doors: dict[int, int] = {}
-    reach = int(np.ceil(FAR / grid.size))
+    reach = int(np.ceil(FLIGHT_REACH / grid.size))
     for r, box in enumerate(ndimage.find_objects(grid.room + 1)):
         if box is not None and map.rooms["storey"][r] == storey:
             wide = tuple(slice(max(side.start - reach, 0), side.stop + reach) for side in box)
@@ -88,7 +88,7 @@ def _add_room(route: Route, map: TopometricMap, grid: Occupancy, clear: Array, r
     mask = inside.copy()
     for _, edge in edges:
         if not is_flight(edge):
-            box, disc = _disc(grid, edge["centre"][:2], NEAR)
+            box, disc = _disc(grid, edge["centre"][:2], DOOR_REACH)
             mask[box] |= grid.free[box] & disc
     root = _middle(inside, clear)
     parent = _ways(mask, clear, grid.size, root)
@@ -103,10 +103,10 @@ def _add_room(route: Route, map: TopometricMap, grid: Occupancy, clear: Array, r
             continue
         if i not in doors or is_flight(edge):
             other = int(edge["rooms"][edge["rooms"] != r][0])
-            known = {"kind": str(edge["kind"]), "edge": i, "width": round(float(edge["width"]), 3), "open": bool(edge["open"])}
+            values = {"kind": str(edge["kind"]), "edge": i, "width": round(float(edge["width"]), 3), "open": bool(edge["open"])}
             if is_flight(edge):
-                known |= {"to_room": other, "to_storey": int(map.rooms["storey"][other])}
-            doors[i] = route.add(grid.centre(np.array(leaf)) if is_flight(edge) else point, **known)
+                values |= {"to_room": other, "to_storey": int(map.rooms["storey"][other])}
+            doors[i] = route.add(grid.centre(np.array(leaf)) if is_flight(edge) else point, **values)
         leaves[leaf] = doors[i] if leaf not in leaves else leaves[leaf]
         if leaves[leaf] != doors[i]:
             route.ways.append((leaves[leaf], doors[i]))
@@ -128,12 +128,12 @@ def _end(map: TopometricMap, edge: Any, r: int) -> tuple[Array, Array]:
 def _leaf(reached: Array, grid: Occupancy, point: Array, out: Array) -> Pixel | None:
     """The pixel from which one goes through a door, or onto a flight: straight on from its end, else beside it."""
     if not out.any():
-        return _nearest(reached, grid, point, NEAR)
-    ahead = point + np.arange(0.0, FAR, grid.size / 2)[:, None] * out
+        return _nearest(reached, grid, point, DOOR_REACH)
+    ahead = point + np.arange(0.0, FLIGHT_REACH, grid.size / 2)[:, None] * out
     at = np.floor((ahead - grid.low) / grid.size).astype(int)
     at = at[((at >= 0) & (at < reached.shape)).all(axis=1)]
     hits = at[reached[tuple(at.T)]]
-    return (int(hits[0, 0]), int(hits[0, 1])) if len(hits) else _nearest(reached, grid, point, FAR)
+    return (int(hits[0, 0]), int(hits[0, 1])) if len(hits) else _nearest(reached, grid, point, FLIGHT_REACH)
 
 
 def _middle(inside: Array, clear: Array) -> Pixel:
@@ -198,11 +198,11 @@ def _tree(
 
 
 def _add_chain(route: Route, grid: Occupancy, mask: Array, clear: Array, chain: list[Pixel], nodes: dict[Pixel, int]) -> None:
-    kept = _pulled(np.array(chain), mask, clear, 1.5 * grid.size)
-    for i in kept:
+    turns = _pulled(np.array(chain), mask, clear, 1.5 * grid.size)
+    for i in turns:
         if chain[i] not in nodes:
             nodes[chain[i]] = route.add(grid.centre(np.array(chain[i])), kind="way")
-    names = [nodes[chain[i]] for i in kept]
+    names = [nodes[chain[i]] for i in turns]
     route.ways += [(a, b) for a, b in pairwise(names) if a != b]
 
 
@@ -229,17 +229,17 @@ def _ways(mask: Array, clear: Array, size: float, root: Pixel) -> dict[Pixel, Pi
 
 def _pulled(chain: Array, mask: Array, clear: Array, give: float) -> list[int]:
     """Rows of a chain of pixels between which straight ways keep as much space (give or take, m) as the chain does, or AWAY."""
-    kept = [0]
+    turns = [0]
     ahead = [len(chain) - 1]
     while ahead:
-        i, j = kept[-1], ahead[-1]
+        i, j = turns[-1], ahead[-1]
         if j - i < 2 or _sees(chain[i : j + 1], mask, clear, give):
-            kept.append(ahead.pop())
+            turns.append(ahead.pop())
             continue
         along = chain[j] - chain[i]
         off = np.abs((chain[i + 1 : j] - chain[i]) @ (-along[1], along[0]))
         ahead.append(i + 1 + int(off.argmax()) if off.max() > 0 else (i + j) // 2)
-    return kept
+    return turns
 
 
 def _sees(chain: Array, mask: Array, clear: Array, give: float) -> bool:
