@@ -59,17 +59,20 @@ STRANGE = [
 
 @pytest.mark.parametrize("change", STRANGE)
 def test_a_strangers_listing(run: Run, folder: Path, change: dict[str, object]) -> None:
-    told = json.loads((folder / "house" / "atlas.json").read_text())
+    listing = json.loads((folder / "house" / "atlas.json").read_text())
     (folder / "strange").mkdir(exist_ok=True)
-    for changed in (told | change, {k: v for k, v in told.items() if k not in change}):
+    for changed in (listing | change, {k: v for k, v in listing.items() if k not in change}):
         (folder / "strange" / "atlas.json").write_text(json.dumps(changed))
         status, out, err = run("atlas", "list", "strange")
         assert status == 0 or (status == 1 and err.count("\n") == 1 and out == ""), err
         assert status == 0 or "damaged" in err or "of format" in err, err
 
 
-@pytest.mark.parametrize("found", [[], {"features": []}, {"yaw": 10**400}, {"translation": 3}, {"scale": 0}, {"probability": 7}])
-def test_strange_registrations_are_made_anew(run: Run, folder: Path, found: object) -> None:
+REGISTRATIONS = [[], {"features": []}, {"yaw": 10**400}, {"translation": 3}, {"scale": 0}, {"probability": 7}]
+
+
+@pytest.mark.parametrize("strange", REGISTRATIONS)
+def test_strange_registrations_are_made_anew(run: Run, folder: Path, strange: object) -> None:
     from topomerge.fusion.atlas.registration_cache import read_registrations
     from topomerge.fusion.atlas.store import read_atlas
 
@@ -79,12 +82,12 @@ def test_strange_registrations_are_made_anew(run: Run, folder: Path, found: obje
     def registrations() -> object:
         return read_registrations(folder / "house", read_atlas(folder / "house").settings)
 
-    told = json.loads(before)
-    assert len(registrations()) == len(told["pairs"]) > 0
+    stored = json.loads(before)
+    assert len(registrations()) == len(stored["pairs"]) > 0
     try:
-        good = next(p["hypotheses"][0] for p in told["pairs"] if p["hypotheses"])
-        told["pairs"][0]["hypotheses"] = [good | found if isinstance(found, dict) else found]
-        path.write_text(json.dumps(told))
+        good = next(p["hypotheses"][0] for p in stored["pairs"] if p["hypotheses"])
+        stored["pairs"][0]["hypotheses"] = [good | strange if isinstance(strange, dict) else strange]
+        path.write_text(json.dumps(stored))
         assert registrations() == {}
     finally:
         path.write_text(before)
@@ -101,13 +104,13 @@ def test_nothing_connected_is_status_two(run: Run, folder: Path) -> None:
 def test_three_maps_are_merged(run: Run, folder: Path) -> None:
     status, out, err = run("merge", "west.tmap", "east.tmap", "stranger.tmap", "-o", "merged")
     assert status == 0 and "west.tmap, east.tmap" in out and "stranger.tmap stands apart" in out and err == ""
-    told = json.loads((folder / "merged" / "merge.json").read_text())
-    assert told["status"] == "merged" and list(told["transforms"]) == ["1"] and len(told["maps"]) == 3
+    merge = json.loads((folder / "merged" / "merge.json").read_text())
+    assert merge["status"] == "merged" and list(merge["transforms"]) == ["1"] and len(merge["maps"]) == 3
     assert np.bitwise_or.reduce(topomerge.load_map(folder / "merged" / "map.tmap").provenance) == 0b11
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("add", "house"), "house: name the maps"),
         (("add", "new", "missing.ply"), "missing.ply: no such file"),
@@ -125,11 +128,11 @@ def test_three_maps_are_merged(run: Run, folder: Path) -> None:
         (("show", "house"), "invalid choice"),
     ],
 )
-def test_bad_input_is_told_in_one_line(run: Run, folder: Path, words: tuple[str, ...], told: str) -> None:
+def test_bad_input_is_told_in_one_line(run: Run, folder: Path, words: tuple[str, ...], message: str) -> None:
     (folder / "broken.tmap").write_bytes((folder / "west.tmap").read_bytes()[:-2000])
     (folder / "other").mkdir(exist_ok=True)
     (folder / "other" / "notes.txt").write_text("mine")
     before = (folder / "house" / "atlas.json").read_bytes()
     status, out, err = run("atlas", *words)
-    assert status == 1 and out == "" and told in err and len(err.splitlines()) == 1
+    assert status == 1 and out == "" and message in err and len(err.splitlines()) == 1
     assert not (folder / "new").exists() and (folder / "house" / "atlas.json").read_bytes() == before

@@ -53,13 +53,13 @@ def listing(folder: Path) -> Any:
 def test_a_cloud_and_a_map_are_merged(folder: Path) -> None:
     merged = folder / "merged"
     assert sorted(p.name for p in merged.iterdir()) == MERGE_FILES
-    found = listing(merged)
-    assert found["status"] == "merged" and found["probability"] >= 0.9
-    assert [Path(m["source"]).name for m in found["maps"]] == ["a.npy", "b.tmap"]
-    matrix = np.array(found["transforms"]["1"]["matrix"])
+    merge = listing(merged)
+    assert merge["status"] == "merged" and merge["probability"] >= 0.9
+    assert [Path(m["source"]).name for m in merge["maps"]] == ["a.npy", "b.tmap"]
+    matrix = np.array(merge["transforms"]["1"]["matrix"])
     middle = np.append(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0], 1.0)
     assert np.allclose((matrix @ middle)[:3], [10.0, 7.0, 1.0], atol=0.08)
-    assert found["seconds"]["read"] > 0 and found["seconds"]["extract"] > 0 and found["seconds"]["fuse"] > 0
+    assert merge["seconds"]["read"] > 0 and merge["seconds"]["extract"] > 0 and merge["seconds"]["fuse"] > 0
     assert (merged / "merged.ply").read_bytes()[:40].startswith(b"ply\nformat binary")
     assert topomerge.load_map(merged / "map.tmap").provenance is not None
 
@@ -68,9 +68,9 @@ def test_a_refusal_has_status_two(run: Run, folder: Path) -> None:
     status, out, err = run("b.tmap", "c.tmap", "-o", "no")
     assert status == 2 and "not merged: probability" in out and err == ""
     assert sorted(p.name for p in (folder / "no").iterdir()) == ["merge.json", "report.html"]
-    found = listing(folder / "no")
-    assert found["status"] == "abstained" and found["transforms"] == {} and found["matches"] == []
-    assert found["reason"] in out
+    merge = listing(folder / "no")
+    assert merge["status"] == "abstained" and merge["transforms"] == {} and merge["matches"] == []
+    assert merge["reason"] in out
     status, out, err = run("b.tmap", "c.tmap", "-o", "no", "--quiet")
     assert status == 2 and out == "" and "not merged" in err and len(err.splitlines()) == 1
 
@@ -79,12 +79,12 @@ def test_force_writes_all_and_keeps_the_status(run: Run, folder: Path) -> None:
     status, out, _ = run("b.tmap", "c.tmap", "-o", "forced", "--force")
     assert status == 2 and "force" in out
     assert sorted(p.name for p in (folder / "forced").iterdir()) == MERGE_FILES
-    found = listing(folder / "forced")
-    assert found["status"] == "abstained" and list(found["transforms"]) == ["1"]
+    merge = listing(folder / "forced")
+    assert merge["status"] == "abstained" and list(merge["transforms"]) == ["1"]
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("b.tmap", "b.tmap"), "b.tmap: is given twice"),
         (("b.tmap", "./merged/../b.tmap"), "is given twice"),
@@ -99,23 +99,23 @@ def test_force_writes_all_and_keeps_the_status(run: Run, folder: Path) -> None:
         (("b.tmap", "c.tmap", "--scale", "2"), "invalid choice"),
     ],
 )
-def test_bad_input_is_told_in_one_line(run: Run, folder: Path, words: tuple[str, ...], told: str) -> None:
+def test_bad_input_is_told_in_one_line(run: Run, folder: Path, words: tuple[str, ...], message: str) -> None:
     (folder / "copy.tmap").write_bytes((folder / "b.tmap").read_bytes())
     (folder / "broken.tmap").write_bytes((folder / "b.tmap").read_bytes()[:-2000])
     (folder / "text.ply").write_text("no points\n")
     np.save(folder / "mm.npy", np.load(folder / "a.npy") * 1000)
     status, out, err = run(*words, "-o", "new")
     assert status == 1 and out == ""
-    assert told in err and len(err.splitlines()) == 1
+    assert message in err and len(err.splitlines()) == 1
     assert not (folder / "new").exists()
 
 
 def test_bad_folders(run: Run, folder: Path) -> None:
     (folder / "file").write_text("")
-    for place, told in (("file", "is a file"), ("file/merged", "can't be made"), ("merged", "is the input")):
+    for place, message in (("file", "is a file"), ("file/merged", "can't be made"), ("merged", "is the input")):
         first = "merged/map.tmap" if place == "merged" else "b.tmap"
         status, _, err = run(first, "c.tmap", "-o", place)
-        assert status == 1 and told in err and len(err.splitlines()) == 1
+        assert status == 1 and message in err and len(err.splitlines()) == 1
     assert sorted(p.name for p in (folder / "merged").iterdir()) == MERGE_FILES
 
 

@@ -47,26 +47,26 @@ def test_what_cannot_be_simulated_leaves_no_folder(tmp_path: Path, capsys: Any) 
 
 def test_files(folder: Path) -> None:
     assert sorted(p.name for p in folder.iterdir()) == ["a.ply", "b.ply", "plan.png", "truth.json"]
-    known = truth(folder)
-    assert known["format"] == 1 and known["seed"] == 3 and known["kind"] == "overlap"
-    assert [m["sensor"] for m in known["maps"]] == ["tls", "depth"]
-    for entry in known["maps"]:
+    facts = truth(folder)
+    assert facts["format"] == 1 and facts["seed"] == 3 and facts["kind"] == "overlap"
+    assert [m["sensor"] for m in facts["maps"]] == ["tls", "depth"]
+    for entry in facts["maps"]:
         cloud = topomerge.read_points(folder / entry["file"])
         assert len(cloud) == entry["points"] > 1000
         assert (folder / entry["file"]).read_bytes()[:40].startswith(b"ply\nformat binary")
-    assert set(known["shared"]) == set(known["maps"][0]["visited"]) & set(known["maps"][1]["visited"])
+    assert set(facts["shared"]) == set(facts["maps"][0]["visited"]) & set(facts["maps"][1]["visited"])
 
 
 def test_the_transform_takes_b_to_a(folder: Path) -> None:
-    known = truth(folder)
-    matrix = np.array(known["T_ab"])
+    facts = truth(folder)
+    matrix = np.array(facts["T_ab"])
     assert not np.allclose(matrix, np.eye(4), atol=0.01)
-    assert np.isclose(np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0])), known["yaw_deg"])
-    for a, b in zip(*(m["rooms"] for m in known["maps"]), strict=True):
+    assert np.isclose(np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0])), facts["yaw_deg"])
+    for a, b in zip(*(m["rooms"] for m in facts["maps"]), strict=True):
         corners = np.column_stack([b["polygon"], np.full(len(b["polygon"]), b["floor"])])
         moved = corners @ matrix[:3, :3].T + matrix[:3, 3]
         assert np.allclose(moved[:, :2], a["polygon"], atol=0.01) and np.allclose(moved[:, 2], a["floor"], atol=0.01)
-    for a, b in zip(*(m["doors"] for m in known["maps"]), strict=True):
+    for a, b in zip(*(m["doors"] for m in facts["maps"]), strict=True):
         assert np.allclose(matrix[:3, :3] @ b["centre"] + matrix[:3, 3], a["centre"], atol=0.01)
 
 
@@ -95,19 +95,19 @@ def test_one_sensor_gives_one_cloud(tmp_path: Path) -> None:
 def test_hard_negatives_share_nothing(tmp_path: Path, hard: str) -> None:
     words = ["--building", "office", "--rooms", "4", "--sensors", "depth,depth", "--hard", hard, "-q", "-o", str(tmp_path)]
     assert cli(["simulate", *words]) == 0
-    known = truth(tmp_path)
-    assert known["kind"] == hard and known["shared"] == [] and known["seen_by_both"] == [] and known["overlap"] == 0
-    assert (known["T_ab"] is None) == (hard != "other-storey")
+    facts = truth(tmp_path)
+    assert facts["kind"] == hard and facts["shared"] == [] and facts["seen_by_both"] == [] and facts["overlap"] == 0
+    assert (facts["T_ab"] is None) == (hard != "other-storey")
 
 
 def test_free_scale(tmp_path: Path) -> None:
     words = ["simulate", *SMALL_BUILDING, "--sensors", "tls,mono", "--scale", "free", "-o", str(tmp_path)]
     assert cli(words) == 0
-    known = truth(tmp_path)
-    matrix = np.array(known["T_ab"])
-    assert np.isclose(matrix[2, 2], known["scale"]) and abs(known["scale"] - 1) > 0.01
-    a, b = (np.array(m["rooms"][0]["polygon"]) for m in known["maps"])
-    assert np.isclose(np.linalg.norm(a[1] - a[0]), known["scale"] * np.linalg.norm(b[1] - b[0]), atol=0.01)
+    facts = truth(tmp_path)
+    matrix = np.array(facts["T_ab"])
+    assert np.isclose(matrix[2, 2], facts["scale"]) and abs(facts["scale"] - 1) > 0.01
+    a, b = (np.array(m["rooms"][0]["polygon"]) for m in facts["maps"])
+    assert np.isclose(np.linalg.norm(a[1] - a[0]), facts["scale"] * np.linalg.norm(b[1] - b[0]), atol=0.01)
 
 
 @pytest.mark.parametrize(

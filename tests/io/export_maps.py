@@ -17,19 +17,19 @@ AT = (2.0, -3.0, 0.5)
 
 def rectangles(pairs: int = 1, storeys: int = 1, at: tuple[float, float, float] = AT) -> list[shapely.Polygon]:
     """The floors of `scenes_map.building`."""
-    found = [shapely.box(x0 * EDGE, y0 * EDGE, x1 * EDGE, y1 * EDGE) for x0, x1, y0, y1 in boxes(pairs)]
-    return [shapely.affinity.translate(r, at[0], at[1]) for r in found] * storeys
+    floors = [shapely.box(x0 * EDGE, y0 * EDGE, x1 * EDGE, y1 * EDGE) for x0, x1, y0, y1 in boxes(pairs)]
+    return [shapely.affinity.translate(r, at[0], at[1]) for r in floors] * storeys
 
 
 def two_floors(at: tuple[float, float, float] = AT) -> TopometricMap:
     """Two storeys of a corridor between two rooms, stairs between the corridors."""
-    found = building(1, 2, at)
-    edges = found.edges.copy()
+    joined = building(1, 2, at)
+    edges = joined.edges.copy()
     stairs = edges["kind"] == "stairs"
-    middle = found.rooms["centroid"][2]
+    middle = joined.rooms["centroid"][2]
     edges["lower"][stairs], edges["upper"][stairs] = middle + (-1.0, 0.0, -1.4), middle + (1.0, 0.0, 1.6)
     edges["centre"][stairs] = middle + (0.0, 0.0, 0.1)
-    return replace(found, edges=edges)
+    return replace(joined, edges=edges)
 
 
 def nothing() -> TopometricMap:
@@ -42,8 +42,8 @@ def nothing() -> TopometricMap:
 
 def without_doors() -> TopometricMap:
     """One storey whose rooms nothing joins."""
-    found = building(1)
-    return replace(found, edges=found.edges[:0])
+    rooms_only = building(1)
+    return replace(rooms_only, edges=rooms_only.edges[:0])
 
 
 def flat(plan: Array, area: float | None = None) -> TopometricMap:

@@ -96,7 +96,7 @@ def short(tag: str) -> str:
 def check(root: Any) -> None:
     """Fail where the document breaks the schema: order and number of children, ids, links, geometry."""
     assert short(root.tag) == "core:IndoorFeatures"
-    known: dict[str, str] = {}
+    kind_of_id: dict[str, str] = {}
     for element in root.iter():
         name = short(element.tag)
         assert name in ORDER, f"{name} is no element of the core"
@@ -106,22 +106,22 @@ def check(root: Any) -> None:
         id = element.get(GML + "id")
         assert (id is not None) == (name.split(":")[1] in NAMED), f"{name}: id {id}"
         if id is not None:
-            assert re.fullmatch(r"[A-Za-z_][\w.-]*", id) and id not in known, f"id {id}"
-            known[id] = name.split(":")[1]
-    _check_links(root, known)
+            assert re.fullmatch(r"[A-Za-z_][\w.-]*", id) and id not in kind_of_id, f"id {id}"
+            kind_of_id[id] = name.split(":")[1]
+    _check_links(root, kind_of_id)
     for ring in root.iter(GML + "LinearRing"):
         points = positions(ring)
         assert (points[0] == points[-1]).all() and points.shape[1] == 3, "a ring must close"
 
 
-def _check_links(root: Any, known: dict[str, str]) -> None:
+def _check_links(root: Any, kind_of_id: dict[str, str]) -> None:
     for element in root.iter():
         for child in element:
             link = child.get(LINK + "href")
             kind = LINKS.get((short(element.tag).split(":")[1], short(child.tag).split(":")[1]))
             assert (link is None) == (kind is None), f"{element.tag} {child.tag} {link}"
             if link is not None:
-                assert link.startswith("#") and known.get(link[1:]) == kind, f"{link} is no {kind}"
+                assert link.startswith("#") and kind_of_id.get(link[1:]) == kind, f"{link} is no {kind}"
 
 
 def positions(element: Any) -> np.ndarray:

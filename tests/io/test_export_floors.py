@@ -26,30 +26,30 @@ def corners(floor: shapely.MultiPolygon) -> int:
 
 @pytest.mark.parametrize("at", [AT, GRID])
 def test_rooms_are_their_rectangles(at):
-    found = floor_polygons(building(2, 2, at))
-    for floor, known in zip(found, rectangles(2, 2, at), strict=True):
-        assert overlap(floor, known) > 0.98 and floor.is_valid
-    assert all(corners(floor) == 4 for floor in found[:4])
-    assert all(floor.geoms[0].exterior.is_ccw for floor in found)
+    floors = floor_polygons(building(2, 2, at))
+    for floor, rectangle in zip(floors, rectangles(2, 2, at), strict=True):
+        assert overlap(floor, rectangle) > 0.98 and floor.is_valid
+    assert all(corners(floor) == 4 for floor in floors[:4])
+    assert all(floor.geoms[0].exterior.is_ccw for floor in floors)
 
 
 def test_rooms_of_a_storey_do_not_overlap():
-    found = floor_polygons(building(3))
-    assert sum(f.area for f in found) == pytest.approx(shapely.union_all(found).area, rel=1e-9)
+    floors = floor_polygons(building(3))
+    assert sum(f.area for f in floors) == pytest.approx(shapely.union_all(floors).area, rel=1e-9)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 4, 1.2])
 def test_walls_are_straight_however_the_building_stands(turn):
     c, s = np.cos(turn), np.sin(turn)
     points = two_rooms().points() @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    found = topomerge.extract(points.astype(np.float32))
-    floors = floor_polygons(found)
+    topomap = topomerge.extract(points.astype(np.float32))
+    floors = floor_polygons(topomap)
     assert len(floors) == 2
-    for known in (shapely.box(0.0, 0.05, 3.95, 5.0), shapely.box(4.05, 0.0, 7.0, 5.0)):
-        known = shapely.affinity.rotate(known, np.degrees(turn), origin=(0, 0))
-        best = max(floors, key=lambda floor: overlap(floor, known))
-        assert overlap(best, known) > 0.95 and corners(best) <= 9
-        assert best.hausdorff_distance(known) < 0.35
+    for rectangle in (shapely.box(0.0, 0.05, 3.95, 5.0), shapely.box(4.05, 0.0, 7.0, 5.0)):
+        rectangle = shapely.affinity.rotate(rectangle, np.degrees(turn), origin=(0, 0))
+        best = max(floors, key=lambda floor: overlap(floor, rectangle))
+        assert overlap(best, rectangle) > 0.95 and corners(best) <= 9
+        assert best.hausdorff_distance(rectangle) < 0.35
 
 
 def test_the_area_is_that_of_the_table():
@@ -73,11 +73,11 @@ def test_a_floor_in_two_pieces_and_none_at_all():
     plan[:20], plan[40:] = True, True
     (floor,) = floor_polygons(flat(plan))
     assert len(floor.geoms) == 2 and floor.area == pytest.approx(12.0)
-    found = building(1)
-    others = found.navigable_room != 1
-    walked = {"navigable": found.navigable.subset(others), "navigable_room": found.navigable_room[others]}
-    bare = replace(found, **walked, navigable_area=None)
-    low, high = found.rooms["lo"][1], found.rooms["hi"][1]
+    topomap = building(1)
+    others = topomap.navigable_room != 1
+    walked = {"navigable": topomap.navigable.subset(others), "navigable_room": topomap.navigable_room[others]}
+    bare = replace(topomap, **walked, navigable_area=None)
+    low, high = topomap.rooms["lo"][1], topomap.rooms["hi"][1]
     assert floor_polygons(bare)[1].bounds == pytest.approx((*low[:2], *high[:2]))
     assert floor_polygons(nothing()) == []
 
@@ -92,14 +92,14 @@ def test_ragged_floors_are_valid():
 
 
 def test_levels():
-    found = building(1, 2)
-    levels, seen = room_levels(found)
+    topomap = building(1, 2)
+    levels, seen = room_levels(topomap)
     assert levels[:, 0] == pytest.approx([0.65] * 3 + [3.65] * 3)  # the middle of the lowest cells that one walks on
-    assert levels[:, 1] - levels[:, 0] == pytest.approx(found.rooms["height"]) and seen.all()
-    rooms = found.rooms.copy()
+    assert levels[:, 1] - levels[:, 0] == pytest.approx(topomap.rooms["height"]) and seen.all()
+    rooms = topomap.rooms.copy()
     rooms["height"] = 0
-    levels, seen = room_levels(replace(found, rooms=rooms))
-    assert levels[0, 1] == pytest.approx(found.storeys["ceiling"][0]) and not seen.any()
+    levels, seen = room_levels(replace(topomap, rooms=rooms))
+    assert levels[0, 1] == pytest.approx(topomap.storeys["ceiling"][0]) and not seen.any()
     assert levels[3, 1] - levels[3, 0] == pytest.approx(2.5)  # nor was a ceiling of the storey seen
     assert room_levels(nothing())[0].shape == (0, 2)
 

@@ -111,8 +111,8 @@ def test_ifc_holds_storeys_spaces_and_doors(tmp_path, at):
         assert element.get_psets(space)["Qto_SpaceBaseQuantities"]["GrossFloorArea"] == pytest.approx(room["area"])
         assert element.get_psets(space)["Topomerge_Room"]["Glimpsed"] == room["glimpsed"]
     doors = model.by_type("IfcDoor")
-    known = map.edges[map.edges["kind"] == "door"]
-    for door, edge in zip(doors, known, strict=True):
+    door_edges = map.edges[map.edges["kind"] == "door"]
+    for door, edge in zip(doors, door_edges, strict=True):
         assert (door.OverallWidth, door.OverallHeight) == pytest.approx((1.0, 2.0))
         matrix = placement.get_local_placement(door.ObjectPlacement)
         assert (matrix @ (0.5, 0, 0, 1))[:3] == pytest.approx(edge["centre"])
@@ -148,9 +148,9 @@ def test_our_own_reader_finds_the_rooms_of_an_ifc(tmp_path, at):
     map = two_floors(at)
     cloud = topomerge.read_points(write(map, "ifc", tmp_path / "a.ifc"))
     assert [r.name for r in cloud.rooms] == [f"room {r}" for r in range(6)]
-    for room, known in zip(cloud.rooms, rectangles(1, 2, at), strict=True):
+    for room, rectangle in zip(cloud.rooms, rectangles(1, 2, at), strict=True):
         floor = shapely.Polygon(room.polygon)
-        assert floor.intersection(known).area > 0.98 * floor.union(known).area
+        assert floor.intersection(rectangle).area > 0.98 * floor.union(rectangle).area
     assert [r.storey for r in cloud.rooms] == [0, 0, 0, 1, 1, 1]
     low, high = map.grid.bounds
     points = cloud.points + cloud.shift

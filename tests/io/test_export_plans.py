@@ -33,16 +33,16 @@ def geojson(map: TopometricMap, folder: Path, **options) -> dict:
 
 
 def test_floors_doors_and_stairs(tmp_path):
-    found = geojson(two_floors(), tmp_path)
-    assert found["type"] == "FeatureCollection" and found["crs"] is None and "metres" in found["topomerge"]["coordinates"]
-    rooms = [f for f in found["features"] if f["properties"]["kind"] == "room"]
-    for feature, known in zip(rooms, rectangles(1, 2), strict=True):
+    plan = geojson(two_floors(), tmp_path)
+    assert plan["type"] == "FeatureCollection" and plan["crs"] is None and "metres" in plan["topomerge"]["coordinates"]
+    rooms = [f for f in plan["features"] if f["properties"]["kind"] == "room"]
+    for feature, rectangle in zip(rooms, rectangles(1, 2), strict=True):
         floor = shapely.geometry.shape(feature["geometry"])
-        assert floor.intersection(known).area > 0.98 * floor.union(known).area
+        assert floor.intersection(rectangle).area > 0.98 * floor.union(rectangle).area
         assert floor.exterior.is_ccw and floor.exterior.has_z
-        assert feature["properties"]["area"] == pytest.approx(known.area) and feature["properties"]["height"] == 2.9
+        assert feature["properties"]["area"] == pytest.approx(rectangle.area) and feature["properties"]["height"] == 2.9
     assert [f["properties"]["storey"] for f in rooms] == [0, 0, 0, 1, 1, 1]
-    ways = [f for f in found["features"] if f["properties"]["kind"] != "room"]
+    ways = [f for f in plan["features"] if f["properties"]["kind"] != "room"]
     assert [f["properties"]["kind"] for f in ways] == ["door", "door", "door", "door", "stairs"]
     door = np.array(ways[0]["geometry"]["coordinates"])
     assert np.linalg.norm(door[1] - door[0]) == pytest.approx(1.0)
@@ -53,9 +53,9 @@ def test_floors_doors_and_stairs(tmp_path):
 
 
 def test_one_storey(tmp_path):
-    found = geojson(two_floors(), tmp_path, storey=1)
-    assert [f["properties"]["storey"] for f in found["features"] if f["properties"]["kind"] == "room"] == [1, 1, 1]
-    assert sorted(f["properties"]["kind"] for f in found["features"] if f["properties"]["kind"] != "room") == [
+    plan = geojson(two_floors(), tmp_path, storey=1)
+    assert [f["properties"]["storey"] for f in plan["features"] if f["properties"]["kind"] == "room"] == [1, 1, 1]
+    assert sorted(f["properties"]["kind"] for f in plan["features"] if f["properties"]["kind"] != "room") == [
         "door",
         "door",
         "stairs",
@@ -77,11 +77,15 @@ def radii(latitude: float) -> tuple[float, float]:
 @pytest.mark.parametrize(("latitude", "heading"), [(0.0, 0.0), (52.52, 0.0), (-33.9, 90.0), (64.1, 237.0)])
 def test_longitude_and_latitude(tmp_path, latitude, heading):
     plain = geojson(building(1), tmp_path)["features"]
-    found = geojson(building(1), tmp_path, origin=Origin(latitude, 13.37, heading))
-    assert "crs" not in found and found["topomerge"]["origin"] == {"latitude": latitude, "longitude": 13.37, "heading": heading}
+    plan = geojson(building(1), tmp_path, origin=Origin(latitude, 13.37, heading))
+    assert "crs" not in plan and plan["topomerge"]["origin"] == {
+        "latitude": latitude,
+        "longitude": 13.37,
+        "heading": heading,
+    }
     north, east = radii(latitude)
     turn = np.radians(heading)
-    for a, b in zip(plain, found["features"], strict=True):
+    for a, b in zip(plain, plan["features"], strict=True):
         metres, degrees = (shapely.get_coordinates(shapely.geometry.shape(f["geometry"])) for f in (a, b))
         wanted_east = metres[:, 0] * np.cos(turn) + metres[:, 1] * np.sin(turn)
         wanted_north = -metres[:, 0] * np.sin(turn) + metres[:, 1] * np.cos(turn)
@@ -106,9 +110,9 @@ def test_origins():
 
 
 def test_a_national_grid_keeps_its_digits(tmp_path):
-    found = geojson(building(1, 1, GRID), tmp_path)
-    for feature, known in zip(found["features"], rectangles(1, 1, GRID), strict=False):
-        assert shapely.geometry.shape(feature["geometry"]).bounds == pytest.approx(known.bounds, abs=0.11)
+    plan = geojson(building(1, 1, GRID), tmp_path)
+    for feature, rectangle in zip(plan["features"], rectangles(1, 1, GRID), strict=False):
+        assert shapely.geometry.shape(feature["geometry"]).bounds == pytest.approx(rectangle.bounds, abs=0.11)
     assert geojson(building(1, 1, GRID), tmp_path)["features"][0]["geometry"]["coordinates"][0][0][0] > 432000
 
 
@@ -126,20 +130,20 @@ GRAPHML = "{http://graphml.graphdrawing.org/xmlns}"
 
 
 def with_areas() -> TopometricMap:
-    found = two_floors()
+    topomap = two_floors()
     areas = np.zeros(7, AREA_DTYPE)
     areas["room"], areas["area"] = [0, 1, 2, 3, 4, 5, 5], 3.0
-    narrow = found.edges[:1].copy()
+    narrow = topomap.edges[:1].copy()
     narrow["rooms"], narrow["kind"] = (5, 6), "opening"
-    return replace(found, areas=areas, narrows=narrow)
+    return replace(topomap, areas=areas, narrows=narrow)
 
 
 def test_graphml(tmp_path):
-    found = with_areas()
-    root = xml.parse(write(found, "graphml", tmp_path / "a.graphml")).getroot()
+    topomap = with_areas()
+    root = xml.parse(write(topomap, "graphml", tmp_path / "a.graphml")).getroot()
     keys = {k.get("id"): (k.get("for"), k.get("attr.name"), k.get("attr.type")) for k in root.iter(f"{GRAPHML}key")}
     nodes = {n.get("id"): {keys[d.get("key")][1]: d.text for d in n} for n in root.iter(f"{GRAPHML}node")}
-    assert len(nodes) == 2 + 6 + 7 and nodes["r4"]["kind"] == "room" and float(nodes["r4"]["area"]) == found.rooms["area"][4]
+    assert len(nodes) == 2 + 6 + 7 and nodes["r4"]["kind"] == "room" and float(nodes["r4"]["area"]) == topomap.rooms["area"][4]
     assert "ceiling" in nodes["s0"] and "ceiling" not in nodes["s1"], "what was not seen is left out"
     edges = [(e.get("source"), e.get("target"), {keys[d.get("key")][1]: d.text for d in e}) for e in root.iter(f"{GRAPHML}edge")]
     assert all(a in nodes and b in nodes for a, b, _ in edges)
@@ -169,9 +173,9 @@ def test_clouds_read_back(tmp_path, suffix, at):
         pytest.importorskip("laspy")
     map = building(1, 1, at)
     path = write(map, suffix.replace("laz", "las"), tmp_path / f"a.{suffix}")
-    found = read_points(path)
-    assert found.points + found.shift == pytest.approx(map.grid.centroids(), abs=0.0011)
-    assert found.colors is not None and len(np.unique(found.colors[map.room == 1], axis=0)) == 1
+    cloud = read_points(path)
+    assert cloud.points + cloud.shift == pytest.approx(map.grid.centroids(), abs=0.0011)
+    assert cloud.colors is not None and len(np.unique(cloud.colors[map.room == 1], axis=0)) == 1
 
 
 def test_rooms_in_las(tmp_path):

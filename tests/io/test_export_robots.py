@@ -53,8 +53,8 @@ def test_walls_stand_where_they_were(tmp_path, at):
     height = map.grid.centroids()[:, 2] - map.storeys["floor"][0]
     walls = map.grid.centroids()[(height > 0.5) & (height < 1.5)][:, :2]
     read = np.unique(np.round(points[points[:, 2] > 0.5][:, :2], 2), axis=0)
-    known = np.unique(np.round(walls, 2), axis=0)
-    assert {tuple(p) for p in read.tolist()} == {tuple(p) for p in known.tolist()}
+    expected = np.unique(np.round(walls, 2), axis=0)
+    assert {tuple(p) for p in read.tolist()} == {tuple(p) for p in expected.tolist()}
     grid = Grid(files["storey_0.yaml"])
     assert (grid.at(map.navigable.centroids()[:, :2]) == 254).all(), "all of the floor is free"
     assert (grid.image == 205).any(), "what nobody saw is unknown"
@@ -100,8 +100,8 @@ def free_ways(path: Path, grid: Grid) -> bool:
 
 
 def kinds(nodes: dict[int, dict]) -> dict[str, int]:
-    found = [node["properties"]["metadata"]["kind"] for node in nodes.values()]
-    return {kind: found.count(kind) for kind in set(found) - {"way"}}
+    kinds_of_nodes = [node["properties"]["metadata"]["kind"] for node in nodes.values()]
+    return {kind: kinds_of_nodes.count(kind) for kind in set(kinds_of_nodes) - {"way"}}
 
 
 def joined(nodes: dict[int, dict], edges: list[dict]) -> bool:

@@ -96,7 +96,7 @@ def test_flipped_bytes(tmp_path: Path) -> None:
     save_map(small, tmp_path / "small.tmap")
     content = (tmp_path / "small.tmap").read_bytes()
     random = np.random.default_rng(2)
-    told = 0
+    refusals = 0
     for _ in range(400):
         # Half of the flips hit the directory at the end, where a zip keeps its sizes and offsets.
         span = (0, len(content)) if random.random() < 0.5 else (len(content) - 1200, len(content))
@@ -107,8 +107,8 @@ def test_flipped_bytes(tmp_path: Path) -> None:
         try:
             assert same(load_map(tmp_path / "bad.tmap"), small)
         except InputError:
-            told += 1
-    assert told > 200
+            refusals += 1
+    assert refusals > 200
 
 
 def rewritten(saved: Path, path: Path, **changes: Array | None) -> Path:

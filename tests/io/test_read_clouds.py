@@ -133,23 +133,23 @@ def test_npz_keeps_all_that_a_cloud_has(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["ascii.ply", "little.ply", "binary.pcd", "table.xyz", "array.npy", "cloud.laz", "cloud.e57"])
 @pytest.mark.parametrize("chunk", [7, 100, 600, 10_000])
 def test_chunks_join_to_the_whole(samples: dict[str, Path], name: str, chunk: int) -> None:
-    whole = read_points(samples[name])
+    cloud = read_points(samples[name])
     chunks = list(read_chunks(samples[name], chunk=chunk))
     assert all(len(c) == chunk for c in chunks[:-1])
-    np.testing.assert_array_equal(np.concatenate([c.points for c in chunks]), whole.points)
-    assert all(np.array_equal(c.shift, whole.shift) for c in chunks)
-    if whole.colors is not None:
-        np.testing.assert_array_equal(np.concatenate([c.colors for c in chunks if c.colors is not None]), whole.colors)
-    if whole.pose_of is not None:
-        np.testing.assert_array_equal(np.concatenate([c.pose_of for c in chunks if c.pose_of is not None]), whole.pose_of)
-        assert all(np.array_equal(c.poses, whole.poses) for c in chunks)
+    np.testing.assert_array_equal(np.concatenate([c.points for c in chunks]), cloud.points)
+    assert all(np.array_equal(c.shift, cloud.shift) for c in chunks)
+    if cloud.colors is not None:
+        np.testing.assert_array_equal(np.concatenate([c.colors for c in chunks if c.colors is not None]), cloud.colors)
+    if cloud.pose_of is not None:
+        np.testing.assert_array_equal(np.concatenate([c.pose_of for c in chunks if c.pose_of is not None]), cloud.pose_of)
+        assert all(np.array_equal(c.poses, cloud.poses) for c in chunks)
 
 
 @pytest.mark.parametrize(
     "name", [*COLORED, "cloud.laz", "cloud.e57", "table.xyz", "array.npy", "tree.bt", "mesh.obj", "plan.yaml"]
 )
 def test_blocks_join_to_the_whole(samples: dict[str, Path], name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = read_points(samples[name])
+    cloud = read_points(samples[name])
     from topomerge.io import arrays, e57, grid, las, mesh, octomap, pcd, ply, text
 
     for module in (arrays, e57, grid, las, mesh, octomap, pcd, ply):
@@ -158,11 +158,11 @@ def test_blocks_join_to_the_whole(samples: dict[str, Path], name: str, monkeypat
     monkeypatch.setattr(e57, "read", e57.read_in_process)  # its process would not know of the smaller blocks
     parts = read_points(samples[name])
     if name == "mesh.obj":  # smaller blocks cut its large triangles, and each part has a lattice of its own
-        assert len(parts) == pytest.approx(len(whole), rel=0.05)
+        assert len(parts) == pytest.approx(len(cloud), rel=0.05)
         return
-    np.testing.assert_array_equal(parts.points, whole.points)
+    np.testing.assert_array_equal(parts.points, cloud.points)
     for values in ("colors", "pose_of"):
-        np.testing.assert_array_equal(getattr(parts, values), getattr(whole, values))
+        np.testing.assert_array_equal(getattr(parts, values), getattr(cloud, values))
 
 
 def test_e57_range_and_angles() -> None:

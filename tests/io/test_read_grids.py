@@ -158,16 +158,16 @@ def leaves_by_hand(data: bytes, keys: tuple[int, int, int], depth: int, at: list
     """(x, y, z, depth, state) of each leaf: the slow and obvious twin of the compiled walk."""
     bits = data[at[0]] + 256 * data[at[0] + 1]
     at[0] += 2
-    found = []
+    leaves = []
     for child in range(8):
         state = bits // 4**child % 4
         side = 2 ** (15 - depth)
         corner = (keys[0] + child % 2 * side, keys[1] + child // 2 % 2 * side, keys[2] + child // 4 * side)
         if state == 3:
-            found += leaves_by_hand(data, corner, depth + 1, at)
+            leaves += leaves_by_hand(data, corner, depth + 1, at)
         elif state:
-            found.append((*corner, depth + 1, state))
-    return found
+            leaves.append((*corner, depth + 1, state))
+    return leaves
 
 
 def test_the_compiled_walk_equals_its_twin() -> None:
@@ -185,8 +185,8 @@ def test_the_compiled_walk_equals_its_twin() -> None:
 
     data = tree(0)
     keys, depths, states = octree_leaves(np.frombuffer(data, np.uint8)) or ([], [], [])
-    found = sorted((*k, d, s) for k, d, s in zip(np.asarray(keys).tolist(), depths, states, strict=True))
-    assert found == sorted(leaves_by_hand(data, (0, 0, 0), 0, [0]))
+    leaves = sorted((*k, d, s) for k, d, s in zip(np.asarray(keys).tolist(), depths, states, strict=True))
+    assert leaves == sorted(leaves_by_hand(data, (0, 0, 0), 0, [0]))
 
 
 def test_a_small_octomap(tmp_path: Path) -> None:

@@ -18,18 +18,18 @@ ANYWHERE = st.integers(-40, 60)
 @given(grids(), st.lists(st.tuples(ANYWHERE, ANYWHERE, ANYWHERE), max_size=30))
 def test_rows_inside_and_outside(grid, queries):
     queries += [tuple(c) for c in grid.cells[:10].tolist()]
-    known = row_of(grid)
+    row_of_cell = row_of(grid)
     cells = np.array(queries, np.int64).reshape(-1, 3)
-    assert grid.rows(cells).tolist() == [known.get(q, -1) for q in queries]
+    assert grid.rows(cells).tolist() == [row_of_cell.get(q, -1) for q in queries]
     assert np.array_equal(grid.contains(cells), grid.rows(cells) >= 0)
 
 
 def test_rows_of_all_cells_of_a_volume():
     grid = random_grid()
     assert np.array_equal(grid.rows(grid.cells), np.arange(len(grid)))
-    every = np.argwhere(np.ones(np.add(grid.shape, 16), bool)) - 8  # beyond every face, also inside the last bricks
-    found = grid.rows(every)
-    assert np.array_equal(every[found >= 0][np.argsort(found[found >= 0])], grid.cells)
+    cells = np.argwhere(np.ones(np.add(grid.shape, 16), bool)) - 8  # beyond every face, also inside the last bricks
+    rows = grid.rows(cells)
+    assert np.array_equal(cells[rows >= 0][np.argsort(rows[rows >= 0])], grid.cells)
 
 
 @pytest.mark.parametrize("far", [-(2**40), 2**40, 2**62])

@@ -32,8 +32,8 @@ def test_profiles_are_the_bits_of_the_column() -> None:
             assert int(out[x, y]) == expected
     flat = out.ravel()
     for begin in (0, 7, 30):
-        found = lowest_bit(flat, begin)
-        for word, bit in zip(flat.tolist(), found.tolist(), strict=True):
+        bits_from = lowest_bit(flat, begin)
+        for word, bit in zip(flat.tolist(), bits_from.tolist(), strict=True):
             above = [b for b in range(begin, 64) if word >> b & 1]
             assert bit == (above[0] if above else -1)
 

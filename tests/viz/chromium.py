@@ -55,14 +55,14 @@ class Page:
             self.close()
             raise
 
-    async def _connected(self, told: Path) -> Any:
+    async def _connected(self, port_file: Path) -> Any:
         from tornado.websocket import websocket_connect
 
         end = time.monotonic() + 60
-        while not told.exists() or "\n" not in told.read_text():
+        while not port_file.exists() or "\n" not in port_file.read_text():
             assert time.monotonic() < end, "the browser does not start"
             await asyncio.sleep(0.1)
-        port = told.read_text().split("\n")[0]
+        port = port_file.read_text().split("\n")[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=60) as answer:
             (tab,) = (one for one in json.load(answer) if one["type"] == "page")
         return await websocket_connect(tab["webSocketDebuggerUrl"], max_message_size=1 << 28)
@@ -75,26 +75,26 @@ class Page:
     async def _answer(self, method: str, words: dict[str, Any]) -> dict[str, Any]:
         await self.socket.write_message(json.dumps({"id": self.number, "method": method, "params": words}))
         while True:
-            told = json.loads(await self.socket.read_message())
-            self._note(told)
-            if told.get("id") == self.number:
-                assert "error" not in told, f"{method}: {told['error']}"
-                return dict(told["result"])
+            message = json.loads(await self.socket.read_message())
+            self._note(message)
+            if message.get("id") == self.number:
+                assert "error" not in message, f"{method}: {message['error']}"
+                return dict(message["result"])
 
-    def _note(self, told: dict[str, Any]) -> None:
-        words = told.get("params", {})
-        if told.get("method") == "Runtime.consoleAPICalled" and words["type"] in ("error", "warning"):
+    def _note(self, message: dict[str, Any]) -> None:
+        words = message.get("params", {})
+        if message.get("method") == "Runtime.consoleAPICalled" and words["type"] in ("error", "warning"):
             self.console.append(" ".join(str(a.get("value")) for a in words["args"]))
-        elif told.get("method") == "Runtime.exceptionThrown":
+        elif message.get("method") == "Runtime.exceptionThrown":
             self.console.append(str(words["exceptionDetails"]))
-        elif told.get("method") == "Log.entryAdded" and words["entry"]["level"] in ("error", "warning"):
+        elif message.get("method") == "Log.entryAdded" and words["entry"]["level"] in ("error", "warning"):
             self.console.append(words["entry"]["text"])
 
     def run(self, script: str) -> Any:
         """The value of an expression, or what it promises."""
-        told = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
-        assert "exceptionDetails" not in told, told["exceptionDetails"]
-        return told["result"].get("value")
+        reply = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in reply, reply["exceptionDetails"]
+        return reply["result"].get("value")
 
     def wait(self, condition: str, seconds: float = 60.0) -> None:
         """Until an expression is true."""
@@ -110,13 +110,13 @@ class Page:
     def picture(self, path: Path) -> None:
         """The whole page as PNG."""
         size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-        told = self.call("Page.captureScreenshot", captureBeyondViewport=True, clip={**size, "scale": 1})
-        path.write_bytes(base64.b64decode(told["data"]))
+        reply = self.call("Page.captureScreenshot", captureBeyondViewport=True, clip={**size, "scale": 1})
+        path.write_bytes(base64.b64decode(reply["data"]))
 
     def printed(self, path: Path) -> None:
         """The page as PDF, on A4."""
-        told = self.call("Page.printToPDF", printBackground=False, paperWidth=8.27, paperHeight=11.69)
-        path.write_bytes(base64.b64decode(told["data"]))
+        reply = self.call("Page.printToPDF", printBackground=False, paperWidth=8.27, paperHeight=11.69)
+        path.write_bytes(base64.b64decode(reply["data"]))
 
     def close(self) -> None:
         """End the browser."""

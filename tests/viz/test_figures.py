@@ -49,9 +49,9 @@ def test_every_room_has_its_number_inside_it() -> None:
     scene = building(3, 2)
     frame = frame_of(scene)
     for storey, plan in enumerate(storey_plans(scene, frame)):
-        found = places(plan, frame)
-        assert sorted(found) == np.flatnonzero(scene.rooms["storey"] == storey).tolist()
-        for room, place in found.items():
+        place_of_room = places(plan, frame)
+        assert sorted(place_of_room) == np.flatnonzero(scene.rooms["storey"] == storey).tolist()
+        for room, place in place_of_room.items():
             i, j = ((np.array([place.x, place.y]) - frame.low) / frame.size).astype(int)
             assert plan.room[i, j] == room and not plan.wall[i, j]
     texts = [text.get_text() for ax in plan_figure(scene).axes for text in ax.texts]

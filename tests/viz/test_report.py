@@ -36,13 +36,13 @@ class Page(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
         self.open: list[str] = []
         self.feed(text)
         assert not self.open, self.open
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attrs)))
+        self.elements.append((tag, dict(attrs)))
         if tag not in ("meta", "input", "br"):
             self.open.append(tag)
 
@@ -50,14 +50,14 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
     def all(self, tag: str, name: str | None = None) -> list[dict[str, str | None]]:
-        found = [about for t, about in self.found if t == tag]
-        return [a for a in found if name is None or name in (a.get("class") or "").split()]
+        of_tag = [about for t, about in self.elements if t == tag]
+        return [a for a in of_tag if name is None or name in (a.get("class") or "").split()]
 
 
 def data_of(text: str) -> dict:
-    found = re.search(r'<script type="application/json" id="scene-data">(.*?)</script>', text, re.S)
-    assert found
-    return json.loads(found[1])
+    match = re.search(r'<script type="application/json" id="scene-data">(.*?)</script>', text, re.S)
+    assert match
+    return json.loads(match[1])
 
 
 def decoded(data: dict) -> np.ndarray:
@@ -94,7 +94,7 @@ def test_every_room_and_door_is_in_plan_and_table() -> None:
 def test_one_file_without_a_network() -> None:
     text = report_html(building(1, 1))
     page = Page(text)
-    for _, about in page.found:
+    for _, about in page.elements:
         assert not {"src", "srcset", "action", "data", "ping"} & set(about)
         assert (about.get("href") or "#") == "#"
         assert not [name for name in about if name.startswith("on")]
@@ -106,16 +106,16 @@ def test_one_file_without_a_network() -> None:
 def test_names_stay_text() -> None:
     map = building(1, 1)
     odd = replace(map, source=f"/tmp/{EVIL}", warnings=(EVIL, "\udcff\x00"), parameters={EVIL: EVIL}, seconds={EVIL: 1.0})
-    plain, found = Page(report_html(map)), Page(report_html(odd))
-    assert not found.all("img")
-    assert len(found.all("script")) == len(plain.all("script")) == 2
+    plain, escaped = Page(report_html(map)), Page(report_html(odd))
+    assert not escaped.all("img")
+    assert len(escaped.all("script")) == len(plain.all("script")) == 2
     assert report_html(odd).count("{{script}}") >= 4  # told as it is, not filled in
     assert data_of(report_html(odd)) == data_of(report_html(map))
 
 
 def test_markup_escapes() -> None:
-    made = element("a", "<b>", element("i", "x&y"), class_="k", data_x='"<', title=None, hidden=True)
-    assert made == '<a class="k" data-x="&quot;&lt;" hidden>&lt;b&gt;<i>x&amp;y</i></a>'
+    link = element("a", "<b>", element("i", "x&y"), class_="k", data_x='"<', title=None, hidden=True)
+    assert link == '<a class="k" data-x="&quot;&lt;" hidden>&lt;b&gt;<i>x&amp;y</i></a>'
     assert join(["<", element("b")], "&") == "&lt;&<b></b>"  # what stands between is the program's own
     data = json_data({"a": "</script><!--&\u2028"}, "x")
     assert "</script>" not in data[:-9] and "<!--" not in data and "\u2028" not in data
@@ -139,10 +139,10 @@ def test_size() -> None:
 
 def test_cells_come_back() -> None:
     map = building(1, 2)
-    found = decoded(scene_data(map))
+    drawn = decoded(scene_data(map))
     cells = map.grid.cells - map.grid.cells.min(axis=0)
     want = np.column_stack([cells, map.storey_of_cells(), map.room])
-    assert sorted(map_rows(found[:, :5])) == sorted(map_rows(want))
+    assert sorted(map_rows(drawn[:, :5])) == sorted(map_rows(want))
 
 
 def map_rows(rows: np.ndarray) -> list[tuple[int, ...]]:
@@ -153,10 +153,10 @@ def test_many_cells_are_merged() -> None:
     map = building(2, 1)
     data = scene_data(map, most=len(map.grid) // 2, seen=np.arange(len(map.grid)) % 2)
     assert data["merged"] == 2 and data["edge"] == 0.2 and data["cells"] == len(map.grid)
-    found = decoded(data)
-    assert len(found) <= len(map.grid) // 2
+    drawn = decoded(data)
+    assert len(drawn) <= len(map.grid) // 2
     want = {tuple(row) for row in ((map.grid.cells - map.grid.cells.min(axis=0)) // 2).tolist()}
-    assert {row[:3] for row in map_rows(found)} == want and len(found) == len(want)
+    assert {row[:3] for row in map_rows(drawn)} == want and len(drawn) == len(want)
     assert len(data["groups"]) == len(data["colours"]["room"])
 
 
@@ -192,10 +192,10 @@ def test_small_gaps_are_filled_and_no_room_takes_from_another() -> None:
     plan = storey_plans(map, frame)[0]
     holed = plan.room.copy()
     holed[10:14, 10:30] = -1
-    found = whole_rooms(replace(plan, room=holed), frame)
-    assert (found[10:14, 10:30] == plan.room[10:14, 10:30]).all()
-    known = plan.room >= 0
-    assert (found[known] == plan.room[known]).all()
+    filled = whole_rooms(replace(plan, room=holed), frame)
+    assert (filled[10:14, 10:30] == plan.room[10:14, 10:30]).all()
+    labelled = plan.room >= 0
+    assert (filled[labelled] == plan.room[labelled]).all()
 
 
 def test_areas_and_stairs_are_drawn() -> None:

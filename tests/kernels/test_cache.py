@@ -26,19 +26,19 @@ def run(folder: Path) -> subprocess.CompletedProcess[str]:
 def test_without_a_home_in_a_private_folder(tmp_path: Path) -> None:
     done = run(tmp_path)
     assert (done.returncode, done.stdout) == (0, "[7]\n"), done.stderr
-    (kept,) = tmp_path.iterdir()
-    assert kept.stat().st_mode & 0o777 == 0o700 and list(kept.rglob("*.nbi"))
+    (cache,) = tmp_path.iterdir()
+    assert cache.stat().st_mode & 0o777 == 0o700 and list(cache.rglob("*.nbi"))
 
 
-@pytest.mark.parametrize("made", ["open", "link"])
-def test_never_in_a_folder_of_others(tmp_path: Path, made: str) -> None:
+@pytest.mark.parametrize("kind", ["open", "link"])
+def test_never_in_a_folder_of_others(tmp_path: Path, kind: str) -> None:
     folder, place = tmp_path / f"topomerge-{os.getuid()}", tmp_path / "elsewhere"
     place.mkdir(mode=0o700)
-    if made == "open":
+    if kind == "open":
         folder.mkdir()
         folder.chmod(0o777)
     else:
         folder.symlink_to(place)
     done = run(tmp_path)
     assert done.returncode == 1 and "set NUMBA_CACHE_DIR" in done.stderr
-    assert not any(place.iterdir()) and (made == "link" or not any(folder.iterdir()))
+    assert not any(place.iterdir()) and (kind == "link" or not any(folder.iterdir()))
