@@ -3,40 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import topomerge
+from tests.cli.processes import Run, process
 from tests.scenes_map import building, same
-from topomerge.cli import console
 from topomerge.cli.main import COMMANDS
-from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
-from topomerge.io.maps import load_map, save_map
-
-Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Call `main` in an empty folder; gives status, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("TOPOMERGE_DEBUG", raising=False)
-
-    def call(*words: str) -> tuple[int, str, str]:
-        status = cli(words)
-        out, err = capsys.readouterr()
-        return status, out, err
-
-    return call
+from topomerge.io.maps import load_map
 
 
 @pytest.fixture
@@ -60,11 +40,6 @@ def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     monkeypatch.setattr(points, "read_chunks", read_chunks)
     monkeypatch.setattr(extraction, "extract", extract)
     return seen
-
-
-def process(*words: str, code: str | None = None, **settings: Any) -> subprocess.CompletedProcess[str]:
-    start = [sys.executable, "-c", code] if code else [sys.executable, "-m", "topomerge"]
-    return subprocess.run([*start, *words], capture_output=True, text=True, timeout=60, check=False, **settings)
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -250,43 +225,6 @@ def test_all_outputs_or_none(run: Run, stages: dict[str, Any], tmp_path: Path, m
     assert (tmp_path / "a.tmap").read_text() == "an older one"
 
 
-def test_info(run: Run, tmp_path: Path) -> None:
-    save_map(building(1, 1), tmp_path / "a.tmap")
-    status, out, _ = run("info", "a.tmap")
-    assert status == 0 and out.startswith("building.ply: 3 rooms, 1 storey, 2 doors")
-    status, out, err = run("info", "a.tmap", "--json")
-    assert status == 0 and len(json.loads(out)["rooms"]) == 3
-    (tmp_path / "bad.tmap").write_bytes((tmp_path / "a.tmap").read_bytes()[:-50])
-    status, out, err = run("info", "bad.tmap")
-    assert (status, out) == (1, "") and err.startswith("topomerge: bad.tmap: damaged") and err.count("\n") == 1
-
-
-def test_a_strangers_map_does_not_steer_the_terminal(run: Run, tmp_path: Path) -> None:
-    text = "\x1b[31mred\x07\x9b\u202e\x00\ud800.ply"
-    save_map(replace(building(1, 1), source=text, warnings=(text,)), tmp_path / "a.tmap")
-    status, out, err = run("info", "a.tmap")
-    assert status == 0 and "red" in out and "red" in err
-    assert all(c.isprintable() or c == "\n" for c in out + err)
-    status, out, err = run("info", "\x1b[31mno.tmap")
-    assert status == 1 and "\x1b" not in err
-
-
-def test_info_into_a_pipe_that_closed(tmp_path: Path) -> None:
-    save_map(replace(building(1, 1), warnings=()), tmp_path / "a.tmap")
-    reader, writer = os.pipe()
-    os.close(reader)
-    command = [sys.executable, "-m", "topomerge", "info", str(tmp_path / "a.tmap")]
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
-    os.close(writer)
-    assert (done.returncode, done.stderr) == (141, "")
-
-
-def test_a_terminal_without_umlauts(tmp_path: Path) -> None:
-    save_map(building(1, 1), tmp_path / "a.tmap")
-    done = process("info", str(tmp_path / "a.tmap"), env={**os.environ, "PYTHONIOENCODING": "ascii"})
-    assert done.returncode == 0 and "area m?" in done.stdout
-
-
 def test_a_real_failure_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "bad.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n")
     done = process("extract", "bad.ply", "-o", "a.tmap", "--json", "a.json", cwd=tmp_path)
@@ -313,43 +251,3 @@ sys.exit(cli())
     assert started.wait(20) == 143
     started.stdout.close()
     assert not list(tmp_path.iterdir())
-
-
-class Terminal:
-    """Stands for a stderr that is a terminal."""
-
-    def __init__(self) -> None:
-        self.text = ""
-
-    def isatty(self) -> bool:
-        return True
-
-    def write(self, text: str) -> int:
-        self.text += text
-        return len(text)
-
-    def flush(self) -> None:
-        pass
-
-
-def test_bars_only_when_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    with console.Bars() as bars:
-        report = bars.task("read")
-        assert report is not None
-        report(0.5, "scan.ply")
-    assert sys.stderr.text == ""  # type: ignore[attr-defined]
-    with console.Bars(delay=0.0) as bars:
-        report = bars.task("read")
-        assert report is not None
-        report(0.2, "[odd] name")
-        bars._timer.join()
-        report(2.0, "[odd] name")
-    report(1.0)  # a late word after the end does no harm
-    assert "[odd] name" in sys.stderr.text  # type: ignore[attr-defined]
-    assert console.Bars(enabled=False).task("read") is None
-
-
-def test_no_bars_without_a_terminal() -> None:
-    with console.Bars(delay=0.0) as bars:
-        assert bars.task("read") is None

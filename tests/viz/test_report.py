@@ -22,11 +22,8 @@ from topomerge.cli.main import main
 from topomerge.errors import InputError
 from topomerge.types import AREA_DTYPE, EDGE_DTYPE, TopometricMap, VoxelGrid
 from topomerge.viz.markup import element, join, json_data
-from topomerge.viz.outline import whole_rooms
-from topomerge.viz.plan import frame_of, storey_plans
 from topomerge.viz.report import report_html, save_report
-from topomerge.viz.scene import leb128, scene_data
-from topomerge.viz.sheet import direction, lay_out
+from topomerge.viz.scene import scene_data
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&{{script}}<!--.ply"
 
@@ -58,24 +55,6 @@ def data_of(text: str) -> dict:
     match = re.search(r'<script type="application/json" id="scene-data">(.*?)</script>', text, re.S)
     assert match
     return json.loads(match[1])
-
-
-def decoded(data: dict) -> np.ndarray:
-    """(n, 6): x, y, z, storey, room, seen; the way that the page's script reads them, slowly."""
-    numbers, rest, place = [], 0, 0
-    for byte in base64.b64decode(data["data"]):
-        rest, place = rest | (byte & 127) << place, place + 7
-        if byte < 128:
-            numbers.append(rest)
-            rest = place = 0
-    rows, at = [], 0
-    _, ny, nz = data["shape"]
-    for storey, room, seen, count in data["groups"]:
-        for number in np.cumsum(numbers[at : at + count]).tolist():
-            rows.append((number // (ny * nz), number // nz % ny, number % nz, storey, room, seen))
-        at += count
-    assert at == len(numbers) == data["drawn"]
-    return np.array(rows)
 
 
 def test_every_room_and_door_is_in_plan_and_table() -> None:
@@ -135,67 +114,6 @@ def test_size() -> None:
     big = building(30, 1)  # 1,300 m2
     assert big.rooms["area"].sum() > 1250
     assert len(report_html(big)) < 3e6
-
-
-def test_cells_come_back() -> None:
-    map = building(1, 2)
-    drawn = decoded(scene_data(map))
-    cells = map.grid.cells - map.grid.cells.min(axis=0)
-    want = np.column_stack([cells, map.storey_of_cells(), map.room])
-    assert sorted(map_rows(drawn[:, :5])) == sorted(map_rows(want))
-
-
-def map_rows(rows: np.ndarray) -> list[tuple[int, ...]]:
-    return [tuple(row) for row in rows.tolist()]
-
-
-def test_many_cells_are_merged() -> None:
-    map = building(2, 1)
-    data = scene_data(map, most=len(map.grid) // 2, seen=np.arange(len(map.grid)) % 2)
-    assert data["merged"] == 2 and data["edge"] == 0.2 and data["cells"] == len(map.grid)
-    drawn = decoded(data)
-    assert len(drawn) <= len(map.grid) // 2
-    want = {tuple(row) for row in ((map.grid.cells - map.grid.cells.min(axis=0)) // 2).tolist()}
-    assert {row[:3] for row in map_rows(drawn)} == want and len(drawn) == len(want)
-    assert len(data["groups"]) == len(data["colours"]["room"])
-
-
-def test_leb128() -> None:
-    assert leb128(np.array([0, 127, 128, 300, 1 << 40])) == bytes([0, 127, 128, 1, 172, 2, 128, 128, 128, 128, 128, 32])
-    assert leb128(np.zeros(0, np.int64)) == b""
-
-
-@pytest.mark.parametrize("degrees", [-40, -20, 0, 10, 30, 44])
-def test_walls_run_along_the_paper(degrees: float) -> None:
-    i, j = np.indices((240, 240)) - 120
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    x, y = np.abs(c * i + s * j), np.abs(-s * i + c * j)
-    walls = ((x < 80) & (y < 50)) & ~((x < 77) & (y < 47))
-    assert np.degrees(direction(walls)) == pytest.approx(degrees, abs=1.0)
-
-
-def test_paper_and_building() -> None:
-    sheet, _ = lay_out(building(1, 1))
-    a, b, c, d, e, f = sheet.back
-    for point in ((2.5, -1.0), (6.0, 3.25)):
-        x, y = sheet.at(np.array(point))
-        assert (a * x + b * y + c, d * x + e * y + f) == pytest.approx(point, abs=0.006)
-    turned = replace(sheet, turn=0.4)
-    a, b, c, d, e, f = turned.back
-    x, y = turned.at(np.array([2.5, -1.0]))
-    assert (a * x + b * y + c, d * x + e * y + f) == pytest.approx((2.5, -1.0), abs=0.008)
-
-
-def test_small_gaps_are_filled_and_no_room_takes_from_another() -> None:
-    map = building(1, 1)
-    frame = frame_of(map)
-    plan = storey_plans(map, frame)[0]
-    holed = plan.room.copy()
-    holed[10:14, 10:30] = -1
-    filled = whole_rooms(replace(plan, room=holed), frame)
-    assert (filled[10:14, 10:30] == plan.room[10:14, 10:30]).all()
-    labelled = plan.room >= 0
-    assert (filled[labelled] == plan.room[labelled]).all()
 
 
 def test_areas_and_stairs_are_drawn() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import time
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from tests.scenes_map import building
 from tests.viz.chromium import Page
 from topomerge.viz.report import save_report
-from topomerge.viz.scene import scene_data
+from topomerge.viz.scene import leb128, scene_data
 
 WHOLE_STAGE = "document.querySelector('.stage') && document.querySelector('.stage').dataset.whole === 'true'"
 # Turns the building and notes ms from picture to picture, how many cells each has, and the longest ms until all are drawn.
@@ -67,3 +68,49 @@ def test_two_million_cells_are_turned(tmp_path: Path) -> None:
     assert seen["all"] < 60_000
     assert drawn.min() > 10_000 and drawn.max() <= total
     assert np.median(took) < 500 and seen["rest"] < 3000  # a machine that is busy with other things, without a graphics card
+
+
+def decoded(data: dict) -> np.ndarray:
+    """(n, 6): x, y, z, storey, room, seen; the way that the page's script reads them, slowly."""
+    numbers, rest, place = [], 0, 0
+    for byte in base64.b64decode(data["data"]):
+        rest, place = rest | (byte & 127) << place, place + 7
+        if byte < 128:
+            numbers.append(rest)
+            rest = place = 0
+    rows, at = [], 0
+    _, ny, nz = data["shape"]
+    for storey, room, seen, count in data["groups"]:
+        for number in np.cumsum(numbers[at : at + count]).tolist():
+            rows.append((number // (ny * nz), number // nz % ny, number % nz, storey, room, seen))
+        at += count
+    assert at == len(numbers) == data["drawn"]
+    return np.array(rows)
+
+
+def test_cells_come_back() -> None:
+    map = building(1, 2)
+    drawn = decoded(scene_data(map))
+    cells = map.grid.cells - map.grid.cells.min(axis=0)
+    want = np.column_stack([cells, map.storey_of_cells(), map.room])
+    assert sorted(map_rows(drawn[:, :5])) == sorted(map_rows(want))
+
+
+def map_rows(rows: np.ndarray) -> list[tuple[int, ...]]:
+    return [tuple(row) for row in rows.tolist()]
+
+
+def test_many_cells_are_merged() -> None:
+    map = building(2, 1)
+    data = scene_data(map, most=len(map.grid) // 2, seen=np.arange(len(map.grid)) % 2)
+    assert data["merged"] == 2 and data["edge"] == 0.2 and data["cells"] == len(map.grid)
+    drawn = decoded(data)
+    assert len(drawn) <= len(map.grid) // 2
+    want = {tuple(row) for row in ((map.grid.cells - map.grid.cells.min(axis=0)) // 2).tolist()}
+    assert {row[:3] for row in map_rows(drawn)} == want and len(drawn) == len(want)
+    assert len(data["groups"]) == len(data["colours"]["room"])
+
+
+def test_leb128() -> None:
+    assert leb128(np.array([0, 127, 128, 300, 1 << 40])) == bytes([0, 127, 128, 1, 172, 2, 128, 128, 128, 128, 128, 32])
+    assert leb128(np.zeros(0, np.int64)) == b""

@@ -1,0 +1,49 @@
+"""Bars that show how far the work is."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from topomerge.cli import console
+
+
+class Terminal:
+    """Stands for a stderr that is a terminal."""
+
+    def __init__(self) -> None:
+        self.text = ""
+
+    def isatty(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        self.text += text
+        return len(text)
+
+    def flush(self) -> None:
+        pass
+
+
+def test_bars_only_when_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with console.Bars() as bars:
+        report = bars.task("read")
+        assert report is not None
+        report(0.5, "scan.ply")
+    assert sys.stderr.text == ""  # type: ignore[attr-defined]
+    with console.Bars(delay=0.0) as bars:
+        report = bars.task("read")
+        assert report is not None
+        report(0.2, "[odd] name")
+        bars._timer.join()
+        report(2.0, "[odd] name")
+    report(1.0)  # a late word after the end does no harm
+    assert "[odd] name" in sys.stderr.text  # type: ignore[attr-defined]
+    assert console.Bars(enabled=False).task("read") is None
+
+
+def test_no_bars_without_a_terminal() -> None:
+    with console.Bars(delay=0.0) as bars:
+        assert bars.task("read") is None
