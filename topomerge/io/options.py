@@ -65,7 +65,7 @@ def read_options(path: Path, values: Mapping[str, Any]) -> ReadOptions:
             raise InputError(f"{path}: --{name} {values[name]} is {wrong}; give one of {', '.join(allowed)}")
     for name in LENGTH_NAMES:
         value = getattr(options, name)
-        if value is not None and not (isinstance(value, Real) and math.isfinite(value) and value > 0):
+        if value is not None and not (isinstance(value, Real) and math.isfinite(value) and float(value) > 0):
             shown = f"{value:g}" if isinstance(value, Real) else repr(value)
             raise InputError(f"{path}: --{name} {shown} can't be used; give a number above 0")
     return options
