@@ -7,7 +7,7 @@ TORCH_INDEX ?=
 export TOPOMERGE_DATA ?= $(wildcard ../shared/data)
 export MPLBACKEND := Agg
 
-.PHONY: setup demo test test-slow lint docs bench clean
+.PHONY: setup demo test test-slow lint docs bench weights clean
 setup: .venv/ready
 
 .venv/ready: pyproject.toml constraints.txt
@@ -51,6 +51,10 @@ docs: setup
 # All benchmarks of speed, about half an hour; what measures rooms and merges takes hours: see docs/benchmarks.md.
 bench: setup
 	$(BIN)/python -m benchmarks.speed
+
+# All learned parts that ship, in their order; what has ended is left as it is. It says how long is left: hours on two cores.
+weights: setup
+	$(BIN)/python -m topomerge.training.weights jobs=2
 
 clean:
 	rm -rf build demo dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -1,11 +1,12 @@
-"""Evaluate descriptors and trained embedders on pairs of maps whose truth is known.
+"""Judge a learned part on buildings that trained nothing: embedders and descriptors, or what `task=` names.
 
     python evaluate.py data=heldout_small merge=false
     python evaluate.py data=heldout run=runs/x
-    python evaluate.py data=real run=runs/x write=docs/results/real-pairs.md section=matching-real
+    python evaluate.py data=real run=runs/x write=docs/results.md section=real-pairs
+    python evaluate.py task=door_classification run=runs/door_classification jobs=2
 
 Predictions go to disk first (`runs/eval/<name>/predictions`), then they are scored: a run that was killed goes on where it was.
-Keys: configs/evaluate.yaml and configs/data/*.yaml.
+Keys: configs/evaluate.yaml and configs/data/*.yaml; with a task configs/task/<task>.yaml, whose `heldout` data is judged on.
 """
 
 from __future__ import annotations
@@ -18,22 +19,35 @@ from topomerge.evaluation.evaluate import evaluate
 from topomerge.evaluation.settings import Evaluation
 
 
+def say(text: str) -> None:
+    """Report the progress."""
+    print(text, file=sys.stderr, flush=True)
+
+
 def main(words: list[str]) -> int:
     """Read the settings with Hydra, evaluate, and print the short tables."""
     if {"-h", "--help"} & set(words):
         print(__doc__)
         return 0
-    words = [f"run=[{w[4:]}]" if w.startswith("run=") and not w.startswith("run=[") else w for w in words]
+    command = f"python evaluate.py {' '.join(words)}"
+    task = next((word[len("task=") :] for word in words if word.startswith("task=")), "embedding")
     try:
-        settings = compose("evaluate", Evaluation, words)
-        found = evaluate(settings, lambda text: print(text, file=sys.stderr, flush=True), f"python evaluate.py {' '.join(words)}")
+        if task == "embedding":
+            words = [word for word in words if not word.startswith("task=")]
+            words = [f"run=[{w[4:]}]" if w.startswith("run=") and not w.startswith("run=[") else w for w in words]
+            scores = evaluate(compose("evaluate", Evaluation, words), say, command)
+            print(f"{scores.summary}\n\nAll tables and figures: {scores.folder}")
+        else:
+            from topomerge.training.judging import judge_task
+
+            judgement = judge_task(task, words, say)
+            print(f"{judgement.summary}\n\nWritten to {judgement.folder}")
     except InputError as error:
         print(f"evaluate: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("evaluate: interrupted; start it again to go on", file=sys.stderr)
         return 130
-    print(f"{found.summary}\n\nAll tables and figures: {found.folder}")
     return 0
 
 

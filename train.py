@@ -1,6 +1,9 @@
-"""Train an embedder: ``python train.py experiment=sage_pointnet data=train_small``; sweeps with -m, see configs/train.yaml.
+"""Train a learned part: ``python train.py task=plan_segmentation data=plan_scans``; see configs/train.yaml and configs/task/.
 
-Several processes: ``torchrun --nproc-per-node 2 train.py ...``. Without Hydra: ``python -m topomerge.training run.json``.
+    python train.py experiment=sage_pointnet data=train_small           the task is embedding where none is named
+    python train.py -m geometry=engineered,pointnet node=none,gat       a sweep
+    torchrun --nproc-per-node 2 train.py ...                            several processes, for embedding
+    python -m topomerge.training run.json                               without Hydra, for embedding
 """
 
 from __future__ import annotations
@@ -12,30 +15,27 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from topomerge.config import typed
 from topomerge.errors import InputError
-from topomerge.training.fit import fit
-from topomerge.training.settings import Training, composed, known, with_recipe
+from topomerge.training.tasks import register_tasks, settings_from, settings_of, train
 
-known()
+register_tasks()
 FLAGS = {"--overfit": "overfit=true", "--resume": "resume=true"}
 
 
-def settings_of(config: DictConfig) -> Training:
-    """The typed settings of one job; that of a sweep gets a folder of its own."""
-    settings = composed(typed(config, with_recipe()))
-    job = HydraConfig.get()
-    if job.mode == RunMode.MULTIRUN:
-        settings.runs, settings.name = str(job.sweep.dir), str(job.sweep.subdir)
-    return settings
+def say(text: str) -> None:
+    """Report the progress."""
+    print(text, file=sys.stderr, flush=True)
 
 
 @hydra.main(version_base="1.3", config_path="pkg://topomerge.configs", config_name="train")
 def main(config: DictConfig) -> float:
     """One run; its best score is what a sweep compares."""
     try:
-        settings = settings_of(config)
-        return fit(settings)[f"val/{settings.watch}"]
+        settings = settings_from(config)
+        job = HydraConfig.get()
+        if job.mode == RunMode.MULTIRUN:  # each run of a sweep gets a folder of its own
+            settings.runs, settings.name = str(job.sweep.dir), str(job.sweep.subdir)
+        return train(settings, say)[f"val/{settings.watch}"]
     except InputError as error:
         sys.exit(f"train: {error}")
     except KeyboardInterrupt:
@@ -44,5 +44,11 @@ def main(config: DictConfig) -> float:
 
 
 if __name__ == "__main__":
-    sys.argv[1:] = [FLAGS.get(word, word) for word in sys.argv[1:]]
+    words = [FLAGS.get(word, word) for word in sys.argv[1:]]
+    if not any(word.startswith("-") or word.startswith("hydra") for word in words):
+        try:
+            settings_of(words)  # a wrong key is one line, where Hydra says ten
+        except InputError as error:
+            sys.exit(f"train: {error}")
+    sys.argv[1:] = words
     main()

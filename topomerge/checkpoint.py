@@ -1,6 +1,6 @@
 """State of a training on disk: what it takes to go on as if nothing had been, without unpickling anything.
 
-A folder: the embedder (`models.weights`), `optimizer.safetensors` and, written last, `state.json`:
+A folder: the files of the network (of an embedder: `models.weights`), `optimizer.safetensors` and, written last, `state.json`:
 
     {"format": 2, "class": "topomerge.training", "sha256": {file: …}, "progress": {…}}
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,36 +18,31 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
-from topomerge.embedding.weights import SETTINGS_FILE, WEIGHTS_FILE
+from topomerge.embedding.weights import WEIGHTS_FILE
 from topomerge.errors import InputError
-from topomerge.models.embedder import Embedder
-from topomerge.models.weights import save_embedder
 
 STATE_FORMAT = 2
 STATE_CLASS = "topomerge.training"
-OPTIMIZER_FILE, STATE_FILE = "optimizer.safetensors", "state.json"
+NETWORK_FILE, OPTIMIZER_FILE, STATE_FILE = "network.safetensors", "optimizer.safetensors", "state.json"
 
 
 def save_state(
-    folder: str | Path,
-    network: Embedder,
-    optimizer: torch.optim.Optimizer,
-    progress: Mapping[str, Any],
-    about: Mapping[str, Any],
+    folder: str | Path, write: Callable[[Path], None], optimizer: torch.optim.Optimizer, progress: Mapping[str, Any]
 ) -> None:
     """Replace a folder by the state as it is; a kill in between leaves the old one, or the new one beside it.
 
     Args:
+        write: writes the files of the network into a folder.
         progress: what else is needed to go on, as JSON has it.
-        about: of the embedder.
     """
     folder = Path(folder)
     new, old = folder.with_name(f"{folder.name}.new"), folder.with_name(f"{folder.name}.old")
     for stale in (new, old):
         shutil.rmtree(stale, ignore_errors=True)
-    save_embedder(network, new, about)
+    new.mkdir(parents=True)
+    write(new)
     (new / OPTIMIZER_FILE).write_bytes(save(_flat(optimizer)))
-    digests = {name: _digest(new / name) for name in (WEIGHTS_FILE, SETTINGS_FILE, OPTIMIZER_FILE)}
+    digests = {path.name: _digest(path) for path in sorted(new.iterdir())}
     state = {"format": STATE_FORMAT, "class": STATE_CLASS, "sha256": digests, "progress": dict(progress)}
     (new / STATE_FILE).write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
     if folder.exists():
@@ -56,8 +51,19 @@ def save_state(
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load_state(folder: str | Path, network: Embedder, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+def write_network(network: torch.nn.Module, folder: Path) -> None:
+    """Write a network's weights as `NETWORK_FILE`."""
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
+    (folder / NETWORK_FILE).write_bytes(save(state))
+
+
+def load_state(
+    folder: str | Path, network: torch.nn.Module, optimizer: torch.optim.Optimizer, weights: str = WEIGHTS_FILE
+) -> dict[str, Any]:
     """Put the state into a network and its optimizer; `progress` comes back.
+
+    Args:
+        weights: the file of the network.
 
     Raises:
         InputError: no such folder, damaged, of another format, class or network.
@@ -77,11 +83,11 @@ def load_state(folder: str | Path, network: Embedder, optimizer: torch.optim.Opt
         raise InputError(
             f"{folder / STATE_FILE}: has format {state.get('format')!r}, this program reads {STATE_FORMAT}; start again"
         )
-    for name in (WEIGHTS_FILE, SETTINGS_FILE, OPTIMIZER_FILE):
+    for name in {*state["sha256"], weights, OPTIMIZER_FILE}:
         if not (folder / name).exists() or _digest(folder / name) != state["sha256"].get(name):
             raise InputError(f"{folder / name}: missing, cut off, or not of this state; start again without resume")
     try:
-        network.load_state_dict(load((folder / WEIGHTS_FILE).read_bytes()))
+        network.load_state_dict(load((folder / weights).read_bytes()))
         _fill(optimizer, load((folder / OPTIMIZER_FILE).read_bytes()))
     except (RuntimeError, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:160]

@@ -23,7 +23,7 @@ NOTHING: Row = {
 
 def measure(case: Case, preset: str, key: str, scans: Path, data: Path | None, out: Path, picture: bool) -> Row:
     """Run a case in this process."""
-    from topomerge.datasets.pairs.example import one_thread
+    from topomerge.datasets.core.builder import one_thread
 
     row: Row = {"key": key, "preset": preset, "picture": picture, "error": ""}
     with one_thread():

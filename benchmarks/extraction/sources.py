@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,16 @@ from topomerge.datasets.pairs.pairs import draw_frames
 from topomerge.datasets.pairs.parts import two_parts
 from topomerge.datasets.simulation.floor_truth import in_frame, truth_of
 from topomerge.datasets.simulation.scanner import moved, scan
-from topomerge.datasets.simulation.sensors import Sensor, get_sensor
+from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.session import session
+from topomerge.datasets.simulation.spoils import drift_between, exact_sensor, spoilt
 from topomerge.datasets.simulation.walk import part
 
 from benchmarks.extraction.scans import Case, Scan
 from topomerge.errors import InputError
 from topomerge.io.points import read_points
-from topomerge.types import Array, PointCloud
+from topomerge.types import Array
 
-ANCHOR = 0.5  # m between places whose drift is kept
 COMMON = 0.6  # share of the rooms that the two sessions of a pair have in common
 ADRIFT = 1.5  # degrees about every 15 m: three times a hand-held camera's
 IPA, IPA_CELL = "grids_ipa_room_segmentation", 0.05
@@ -111,9 +111,9 @@ def simulated(case: Case, building: Building) -> Scan:
         sensor = replace(sensor, drift=ADRIFT)
     spacing = case.spacing or None
     cloud = scan(building, sensor, visited, np.random.default_rng(seed), spacing)
-    straight = scan(building, _exact(sensor), visited, np.random.default_rng(seed), budget=8)  # the poses come before the rays
-    cloud = _spoilt(cloud, building, case.spoil, rng)
-    anchors, drift = _drift_of(cloud, straight) if _exact(sensor) != sensor else (np.zeros((0, 3)), np.zeros((0, 3)))
+    straight = scan(building, exact_sensor(sensor), visited, np.random.default_rng(seed), budget=8)  # poses come before rays
+    cloud = spoilt(cloud, building, case.spoil, rng)
+    anchors, drift = drift_between(cloud, straight) if exact_sensor(sensor) != sensor else (np.zeros((0, 3)), np.zeros((0, 3)))
     truth = truth_of(building, np.isin(np.arange(len(building.rooms)), visited), cloud.points, anchors, drift)
     frame = draw_frames(1, False, np.random.default_rng([*seed, 3]))[0]
     return Scan(replace(moved(cloud, frame), rooms=()), in_frame(truth, frame), building.rooms)
@@ -129,39 +129,3 @@ def _visited(case: Case, building: Building) -> Array:
     inside = np.array([i for i, r in enumerate(building.rooms) if r.kind != "lift"])
     parts = building.parts()[inside]
     return inside[parts == np.bincount(parts).argmax()]
-
-
-def _exact(sensor: Sensor) -> Sensor:
-    """The same sensor, whose poses are known exactly."""
-    exact: dict[str, Any] = {"drift": 0.0, "tilt": 0.0, "jitter": (0.0, 0.0)}
-    return replace(sensor, **{f.name: exact[f.name] for f in fields(sensor) if f.name in exact})
-
-
-def _drift_of(cloud: PointCloud, straight: PointCloud) -> tuple[Array, Array]:
-    """Places of the cloud, one a cube of `ANCHOR`, and what undoes the drift there."""
-    assert straight.poses is not None and cloud.poses is not None and cloud.pose_of is not None
-    back = straight.poses @ np.linalg.inv(cloud.poses)
-    points = cloud.points.astype(np.float64)
-    undone = np.einsum("nij,nj->ni", back[cloud.pose_of, :3, :3], points) + back[cloud.pose_of, :3, 3]
-    cell, of, count = np.unique(np.floor(points / ANCHOR).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
-    of = of.ravel()
-
-    def mean(values: Array) -> Array:
-        return np.stack([np.bincount(of, values[:, k], len(cell)) for k in range(3)], axis=1) / count[:, None]
-
-    return mean(points), mean(undone - points)
-
-
-def _spoilt(cloud: PointCloud, building: Building, spoil: str, rng: np.random.Generator) -> PointCloud:
-    """The cloud after what is done to its points."""
-    points, visible = cloud.points, np.ones(len(cloud), bool)
-    if spoil == "sparse":
-        visible = rng.random(len(points)) < 0.05
-    elif spoil == "below2":
-        floor = building.storeys["floor"]
-        storey = np.clip(np.searchsorted(floor - 0.3, points[:, 2]) - 1, 0, None)
-        visible = points[:, 2] < floor[storey] + 2.0
-    elif spoil == "noise":
-        points = points + rng.normal(0, 0.04, points.shape).astype(np.float32)
-    pose_of = None if cloud.pose_of is None else cloud.pose_of[visible]
-    return replace(cloud, points=points[visible], labels=None, pose_of=pose_of)

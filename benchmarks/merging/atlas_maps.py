@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.buildings.procedural import make_building
+from topomerge.datasets.core.builder import one_thread
 from topomerge.datasets.pairs.atlases import make_atlas
-from topomerge.datasets.pairs.example import one_thread
 from topomerge.datasets.pairs.pairs import Atlas
 from topomerge.datasets.plans.splits import seeds
 

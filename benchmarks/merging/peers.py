@@ -1,7 +1,6 @@
 """Ours, KISS-Matcher (0.2 and 0.3 m), FPFH + RANSAC and FGR on the same pairs, in one run: what is right, and the time it takes.
 
-``python -m benchmarks.merging.peers SECONDS [real|heldout]`` works through test pairs (`merge_pairs.py test`,
-`merge_drawings.py test`)
+``python -m benchmarks.merging.peers SECONDS [real|heldout]`` works through test pairs (`cached_pairs.py`)
 for so many seconds of processor, bin by bin and kind by kind in turn; or through the real pairs of TOPOMERGE_DATA; or through the
 maps that `evaluate.py data=heldout` kept, with the learned embedder's merge among the methods. Resumable: a line of JSON a pair
 with all methods in ``cache/merge/peers*.jsonl``; `peers_table.py` makes the tables of them.
@@ -26,11 +25,12 @@ from typing import Any
 
 import numpy as np
 from topomerge.datasets.pairs.evaluation_pair import load_set
+from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
 
-from benchmarks.merging.pairs import GridPair, load
+from benchmarks.merging.cached_pairs import pair_files
 from benchmarks.merging.register import SCALELESS, open3d_features, real_pairs, upright
-from benchmarks.training.calibrate_merge import error
 from topomerge.fusion.cell_means import cell_middles
+from topomerge.training.belief_hypotheses import error
 from topomerge.types import PointCloud, Sim3, VoxelGrid
 
 CACHE = Path("cache/merge")
@@ -181,7 +181,7 @@ def measured(pair: GridPair, all_the_way: bool) -> dict[str, Any]:
 def chosen() -> Iterator[Path]:
     """Pairs that share something, one of each bin and kind in turn; drawings of unknown scale are left out."""
     groups: dict[tuple[str, str], list[Path]] = {}
-    for path in sorted(CACHE.glob("test/*.npz")) + sorted(CACHE.glob("test_drawings/*_overlap.npz")):
+    for path in pair_files("test") + pair_files("test_drawings", ("overlap",)):
         with np.load(path) as arrays:
             about = json.loads(arrays["about"].tobytes())
         if about["kind"] == "overlap" and about["common"] >= 1 and not about.get("scaled"):
@@ -198,7 +198,7 @@ def pairs(which: str, done: set[str]) -> Iterator[tuple[int, GridPair]]:
         return
     for k, path in enumerate(list(chosen())):
         if path.stem not in done:
-            yield k, load(path, mean=True)
+            yield k, load_grids(path, mean=True)
 
 
 def run(seconds: float, which: str = "") -> None:

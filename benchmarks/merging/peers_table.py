@@ -102,7 +102,7 @@ def section() -> str:
     taken = {m: [r["seconds"] for r in rows if r["method"] == m and r["name"] in names] for m in NAMES}
     other = {m: float(np.median(s)) for m, s in taken.items() if s}
     return "\n\n".join([
-        "`python -m benchmarks.merging.pairs test 175; python -m benchmarks.merging.drawings test 110; "
+        "`python -m benchmarks.merging.cached_pairs test jobs=2; "
         "python -m benchmarks.merging.peers 9000; python -m benchmarks.merging.peers_table docs/results/peers.md`",
         TEXT,
         by(rows, keys[0], list(BINS), "in common", HEADS, measures),

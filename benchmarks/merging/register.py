@@ -1,6 +1,6 @@
 """Registration of whole maps beside KISS-Matcher and Open3D: what is merged right and wrong, and how fast.
 
-``python -m benchmarks.merging.register [split] [limit] [methods]``: cached simulated pairs (``merge_pairs.py``; split
+``python -m benchmarks.merging.register [split] [limit] [methods]``: cached simulated pairs (``cached_pairs.py``; split
 ``train`` for
 development, ``test`` for final runs only; ``test_drawings`` for maps and their floor plans), or ``real`` for the real pairs of
 TOPOMERGE_DATA. Methods: ours, kiss02, kiss03, fpfh, fgr (comma-separated; default all). Resumable: a line of JSON a pair and
@@ -22,13 +22,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from topomerge.datasets.pairs.grid_pairs import GridPair, common_area, free_of, grid_of, load_grids
 from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.real.sources import iter_real_pairs
 
-from benchmarks.merging.pairs import GridPair, common_area, free_of, grid_of, load
-from benchmarks.training.calibrate_merge import error, kind_of, right
+from benchmarks.merging.cached_pairs import pair_files
 from topomerge.fusion.cell_means import cell_middles
 from topomerge.fusion.registration import register
+from topomerge.training.belief_hypotheses import error, kind_of, right
 from topomerge.types import Array, Sim3, VoxelGrid
 
 SCALELESS = ("halmstad",)  # no metres per pixel are known
@@ -125,9 +126,9 @@ def real_pairs() -> Iterator[GridPair]:
 
 def simulated_pairs(split: str, limit: int, skip: set[str]) -> Iterator[GridPair]:
     """The first cached pairs of a split, but for those named."""
-    for path in sorted((Path("cache/merge") / split).glob("*_overlap.npz" if split.endswith("_drawings") else "*.npz"))[:limit]:
+    for path in pair_files(split, ("overlap",) if split.endswith("_drawings") else ())[:limit]:
         if path.stem not in skip:
-            yield load(path, mean=True)
+            yield load_grids(path, mean=True)
 
 
 def run(split: str, limit: int, methods: list[str], target: Path) -> None:

@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from benchmarks.training.calibrate_merge import THRESHOLD, fair, kind_of, right, with_differs
+from topomerge.fusion.verify import model
 from topomerge.io.atomic import replacing
 from topomerge.metrics import bootstrap
+from topomerge.training.belief_hypotheses import fair, kind_of, right
 
 Row = dict[str, Any]
 CACHE = Path("cache/merge")
+THRESHOLD = float(model()["threshold"])
 NAMES = {
     "ours": "topomerge", "learned": "topomerge, rooms matched by learning", "kiss02": "KISS-Matcher 0.2 m",
     "kiss03": "KISS-Matcher 0.3 m", "fpfh": "FPFH + RANSAC", "fgr": "FGR",
@@ -240,7 +242,7 @@ BEFORE = (
 
 def section() -> str:
     """The whole section."""
-    rows, strangers = with_differs(rows_of("results_test.jsonl"), "test"), rows_of("strangers_test.jsonl")
+    rows, strangers = rows_of("results_test.jsonl"), rows_of("strangers_test.jsonl")
     mine = [r for r in rows if r["method"] == "ours"]
     drawn = rows_of("results_test_drawings.jsonl")
     large = [r for r in mine if kind_of(r) in ("80-200", ">200")]
@@ -248,8 +250,8 @@ def section() -> str:
     sensors = sorted({"-".join(sorted(r["sensors"])) for r in large})
     believed = share(large, lambda r: good(r) and r["believed"])
     parts = [
-        "`python -m benchmarks.merging.pairs test 175; python -m benchmarks.merging.drawings test 110; "
-        "python -m benchmarks.merging.drawings test differs; python -m benchmarks.merging.register test 1000 ours; "
+        "`python -m benchmarks.merging.cached_pairs test jobs=2; "
+        "python -m benchmarks.merging.register test 1000 ours; "
         "python -m benchmarks.merging.register test_drawings 1000 ours; "
         "python -m benchmarks.merging.strangers test 430; python -m benchmarks.merging.results docs/results/merging.md`",
         f"{len(mine)} simulated pairs of {buildings} test buildings, in 0.1 m cells, every sixth with much moved furniture, "

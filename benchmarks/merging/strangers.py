@@ -1,5 +1,5 @@
-"""False merges: maps of different buildings put together, of the cached pairs of a split (``merge_pairs.py``), and maps with
-floor plans that are not theirs (``merge_drawings.py``).
+"""False merges: maps of different buildings put together, of the cached pairs of a split (``cached_pairs.py``), and maps with
+floor plans that are not theirs.
 
 ``python -m benchmarks.merging.strangers [split] [pairs]``; resumable: one line of JSON a pair in
 ``cache/merge/strangers_*.jsonl``.
@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from topomerge.datasets.pairs.grid_pairs import load_grids
 
-from benchmarks.merging.pairs import load
+from benchmarks.merging.cached_pairs import pair_files
 from benchmarks.merging.register import SCALELESS, real_pairs
 from topomerge.fusion.registration import Prepared, Registration, prepare, register
 from topomerge.types import VoxelGrid
@@ -33,14 +34,14 @@ STRIDE = 7  # pairs are laid out in blocks of so many pairs, so that few maps ar
 @cache
 def maps(path: Path) -> tuple[str, tuple[Prepared, Prepared], list[str]]:
     """Building, both maps and their sensors of a cached pair."""
-    pair = load(path)
+    pair = load_grids(path)
     a, b = (prepare(g, f) for g, f in zip((pair.a, pair.b), pair.free, strict=True))
     return str(pair.about["building"]), (a, b), list(pair.about["sensors"])  # type: ignore[call-overload]
 
 
 def strangers(split: str) -> Iterator[tuple[Path, Path]]:
     """Neighbours in a shuffled order: a of one, b of another."""
-    paths = sorted((Path("cache/merge") / split).glob("*.npz"))
+    paths = pair_files(split)
     order = np.random.default_rng(0).permutation(len(paths))
     for start in range(0, len(order), STRIDE):
         maps.cache_clear()
@@ -89,10 +90,12 @@ def of_real(many: int, done: Collection[str]) -> Iterator[Row]:
 
 def of_drawings(split: str, done: Collection[str]) -> Iterator[Row]:
     """Maps and floor plans of another building, another storey or another wing."""
-    for path in sorted((Path("cache/merge") / f"{split}_drawings").glob("*.npz")):
-        if path.stem in done or path.stem.endswith("_overlap"):
+    for path in pair_files(f"{split}_drawings"):
+        if path.stem in done:
             continue
-        pair = load(path)
+        pair = load_grids(path)
+        if pair.about["kind"] == "overlap":
+            continue
         keys = ("kind", "building", "sensors", "differs", "walls_differ", "scaled")
         about = {k: pair.about[k] for k in keys if k in pair.about}
         scale = "free" if pair.about["scaled"] else "fixed"

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import signal
-import threading
-import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from topomerge.datasets.buildings.erect import erect
 from topomerge.datasets.buildings.procedural import make_building
+from topomerge.datasets.core.builder import Row, make_item
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.pairs.degrade import UNCHANGED, degraded
@@ -28,7 +25,6 @@ from topomerge.embedding.graph import from_arrays, graph_arrays
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io import archive
-from topomerge.io.atomic import replacing
 from topomerge.io.listing import plain
 from topomerge.types import Array, TopometricMap
 
@@ -38,19 +34,6 @@ if TYPE_CHECKING:
 
 FEWEST = 2  # rooms that must come out of each map
 LONGEST = 600.0  # s a pair: a hundred times what is usual, so that no slow machine makes another set
-
-
-class TooLongError(InputError):
-    """An item took too long; on another machine it may not."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """What became of an item: `reason` is empty where the pair was made."""
-
-    name: str
-    reason: str
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -72,63 +55,10 @@ class Example:
 
 
 def make_file(item: Item, plans: Sequence[Sequence[Plan]], folder: str) -> Row:
-    """Make an item's file in a folder, or one that tells why there is none. It never raises: what went wrong is in the row.
-
-    One thread is used, so that as many workers as cores don't fight for them.
-    """
-    began = time.perf_counter()
-    try:
-        with one_thread(), time_limit(LONGEST):
-            arrays = keep(item, plans, Path(folder)) if item.maps else make_arrays(item, plans)
-            archive.write(arrays, Path(folder) / f"{item.name}.npz")
-        reason = ""
-    except Exception as error:  # one bad item must not end a build
-        reason = " ".join(str(error).split())[:200]
-        reason = reason if isinstance(error, InputError) else f"{type(error).__name__}: {reason}"
-        if isinstance(error, InputError) and not isinstance(error, TooLongError):
-            with replacing(Path(folder) / f"{item.name}.refused") as beside:  # the same inputs would be refused again
-                beside.write_text(reason + "\n", encoding="utf-8")
-    return Row(item.name, reason, time.perf_counter() - began)
-
-
-def refusal(folder: Path, name: str) -> str:
-    """Why an item was refused before; empty where it was not."""
-    path = folder / f"{name}.refused"
-    return path.read_text(encoding="utf-8").strip() if path.is_file() else ""
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Keep BLAS, OpenMP and numba to one thread."""
-    import numba
-    from threadpoolctl import threadpool_limits
-
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        numba.set_num_threads(threads)
-
-
-@contextmanager
-def time_limit(seconds: float) -> Iterator[None]:
-    """End what takes too long with an `InputError`; without effect in threads, which get no signals."""
-    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
-        yield
-        return
-
-    def stop(*_: object) -> NoReturn:
-        raise TooLongError(f"takes longer than {seconds:g} s")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+    """Make an item's file in a folder, or one that says why there is none (`core.builder.make_item`)."""
+    return make_item(
+        item.name, folder, lambda: keep(item, plans, Path(folder)) if item.maps else make_arrays(item, plans), LONGEST
+    )
 
 
 def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]:
@@ -225,16 +155,6 @@ def _building(item: Item, k: int, plans: Sequence[Sequence[Plan]]) -> Building:
     if item.source == "procedural":
         return make_building(item.kind, int(name), item.storeys, difficulty_of(item))
     return erect(plans[k], difficulty_of(item), item.seed % 100_000 + k, name, item.source)
-
-
-def about(path: Path) -> dict[str, Any]:
-    """What a cached pair is, after checking that the whole file can be read.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    found: dict[str, Any] = json.loads(archive.read(path, "cached pair")["about"].tobytes())
-    return found
 
 
 def load_example(path: str | Path) -> Example:

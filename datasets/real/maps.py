@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 
+from topomerge.datasets.core.builder import time_limit
 from topomerge.datasets.pairs.evaluation_pair import kept_arrays, save_maps, told_of_maps
-from topomerge.datasets.pairs.example import pair_arrays, time_limit
+from topomerge.datasets.pairs.example import pair_arrays
 from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.plans.floorplans import Refusal
 from topomerge.datasets.real.sources import collect

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from topomerge.datasets.core.builder import refusal
 from topomerge.datasets.core.script import exit_status
-from topomerge.datasets.pairs.example import refusal
 from topomerge.datasets.pairs.items import Item
 
 from topomerge.errors import InputError

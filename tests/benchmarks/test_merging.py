@@ -23,8 +23,8 @@ def test_kinds_and_bins_do_not_depend_on_the_order(module) -> None:
     assert [peers.bin_of(m2) for m2 in (1.0, 39.9, 40.0, 80.0)] == ["<40 m²", "<40 m²", "40-80 m²", "≥80 m²"]
 
 
-def test_plans_that_differ_only_where_nobody_looked_are_the_same(module) -> None:
-    drawings = module("drawings")
+def test_plans_that_differ_only_where_nobody_looked_are_the_same() -> None:
+    drawings = importlib.import_module("topomerge.datasets.pairs.grid_drawings")
     building = make_building("office", 5, 2)
     lower = np.array([i for i, r in enumerate(building.rooms) if r.storey == 0])
     here = drawings.Place("x", "a", building, Sim3(), 0, lower)
@@ -33,8 +33,8 @@ def test_plans_that_differ_only_where_nobody_looked_are_the_same(module) -> None
     assert 0 <= two <= everywhere
 
 
-def test_a_slice_or_a_drawing_says_nothing_of_its_height(module) -> None:
-    right = importlib.import_module("benchmarks.training.calibrate_merge").right
+def test_a_slice_or_a_drawing_says_nothing_of_its_height() -> None:
+    right = importlib.import_module("topomerge.training.belief_hypotheses").right
     off = [0.1, 1.0, 1.0]
     assert right(off, ("tls", "laser2d")) and right(off, ("drawing", "tls")) and not right(off, ("tls", "depth"))
     assert not right(None, ("tls", "laser2d"))

@@ -13,15 +13,15 @@ def main(words: list[str]) -> int:
     if not words or {"-h", "--help"} & set(words):
         print(__doc__)
         return 0 if words else 1
-    from topomerge.training.fit import fit
+    from topomerge.training.embedding import fit
     from topomerge.training.settings import from_dict, from_file, to_dict
 
     try:
-        told = to_dict(from_file(words[0]))
+        values = to_dict(from_file(words[0]))
         for word in words[1:]:
             key, _, value = word.partition("=")
-            told[key.lstrip("-")] = _value(value) if "=" in word else True
-        fit(from_dict(told))
+            values[key.lstrip("-")] = _value(value) if "=" in word else True
+        fit(from_dict(values))
     except InputError as error:
         print(f"train: {error}", file=sys.stderr)
         return 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, make_dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ class Augment:
 @dataclass
 class Training:
     """Args:
+    task: which of the learned parts; this is `embedding`.
     name: of the run; its folder is `runs`/`name`.
     data: name of the set of pairs to train on: `cache`/`data`.jsonl, or the path of a manifest or packed file.
     validation: likewise of the set to watch; empty: a tenth of the training buildings is held out.
@@ -52,8 +53,10 @@ class Training:
     overfit: train on one batch, without augmentation, and validate on it.
     resume: go on where the run of this name stopped.
     watch: what is best: a score of validation.
+    export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
     """
 
+    task: str = "embedding"
     name: str = "run"
     runs: str = "runs"
     cache: str = "cache"
@@ -77,6 +80,7 @@ class Training:
     overfit: bool = False
     resume: bool = False
     tensorboard: bool = True
+    export: str = ""
     network: Network = field(default_factory=Network)
     loss: LossSettings = field(default_factory=LossSettings)
     augment: Augment = field(default_factory=Augment)
@@ -93,6 +97,8 @@ def check(settings: Training) -> None:
     Raises:
         InputError: names the key.
     """
+    if settings.task != "embedding":
+        raise InputError(f"task must be embedding, not {settings.task!r}: the other tasks need Hydra, python train.py task=...")
     check_network(settings.network)
     check_loss(settings.loss)
     for key, least in (("epochs", 1), ("batch", 1), ("devices", 1), ("limit", 0), ("patience", 0), ("seed", 0)):
@@ -113,26 +119,6 @@ def check(settings: Training) -> None:
         raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
 
 
-def from_words(words: Sequence[str] = ()) -> Training:
-    """From `configs/train.yaml` and words like ``node=sage loss.kind=triplet``, by Hydra.
-
-    Raises:
-        InputError: one line with the key's name.
-    """
-    from topomerge.config import compose
-
-    return composed(compose("train", known(), words))
-
-
-def known() -> type[Training]:
-    """`with_recipe`, of which Hydra has been told the keys and defaults."""
-    from topomerge.config import register
-
-    schema = with_recipe()
-    register("train", schema)
-    return schema
-
-
 def with_recipe() -> type[Training]:
     """`Training` with all of `configs/data/<name>.yaml` in the place of its name, as Hydra composes it."""
     from topomerge.datasets.pairs.recipe import Recipe
@@ -142,8 +128,8 @@ def with_recipe() -> type[Training]:
 
 def composed(given: Any) -> Training:
     """`Training` out of what `with_recipe` says: of the data only the name is needed."""
-    told = {f.name: getattr(given, f.name) for f in fields(Training)}
-    return Training(**{**told, "data": given.data.name})
+    values = {f.name: getattr(given, f.name) for f in fields(Training)}
+    return Training(**{**values, "data": given.data.name})
 
 
 def from_file(path: str | Path) -> Training:
@@ -159,28 +145,28 @@ def from_file(path: str | Path) -> Training:
         raise InputError(f"{path}: {error.strerror or error}; give the config.json of a run") from error
     try:
         if path.suffix == ".json":
-            told = json.loads(text)
+            values = json.loads(text)
         else:
             import yaml
 
-            told = yaml.safe_load(text)
+            values = yaml.safe_load(text)
     except Exception as error:  # of json or of yaml, which need not be installed for the other
         raise InputError(f"{path}: damaged ({' '.join(str(error).split())[:120]})") from error
     try:
-        return from_dict(told)
+        return from_dict(values)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def from_dict(told: Any) -> Training:
+def from_dict(values: Any) -> Training:
     """From what `to_dict` gave.
 
     Raises:
         InputError: an unknown key, or a value of another type.
     """
-    if not isinstance(told, Mapping):
-        raise InputError(f"settings must be a table of keys, not {type(told).__name__}")
-    values = {**told}
+    if not isinstance(values, Mapping):
+        raise InputError(f"settings must be a table of keys, not {type(values).__name__}")
+    values = dict(values)
     parts: dict[str, Any] = {"network": network_from(values.pop("network", {}))}
     for key, kind in (("loss", LossSettings), ("augment", Augment)):
         parts[key] = _filled(kind, values.pop(key, {}), f"{key}.")
@@ -189,17 +175,17 @@ def from_dict(told: Any) -> Training:
     return settings
 
 
-def _filled(kind: Any, told: Any, where: str, **given: Any) -> Any:
-    if not isinstance(told, Mapping):
-        raise InputError(f"{where.rstrip('.')} must be a table of keys, not {told!r}")
+def _filled(kind: Any, values: Any, where: str, **given: Any) -> Any:
+    if not isinstance(values, Mapping):
+        raise InputError(f"{where.rstrip('.')} must be a table of keys, not {values!r}")
     defaults = {f.name: getattr(kind(), f.name) for f in fields(kind)}
-    for key, value in told.items():
+    for key, value in values.items():
         if key not in defaults or is_dataclass(defaults[key]):
             raise InputError(f"unknown key {where}{key}; {', '.join(sorted(defaults))} are possible")
         wanted = type(defaults[key])
         if not (type(value) is wanted or (wanted is float and type(value) is int)):
             raise InputError(f"{where}{key} must be {wanted.__name__}, not {value!r}")
-    return kind(**told, **given)
+    return kind(**values, **given)
 
 
 def to_dict(settings: Training) -> dict[str, Any]:

@@ -17,7 +17,7 @@ class SweepTable:
     """Hydra's callback that writes table.md when all runs of a sweep have ended."""
 
     def _nothing(self, **_: Any) -> None:
-        """What Hydra tells besides."""
+        """What else Hydra reports."""
 
     on_run_start = on_run_end = on_multirun_start = on_job_start = on_job_end = on_compose_config = _nothing
 
@@ -38,10 +38,13 @@ def write_table(folder: str | Path) -> Path:
     rows = [row for path in sorted(folder.rglob("metrics.jsonl")) if (row := _best(path.parent)) is not None]
     if not rows:
         raise InputError(f"{folder}: no runs in it")
-    rows.sort(key=lambda row: -row["recall@1"])
-    head = ["run", "geometry", "node", "edges", "loss", "seed", *SHOWN, "epoch", "s an epoch"]
+    rows.sort(key=lambda row: -row["best"])
+    columns = ["run", "geometry", "node", "edges", "loss", "seed", *SHOWN, "epoch", "s an epoch"]
+    if any("geometry" not in row for row in rows):  # of other tasks: all their scores
+        columns = list(dict.fromkeys(name for row in rows for name in row if name not in ("best", "geometry")))
+    head = [name for name in columns if any(name in row for row in rows)]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
-    lines += [f"| {' | '.join(_cell(row[name]) for name in head)} |" for row in rows]
+    lines += [f"| {' | '.join(_cell(row.get(name, '–')) for name in head)} |" for row in rows]
     with replacing(folder / "table.md") as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder / "table.md"
@@ -53,14 +56,21 @@ def _cell(value: Any) -> str:
 
 def _best(run: Path) -> dict[str, Any] | None:
     """The best epoch of a run; None where there is none yet."""
-    told = json.loads((run / "config.json").read_text(encoding="utf-8"))
+    config = json.loads((run / "config.json").read_text(encoding="utf-8"))
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
     if not rows:
         return None
-    best = max(rows, key=lambda row: float(row[f"val/{told['watch']}"]))
-    geometry, node = told["network"]["geometry"], told["network"]["node"]
+    best = max(rows, key=lambda row: float(row[f"val/{config['watch']}"]))
+    score = float(best[f"val/{config['watch']}"])
+    seconds = sum(float(row["seconds"]) for row in rows) / len(rows)
+    if config.get("task", "embedding") != "embedding":
+        scores = {name.removeprefix("val/"): value for name, value in best.items() if name.startswith("val/")}
+        row = {"run": run.name, "best": score, "seed": config["seed"], **scores}
+        return {**row, "epoch": best["epoch"] + 1, "s an epoch": seconds}
+    geometry, node = config["network"]["geometry"], config["network"]["node"]
     return {
         "run": run.name,
+        "best": score,
         "geometry": "+".join(geometry["parts"]),
         "node": node["kind"] if node["kind"] == "none" else f"{node['kind']} {node['layers']}",
         "edges": "–"
@@ -72,11 +82,11 @@ def _best(run: Path) -> dict[str, Any] | None:
         else f"rooms within {node['around']:g} m"
         if node.get("around")
         else "yes",
-        "loss": told["loss"]["kind"],
-        "seed": told["seed"],
+        "loss": config["loss"]["kind"],
+        "seed": config["seed"],
         **{name: best.get(f"val/{name}", "–") for name in SHOWN},
         "epoch": best["epoch"] + 1,
-        "s an epoch": sum(float(row["seconds"]) for row in rows) / len(rows),
+        "s an epoch": seconds,
     }
 
 

@@ -14,11 +14,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from topomerge.datasets.core import builder as module
+from topomerge.datasets.core.builder import Row
 from topomerge.datasets.core.plan import Opening, Plan
-from topomerge.datasets.pairs import build as module
 from topomerge.datasets.pairs import example, items
 from topomerge.datasets.pairs.build import Build, build, main
-from topomerge.datasets.pairs.example import PairSet, Row, load_example
+from topomerge.datasets.pairs.example import PairSet, load_example
 from topomerge.datasets.pairs.items import Item, draw_items, plans_of
 from topomerge.datasets.pairs.recipe import Recipe, check
 
@@ -53,7 +54,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A cache that was built without interruption."""
     cache = tmp_path_factory.mktemp("whole")
     report = build(Build(SMALL, str(cache)))
-    assert report.made == report.pairs == 3 and not report.refused
+    assert report.made == report.items == 3 and not report.refused
     return cache
 
 
@@ -64,7 +65,7 @@ def contents(cache: Path) -> dict[str, bytes]:
 def test_what_is_there_is_not_made_again(whole: Path) -> None:
     before = contents(whole)
     report = build(Build(SMALL, str(whole)))
-    assert report.made == 0 and report.pairs == 3
+    assert report.made == 0 and report.items == 3
     assert contents(whole) == before and set(before) == {"small.jsonl", *(f"pairs/{i.name}.npz" for i in draw_items(SMALL, {}))}
 
 
@@ -135,7 +136,7 @@ def test_one_bad_item_ends_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 
     monkeypatch.setattr(example, "make_arrays", make)
     report = build(Build(SMALL, str(tmp_path)))
-    assert report.pairs == report.made == 0 and report.refused == {"KeyError: 'x'": 2, "# has no such rooms": 1}
+    assert report.items == report.made == 0 and report.refused == {"KeyError: 'x'": 2, "# has no such rooms": 1}
     assert (tmp_path / "small.jsonl").read_text() == ""
     assert [p.name for p in (tmp_path / "pairs").iterdir()] == [f"{bad}.refused"], "a KeyError is no reason for good"
     asked: list[str] = []
@@ -261,7 +262,7 @@ def crash(item: Item, plans: list[Plan], folder: str) -> Row:
 @pytest.mark.slow
 def test_an_item_that_kills_its_worker_is_refused() -> None:
     items = draw_items(SMALL, {})
-    rows = module._run([(i, [], "") for i in items], Build(SMALL, jobs=2), lambda row: None, crash)
+    rows = module.run_tasks([(i, [], "") for i in items], Build(SMALL, jobs=2), lambda row: None, crash)
     assert {r.name: r.reason[:6] for r in rows} == {i.name: "killed" if i == items[1] else "" for i in items}
 
 

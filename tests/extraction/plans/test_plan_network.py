@@ -48,17 +48,17 @@ def two_rooms() -> StoreyPlan:
 
 def test_numpy_as_torch() -> None:
     torch = pytest.importorskip("torch")
-    from benchmarks.training.train_plan_network import exported, network
+    from topomerge.models.plan_unet import PlanUNet, exported_weights
 
     torch.manual_seed(0)
-    net = network()
+    net = PlanUNet((16, 32, 40, 40, 40, 32, 16, 12))
     net.train()
     net(torch.rand(4, EVIDENCE_CHANNELS, 64, 64))  # gives the normalisation something to know
     net.eval()
     x = np.random.default_rng(0).random((80, 144, EVIDENCE_CHANNELS)).astype(np.float32)
     with torch.no_grad():
         wanted = net(torch.from_numpy(x.transpose(2, 0, 1)[None].copy()))[0].numpy().transpose(1, 2, 0)
-    assert np.abs(forward(x, exported(net)) - wanted).max() < 1e-4
+    assert np.abs(forward(x, exported_weights(net)) - wanted).max() < 1e-4
 
 
 def test_what_it_sees(two_rooms: StoreyPlan) -> None:

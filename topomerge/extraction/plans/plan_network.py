@@ -47,12 +47,12 @@ def evidence(plan: StoreyPlan) -> Array:
     )
 
 
-def column_probabilities(plan: StoreyPlan) -> Array:
-    """(nx, ny, 5) float32 probability of each of `COLUMN_CLASSES` in each column."""
+def column_probabilities(plan: StoreyPlan, network: dict[str, Array] | None = None) -> Array:
+    """(nx, ny, 5) float32 probability of each of `COLUMN_CLASSES` in each column, by the weights that ship or by others."""
     x, margin = evidence(plan), COARSEST_STRIDE
     nx, ny = x.shape[:2]
     x = np.pad(x, ((margin, -nx % margin + margin), (margin, -ny % margin + margin), (0, 0)))
-    score = forward(x, weights())[margin : margin + nx, margin : margin + ny]
+    score = forward(x, weights() if network is None else network)[margin : margin + nx, margin : margin + ny]
     return softmax(score)
 
 

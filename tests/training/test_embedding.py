@@ -21,13 +21,14 @@ from topomerge.checkpoint import load_state
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.errors import InputError
-from topomerge.training import fit as loop
 from topomerge.training.__main__ import main
 from topomerge.training.batches import changed, make_batch
-from topomerge.training.fit import fit, hold_out, pace
+from topomerge.training.embedding import EmbeddingJob, fit, hold_out
+from topomerge.training.loop import pace
 from topomerge.training.packed import load_pairs
-from topomerge.training.settings import Augment, Training, from_dict, from_file, from_words, to_dict
+from topomerge.training.settings import Augment, Training, from_dict, from_file, to_dict
 from topomerge.training.table import write_table
+from topomerge.training.tasks import settings_of as from_words
 from topomerge.training.validate import embed, validate
 
 ROOT = Path(__file__).parent.parent.parent
@@ -153,20 +154,20 @@ def weights(folder: Path) -> bytes:
 def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch, parts):
     settings.network = replace(SMALL, geometry=Geometry(list(parts), width=16))
     fit(replace(settings, name="whole"), quiet)
-    step, done = loop.Run.step, []
+    step, done = EmbeddingJob.step, []
 
-    def interrupted(self, batch):
+    def interrupted(self, batch, state):
         done.append(1)
         if len(done) == 4:  # in the middle of the second epoch
             os.kill(os.getpid(), signal.SIGINT)
-        return step(self, batch)
+        return step(self, batch, state)
 
-    monkeypatch.setattr(loop.Run, "step", interrupted)
+    monkeypatch.setattr(EmbeddingJob, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fit(replace(settings, name="cut"), quiet)
     state = json.loads((tmp_path / "cut" / "last" / "state.json").read_text())["progress"]
     assert (state["epoch"], state["step"]) == (1, 2)
-    monkeypatch.setattr(loop.Run, "step", step)
+    monkeypatch.setattr(EmbeddingJob, "step", step)
     fit(replace(settings, name="cut", resume=True), quiet)
     for folder in ("best", "last"):
         assert weights(tmp_path / "cut" / folder) == weights(tmp_path / "whole" / folder), folder
@@ -216,8 +217,8 @@ def test_bad_states_are_refused(settings, tmp_path):
         load_state(last, net, optimizer)
     for change, said in (({"format": 7}, "format 7"), ({"class": "builtins.eval"}, "no state")):
         fresh()
-        told = json.loads((last / "state.json").read_text())
-        (last / "state.json").write_text(json.dumps({**told, **change}))
+        state = json.loads((last / "state.json").read_text())
+        (last / "state.json").write_text(json.dumps({**state, **change}))
         with pytest.raises(InputError, match=said):
             load_state(last, net, optimizer)
     fresh()

@@ -1,0 +1,279 @@
+"""The builder of cached sets: an item makes one file, written whole; what was killed goes on where it was.
+
+Pairs to train on (`pairs.build`), plans with their truth (`pairs.plan_examples`), pairs of grids (`pairs.grid_pairs`) and what is
+worked out from each of them (`core.derived`) are all made by it. A file is ``<hash of the inputs>.npz``, or ``.refused`` with the
+reason; the manifest ``<name>.jsonl`` lists what the files say about themselves. Work is shared out by joblib, over processes of
+this machine or a Dask cluster.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn, Protocol
+
+from topomerge.errors import InputError
+from topomerge.io import archive
+from topomerge.io.atomic import replacing
+from topomerge.types import Array
+
+PATIENCE = 20.0  # s to wait for the scheduler of a cluster
+OLD = 3600.0  # s; half-written files of a build that was killed are deleted when they are older
+Task = tuple[Any, Any, str]  # an item, which has a name; what it is made from; the folder of its file
+Say = Callable[[str], None]
+
+
+class Sharing(Protocol):
+    """How the work is shared out: the folder of the cache, processes, scheduler of a cluster, and [k, n]: every n-th item from
+    the k-th on."""
+
+    cache: str
+    jobs: int
+    cluster: str | None
+    part: list[int]
+
+
+class TooLongError(InputError):
+    """An item took too long; on another machine it may not."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of an item: `reason` is empty where its file was made."""
+
+    name: str
+    reason: str
+    seconds: float
+
+
+Work = Callable[[Any, Any, str], Row]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a build did; `refused` counts reasons."""
+
+    manifest: Path
+    items: int
+    made: int
+    seconds: float  # of work, of the items made now
+    refused: dict[str, int]
+
+
+def check_sharing(sharing: Sharing) -> None:
+    """Refuse what work can't be shared out by.
+
+    Raises:
+        InputError: names the key.
+    """
+    if sharing.jobs < 1:
+        raise InputError(f"jobs must be 1 or more, not {sharing.jobs}")
+    if len(sharing.part) != 2 or not 1 <= sharing.part[0] <= sharing.part[1]:
+        raise InputError(f"part must be [k, n] with 1 <= k <= n, not {sharing.part}")
+
+
+def build_set(
+    manifest: Path, tasks: Sequence[Task], work: Work, sharing: Sharing, say: Say = lambda text: None, every: float = 10.0,
+    unit: str = "pairs",
+) -> Report:  # fmt: skip
+    """Make the files of a set that are missing, the first tasks first, then write its manifest.
+
+    Args:
+        manifest: file to write; the tasks name the folder of the files.
+        work: makes the file of a task (`make_item`).
+        say: is told the progress, a line each `every` seconds.
+        unit: what the items are called there.
+    """
+    folders = {item.name: Path(folder) for item, _, folder in tasks}
+    for folder in set(folders.values()):
+        folder.mkdir(parents=True, exist_ok=True)
+        _tidy(folder)
+    rows = {n: row for n, folder in folders.items() if (row := _cached_row(folder / f"{n}.npz")) is not None}
+    refusals = {n: reason for n, folder in folders.items() if n not in rows and (reason := refusal(folder, n))}
+    missing = {task[0].name: task for task in tasks if task[0].name not in rows and task[0].name not in refusals}
+    say(f"{len(rows)} of {len(folders)} {unit} are in the cache, {len(refusals)} are known to be refused")
+    made = run_tasks(list(missing.values()), sharing, Progress(len(missing), say, every, unit), work)
+    rows |= {row.name: about(folders[row.name] / f"{row.name}.npz") for row in made if not row.reason}
+    with replacing(manifest) as beside:
+        lines = [json.dumps(rows[name], sort_keys=True, ensure_ascii=False) for name in sorted(rows)]
+        beside.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+    refused = Counter(_kind(reason) for reason in (*refusals.values(), *(row.reason for row in made)) if reason)
+    seconds = sum(row.seconds for row in made if not row.reason)
+    return Report(manifest, len(rows), sum(not row.reason for row in made), seconds, dict(refused.most_common()))
+
+
+def make_item(name: str, folder: str, make: Callable[[], Mapping[str, Array]], longest: float) -> Row:
+    """Make an item's file in a folder, or one that says why there is none. It never raises: what went wrong is in the row.
+
+    One thread is used, so that as many workers as cores don't fight for them.
+
+    Args:
+        make: gives the arrays; among them `about`, the row of the manifest as JSON.
+        longest: s that it may take.
+    """
+    began = time.perf_counter()
+    try:
+        with one_thread(), time_limit(longest):
+            archive.write(make(), Path(folder) / f"{name}.npz")
+        reason = ""
+    except Exception as error:  # one bad item must not end a build
+        reason = " ".join(str(error).split())[:200]
+        reason = reason if isinstance(error, InputError) else f"{type(error).__name__}: {reason}"
+        if isinstance(error, InputError) and not isinstance(error, TooLongError):
+            with replacing(Path(folder) / f"{name}.refused") as beside:  # the same inputs would be refused again
+                beside.write_text(reason + "\n", encoding="utf-8")
+    return Row(name, reason, time.perf_counter() - began)
+
+
+def refusal(folder: Path, name: str) -> str:
+    """Why an item was refused before; empty where it was not."""
+    path = folder / f"{name}.refused"
+    return path.read_text(encoding="utf-8").strip() if path.is_file() else ""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep BLAS, OpenMP and numba to one thread."""
+    import numba
+    from threadpoolctl import threadpool_limits
+
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        numba.set_num_threads(threads)
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """End what takes too long with an `InputError`; without effect in threads, which get no signals."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def stop(*_: object) -> NoReturn:
+        raise TooLongError(f"takes longer than {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def about(path: Path) -> dict[str, Any]:
+    """What a cached file says about itself, after checking that the whole file can be read.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    row: dict[str, Any] = json.loads(archive.read(path, "cached item")["about"].tobytes())
+    return row
+
+
+def _tidy(folder: Path) -> None:
+    for path in (p for ending in ("npz", "refused") for p in folder.glob(f".*.{ending}")):
+        if time.time() - path.stat().st_mtime > OLD:
+            path.unlink(missing_ok=True)
+
+
+def _cached_row(path: Path) -> dict[str, Any] | None:
+    """What a file of the cache is; a damaged one is made again."""
+    try:
+        return about(path) if path.exists() else None
+    except InputError:
+        return None
+
+
+def _kind(reason: str) -> str:
+    """A reason without the names and numbers, to be counted."""
+    return re.sub(r"\S*\d\S*", "#", reason)
+
+
+class Progress:
+    """Tells now and then how far a build is."""
+
+    def __init__(self, total: int, say: Say, every: float, unit: str = "pairs") -> None:
+        self.total, self.say, self.every, self.unit = total, say, every, unit
+        self.done = self.refused = 0
+        self.began = self.last = time.monotonic()
+
+    def __call__(self, row: Row) -> None:
+        self.done += 1
+        if row.reason:
+            self.refused += 1
+            self.say(f"refused {row.name}: {row.reason}")
+        now = time.monotonic()
+        if now - self.last >= self.every or self.done == self.total:
+            self.last = now
+            each = (now - self.began) / self.done
+            left = time.strftime("%H:%M:%S", time.gmtime(each * (self.total - self.done)))
+            self.say(f"{self.done} of {self.total} {self.unit}, {self.refused} refused, {each:.2f} s each, {left} left")
+
+
+def run_tasks(tasks: list[Task], sharing: Sharing, note: Callable[[Row], None], work: Work) -> list[Row]:
+    """Rows of all tasks. A task that kills its worker is found by running those that were under way one by one."""
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    rows: dict[str, Row] = {}
+    while pending := [task for task in tasks if task[0].name not in rows]:
+        try:
+            for row in _parallel(pending, sharing, work):
+                rows[row.name] = row
+                note(row)
+        except TerminatedWorkerError:
+            left = [task for task in pending if task[0].name not in rows]
+            for row in (_alone(task, sharing, work) for task in left[: 2 * sharing.jobs]):
+                rows[row.name] = row
+                note(row)
+    return list(rows.values())
+
+
+def _alone(task: Task, sharing: Sharing, work: Work) -> Row:
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    try:
+        return next(iter(list(_parallel([task], sharing, work))))
+    except TerminatedWorkerError:
+        return Row(task[0].name, "killed its worker (out of memory?)", 0.0)
+
+
+def _parallel(tasks: Iterable[Task], sharing: Sharing, work: Work) -> Iterator[Row]:
+    from joblib import Parallel, delayed
+
+    with _backend(sharing):
+        parallel = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2 * n_jobs")
+        yield from parallel(delayed(work)(*task) for task in tasks)
+
+
+@contextmanager
+def _backend(sharing: Sharing) -> Iterator[None]:
+    """Where joblib works: processes started afresh (never forked: numba's threads don't survive that), or a cluster."""
+    from joblib import parallel_config
+
+    if sharing.cluster is None:
+        with parallel_config(backend="loky", n_jobs=sharing.jobs, inner_max_num_threads=1):
+            yield
+        return
+    try:
+        from dask.distributed import Client
+    except ImportError as error:
+        raise InputError("a cluster needs Dask: pip install topomerge[cluster]") from error
+    try:
+        client = Client(sharing.cluster, timeout=PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cluster: no scheduler answers at {sharing.cluster}") from error
+    with client, parallel_config(backend="dask", client=client, n_jobs=-1):
+        yield

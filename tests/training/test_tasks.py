@@ -1,0 +1,201 @@
+"""The tasks of `train.py`: each is trained on tiny data, goes on where it stopped, exports a file that the product reads, and is
+judged; wrong words are named."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.training import tiny
+from topomerge.embedding.engineered import scaled
+from topomerge.errors import InputError
+from topomerge.extraction.plans.door_classifier import door_probability
+from topomerge.extraction.plans.plan_network import column_probabilities
+from topomerge.fusion.verify import model
+from topomerge.io.weight_files import VARIABLE, weights_file
+from topomerge.matching.odds import odds_weights
+from topomerge.training import door_classification, plan_segmentation
+from topomerge.training.door_classification import door_scores
+from topomerge.training.judging import judge_task
+from topomerge.training.loop import State
+from topomerge.training.plan_segmentation import class_scores
+from topomerge.training.tasks import TASKS, settings_of, train, weights_of
+
+ROOT = Path(__file__).parent.parent.parent
+NETWORKS = {
+    "plan_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
+    "door_classification": ["epochs=2", "batch=64", "hidden=4", "networks=2"],
+}
+FITS = ("merge_belief", "match_odds", "feature_scale")
+
+
+def quiet(text: str) -> None:
+    """Say nothing."""
+
+
+@pytest.fixture
+def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Words of a task whose data is tiny."""
+    paths = tiny.plan_files(tmp_path / "plans", 4)
+    monkeypatch.setattr(plan_segmentation, "build_plans", lambda *_: (paths, None))
+    monkeypatch.setattr(door_classification, "door_examples", lambda *_: tiny.door_tables(320))
+    for task, name, make in (
+        ("merge_belief", "belief_rows", tiny.belief_rows),
+        ("match_odds", "pair_evidence", tiny.evidence),
+        ("feature_scale", "pair_features", tiny.feature_pairs),
+    ):
+        monkeypatch.setattr(importlib.import_module(f"topomerge.training.{task}"), name, make)
+
+    def of(task: str, *more: str) -> list[str]:
+        return [f"task={task}", f"runs={tmp_path / 'runs'}", "tensorboard=false", *NETWORKS.get(task, []), *more]
+
+    return of
+
+
+def read(task: str) -> Any:
+    """What the product does with a task's file."""
+    plan = tiny.two_rooms(0).plan
+    return {
+        "plan_segmentation": lambda: column_probabilities(plan),
+        "door_classification": lambda: door_probability(np.zeros((3, 17))),
+        "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
+        "match_odds": lambda: odds_weights("match"),
+        "feature_scale": lambda: scaled(np.ones((2, 18)), "matched"),
+    }[task]()
+
+
+@pytest.mark.parametrize("task", [*NETWORKS, *FITS])
+def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monkeypatch) -> None:
+    shipped = read(task)
+    scores = train(settings_of(words(task, f"export={tmp_path / 'exported'}")), quiet)
+    run = tmp_path / "runs" / task
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert len(rows) == (2 if task in NETWORKS else 1) and all(np.isfinite(value) for value in scores.values())
+    assert json.loads((run / "config.json").read_text())["task"] == task
+    card = json.loads((run / "best" / f"{Path(TASKS[task].file).stem}.card.json").read_text())
+    assert card["task"] == task and f"task={task}" in card["command"] and card["metrics"] and card["data"]["split"] == "train"
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "exported"))
+    assert weights_file(TASKS[task].package, TASKS[task].file).parent == tmp_path / "exported"
+    trained = read(task)
+    assert np.isfinite(trained).all() and not np.array_equal(trained, shipped)
+    monkeypatch.delenv(VARIABLE)
+    assert np.array_equal(read(task), shipped)
+    judged = judge_task(task, words(task, f"run={run}", f"folder={tmp_path / 'eval'}"), quiet)
+    assert f"| {next(iter(judged.scores))} |" in judged.summary and (judged.folder / "scores.json").exists()
+    assert weights_of(task, "").is_file() and judge_task(task, words(task, f"folder={tmp_path / 'eval'}"), quiet).scores
+
+
+@pytest.mark.parametrize("task", list(NETWORKS))
+def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
+    kind = {"plan_segmentation": plan_segmentation.PlanJob, "door_classification": door_classification.DoorJob}[task]
+    train(settings_of(words(task, "name=whole")), quiet)
+    step, seen = kind.step, []
+
+    def cut(self, batch: Any, state: State) -> dict[str, float]:
+        seen.append(1)
+        if len(seen) == 4:
+            os.kill(os.getpid(), 2)
+        return step(self, batch, state)
+
+    monkeypatch.setattr(kind, "step", cut)
+    with pytest.raises(KeyboardInterrupt):
+        train(settings_of(words(task, "name=cut")), quiet)
+    monkeypatch.setattr(kind, "step", step)
+    train(settings_of(words(task, "name=cut", "resume=true")), quiet)
+    files = [tmp_path / "runs" / name / "last" / "network.safetensors" for name in ("cut", "whole")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    with pytest.raises(InputError, match="nothing to resume"):
+        train(settings_of(words(task, "name=none", "resume=true")), quiet)
+
+
+@pytest.mark.parametrize("task", FITS)
+def test_a_fit_that_ended_is_left_as_it_is(task, words, tmp_path) -> None:
+    first = train(settings_of(words(task)), quiet)
+    said: list[str] = []
+    assert train(settings_of(words(task, "resume=true")), said.append) == first and "is there" in said[0]
+
+
+def test_fits_learn_what_is_so(words) -> None:
+    assert train(settings_of(words("merge_belief")), quiet)["val/right_first"] > 0.6
+    odds = train(settings_of(words("match_odds")), quiet)
+    assert odds["val/match_accuracy"] > 0.7 and odds["val/hypothesis_accuracy"] > 0.7
+    assert train(settings_of(words("feature_scale")), quiet)["val/recall@1"] > 0.9
+    assert train(settings_of(words("door_classification", "epochs=8", "rate=0.02")), quiet)["val/auc"] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("given", "key"),
+    [
+        (["task=door"], "task=door"),
+        (["task=plan_segmentation", "data.scan=3"], "data.scan"),
+        (["task=plan_segmentation", "epochs=many"], "epochs"),
+        (["task=plan_segmentation", "crop=30"], "crop"),
+        (["task=plan_segmentation", "loss.classes=[1,2]"], "loss.classes"),
+        (["task=door_classification", "networks=0"], "networks"),
+        (["task=merge_belief", "threshold=2"], "threshold"),
+        (["task=match_odds", "pulls=1"], "pulls"),
+        (["task=feature_scale", "name=../x"], "name"),
+        (["task=embedding", "epoch=3"], "epoch"),
+    ],
+)
+def test_a_wrong_word_is_one_line_with_its_key(given: list[str], key: str) -> None:
+    with pytest.raises(InputError, match=key) as refused:
+        settings_of(given)
+    assert "\n" not in str(refused.value)
+
+
+def test_scores_of_classes_and_doors() -> None:
+    scores = class_scores(np.diag([5, 4, 0, 0, 1]))
+    assert scores["mean_iou"] == scores["mean_f1"] == scores["accuracy"] == 1 and scores["iou_shut"] == 0
+    scores = class_scores(np.array([[3, 1], [1, 3]] + [[0, 0]] * 3) @ np.eye(2, 5, dtype=int))
+    assert scores["iou_inside"] == pytest.approx(0.6) and scores["f1_wall"] == pytest.approx(0.75)
+    doors = door_scores(np.array([0.9, 0.8, 0.3, 0.1]), np.array([True, False, True, False]))
+    assert doors["precision"] == doors["recall"] == 0.5 and doors["auc"] == pytest.approx(0.75)
+
+
+def run(*given: str, **variables: str) -> subprocess.CompletedProcess:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "TOPOMERGE_DATA": "", **variables}
+    common: dict[str, Any] = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 900, "check": False}
+    return subprocess.run([sys.executable, *given], env=environment, **common)
+
+
+SMALL_PAIRS = [
+    "data.pairs=2", "data.rooms=[4,5]", "data.sources={procedural: 1, r2v: 0, campus: 0}", "heldout.pairs=1",
+    "heldout.rooms=[4,5]",
+]  # fmt: skip
+SIMULATED = {
+    "plan_segmentation": [*NETWORKS["plan_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
+    "door_classification": ["data=plan_scans", "data.scans=4", "data.seed=0", "epochs=2", "hold_out=2", "heldout.scans=1"],
+    "merge_belief": [
+        "data.sets=[5]", "data.drawings=[2]", "data.rooms=[4,6]", "data.sensors={depth: 1.0, tls: 1.0}", "folds=2",
+        "hypotheses=4", "heldout.sets=[1]", "heldout.drawings=[0]", "heldout.rooms=[4,6]", "heldout.strangers=0",
+    ],
+    "match_odds": [*SMALL_PAIRS, "folds=2"],
+    "feature_scale": SMALL_PAIRS,
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", list(SIMULATED))
+def test_from_simulated_data_to_a_merge(task: str, tmp_path: Path) -> None:
+    """The whole way, as typed: data is made, weights trained and exported, judged, and used by extract and merge."""
+    common = [f"task={task}", f"cache={tmp_path / 'cache'}", *SIMULATED[task]]
+    done = run("train.py", *common, f"runs={tmp_path}", f"export={tmp_path / 'exported'}")
+    assert done.returncode == 0, done.stderr
+    assert list((tmp_path / task / "tb").glob("events*"))
+    done = run("evaluate.py", *common, f"run={tmp_path / task}", f"folder={tmp_path / 'eval'}")
+    assert done.returncode == 0 and "| score | value |" in done.stdout, done.stderr
+    weights = {VARIABLE: str(tmp_path / "exported")}
+    pair = ["--building", "office", "--seed", "5", "--sensors", "tls,depth", "--rooms", "5", "--overlap", "0.7"]
+    assert run("-m", "topomerge", "simulate", *pair, "-o", str(tmp_path / "pair")).returncode == 0
+    files = [str(tmp_path / "pair" / name) for name in ("a.ply", "b.ply")]
+    done = run("-m", "topomerge", "merge", *files, "-o", str(tmp_path / "merged"), **weights)
+    assert done.returncode in (0, 2), done.stderr

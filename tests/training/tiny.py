@@ -1,0 +1,107 @@
+"""Learning sets of each task that are made in no time: plans of two rooms; hypotheses, evidence and features out of numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from topomerge.datasets.pairs.plan_examples import PlanExample, PlanItem, example_arrays
+from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
+
+from topomerge.embedding.engineered import FEATURES
+from topomerge.extraction.plans.plan import profile_bands
+from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.io import archive
+from topomerge.matching.odds import hypothesis_features
+from topomerge.training.feature_scale import PairFeatures
+from topomerge.training.match_odds import Evidence
+
+EDGE = 0.1  # m
+
+
+def plan_files(folder: Path, count: int) -> list[Path]:
+    """Files of scans of two rooms beside each other with a door between them, each wider than the one before."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for k in range(count):
+        path = folder / f"{k}.npz"
+        archive.write(example_arrays(PlanItem(k, "procedural", 0, "", ""), [two_rooms(4 * k)]), path)
+        paths.append(path)
+    return paths
+
+
+def two_rooms(wider: int) -> PlanExample:
+    """5 m and a little by 4 m each, with a door of 0.9 m."""
+    nx, ny, middle = 106 + 2 * wider, 46, 52 + wider
+    wall = np.zeros((nx, ny), bool)
+    wall[1:3], wall[-3:-1], wall[:, 1:3], wall[:, -3:-1], wall[middle : middle + 2] = True, True, True, True, True
+    wall[middle : middle + 2, 18:27] = False
+    inside = ~wall
+    inside[[0, -1]] = inside[:, [0, -1]] = False
+    bands = profile_bands(EDGE)
+    profile = np.where(wall, bands.mask(-0.3, 2.4), np.where(inside, bands.mask(-0.3, 0.3), 0)).astype(np.uint64)
+    nowhere = np.full(wall.shape, np.nan)
+    plan = StoreyPlan(np.zeros(2), EDGE, wall, inside, profile, bands, np.zeros(wall.shape), nowhere)
+    room = np.full(wall.shape, -1, np.int16)
+    room[inside] = (np.argwhere(inside)[:, 0] > middle).astype(np.int16)
+    truth = np.full(wall.shape, TRUE_CLASSES.index("outside"), np.uint8)
+    truth[inside], truth[wall] = TRUE_CLASSES.index("inside"), TRUE_CLASSES.index("wall")
+    truth[middle : middle + 2, 18:27] = TRUE_CLASSES.index("doorway")
+    return PlanExample(plan, room, truth, np.array([0, 1]), "drawn/procedural")
+
+
+def door_tables(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Features, answers that the first feature tells, and scans."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(count, 17))
+    return x, x[:, 0] > 0, np.arange(count) % 8
+
+
+def belief_rows(*_: Any) -> list[dict[str, Any]]:
+    """Pairs with and without slices, whose right hypothesis brings more walls together, mostly."""
+    rng, rows = np.random.default_rng(0), []
+    for k in range(40):
+        flat, hypotheses = k % 2 == 1, []
+        for number in range(4):
+            right = number == 0 and k % 3 > 0
+            features = {name: float(abs(rng.normal())) for name in AMOUNTS} | {n: float(rng.uniform(0.2, 0.5)) for n in SHARES}
+            features |= {"walls": 10.0 + 20 * right + rng.random(), "conflict": 1.0, "met": 0.5, "chance": 0.3}
+            features["sliced"] = float(flat)
+            closely = {name: float(rng.uniform(0.1, 1.0)) for name in WINNER_INPUTS}
+            error = [0.1, 0.0, 1.0] if right else [5.0, 0.0, 90.0]
+            hypotheses.append({**features, **(closely if number < 2 else {}), "err": error})
+        row = {"name": str(k), "common": 30.0 + k, "kind": "overlap", "building": f"b{k}", "hyps": hypotheses}
+        rows.append({**row, "sensors": ["tls", "laser2d" if flat else "depth"]})
+    return rows
+
+
+AMOUNTS = ("free", "clutter", "level", "ceilings", "ceiling_area")
+SHARES = ("ratio", "opposed", "conflict_share", "worst_conflict", "share")
+WINNER_INPUTS = (
+    "in_place", "by_chance", "pieces", "free", "tall_conflict", "crossing", "worst_ratio", "squares", "bad_squares",
+    "moved_walls", "hanging_met", "hanging",
+)  # fmt: skip
+
+
+def evidence(*_: Any) -> list[Evidence]:
+    """Hypotheses of which that with more evidence is right, and rooms of which those that fit are one."""
+    rng, pairs = np.random.default_rng(0), []
+    for k in range(12):
+        right = np.array([k % 4 > 0, False, False])
+        metres = np.column_stack([rng.uniform(1, 5, 3) + 30 * right, rng.uniform(1, 5, 3), rng.uniform(1, 20, 3)])
+        one = rng.random(8) < 0.5
+        rooms = np.column_stack([np.ones(8), one + rng.random(8), rng.random(8), np.zeros(8), np.zeros(8)])
+        pairs.append(Evidence(f"b{k}", hypothesis_features(metres), right, rooms, one))
+    return pairs
+
+
+def feature_pairs(*_: Any) -> list[PairFeatures]:
+    """Rooms whose features hardly differ between two maps."""
+    rng, pairs = np.random.default_rng(0), []
+    for k in range(6):
+        a = rng.normal(size=(9, len(FEATURES)))
+        b = a + 0.05 * rng.normal(size=a.shape)
+        rows = np.arange(9)
+        pairs.append(PairFeatures(f"b{k}", a, b, rows == 0, rows == 1, np.column_stack([rows, rows]), rows > 1))
+    return pairs

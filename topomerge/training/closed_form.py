@@ -1,0 +1,72 @@
+"""What tasks without epochs share: weights out of one fit, with a run's folder, scores, a card and an export all the same."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import numpy as np
+
+from topomerge.io.atomic import replacing
+from topomerge.training.log import Log
+from topomerge.training.loop import Say
+from topomerge.training.run_folder import export_files, write_card, write_settings
+from topomerge.training.task_settings import TaskSettings
+from topomerge.training.tasks import TASKS
+from topomerge.types import Array
+
+BANDS = (0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.97, 1.0)  # of probabilities, over which their calibration is measured
+Settings = TypeVar("Settings", bound=TaskSettings)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What a fit gives: weights as the package reads them, scores on what was left out, and what was learned from."""
+
+    weights: dict[str, Any]
+    metrics: dict[str, float]
+    origin: dict[str, Any]
+
+
+def run_fit(settings: Settings, make: Callable[[Settings, Say], Fitted], say: Say) -> dict[str, float]:
+    """Fit, and leave a run's folder. With `resume` a run that has ended is left as it is: its data is cached either way.
+
+    Returns:
+        The scores, as in metrics.jsonl.
+    """
+    best = settings.folder / "best" / TASKS[settings.task].file
+    metrics = settings.folder / "metrics.jsonl"
+    if settings.resume and best.exists() and metrics.exists():
+        say(f"{best}: is there")
+        row = json.loads(metrics.read_text(encoding="utf-8").splitlines()[-1])
+    else:
+        write_settings(settings.folder, asdict(settings))
+        began = time.perf_counter()
+        fitted = make(settings, say)
+        log = Log(settings.folder, settings.tensorboard)
+        scores = {f"val/{name}": float(value) for name, value in fitted.metrics.items()}
+        row = {"epoch": 0, "seconds": time.perf_counter() - began, **scores}
+        log.row(row)
+        log.close()
+        best.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(best) as beside:
+            beside.write_text(json.dumps(fitted.weights, indent=1) + "\n", encoding="utf-8")
+        write_card(best, asdict(settings), fitted.origin, scores)
+        say(", ".join(f"{name} {value:.3f}" for name, value in fitted.metrics.items()))
+    if settings.export:
+        export_files(best.parent, settings.export, TASKS[settings.task].package)
+    return {name: value for name, value in row.items() if isinstance(value, float)}
+
+
+def calibration_error(p: Array, y: Array) -> float:
+    """Expected calibration error: how far probabilities (n,) are from how often it was so (n,), over `BANDS`."""
+    error = 0.0
+    for low, high in pairwise(BANDS):
+        band = (p >= low) & (p < high + (high == 1))
+        if band.any():
+            error += band.mean() * abs(float(np.mean(p[band])) - float(np.mean(y[band])))
+    return float(error)

@@ -1,0 +1,241 @@
+"""Task `door_classification`: is a narrowing of the floor a door (`extraction.plans.door_classifier`)?
+
+A plan is cut into regions as the extraction does. Two neighbouring regions are an example: 1 where most of them lie in different
+true rooms. Regions of one true room are then merged, as a perfect classifier would, and what remains gives more examples: the
+classifier is asked about half-merged rooms, too. It hears the plan network, which is trained before.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from topomerge.datasets.core.derived import derive, read_derived
+from topomerge.datasets.pairs.plan_examples import PlanRecipe, build_plans, load_examples
+from topomerge.errors import InputError
+from topomerge.extraction.plans.door_classifier import read_classifier
+from topomerge.extraction.plans.passages import DOOR_FEATURES, clearance_of, door_features, find_passages, regions_of
+from topomerge.extraction.plans.plan_network import PLAN_NETWORK_FILE, column_probabilities, without_furniture
+from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.io.atomic import replacing
+from topomerge.io.weight_files import weights_file
+from topomerge.numpy_nn import perceptron, sigmoid
+from topomerge.training.loop import Say, State, mixed
+from topomerge.training.networks import NetworkJob, run_network
+from topomerge.training.task_settings import DoorClassification
+from topomerge.types import Array
+
+PURE = 0.7  # share of a region in its true room; regions between rooms are no example
+RANGE = (0.005, 0.995)  # quantiles that features are clipped to
+Doors = tuple[Array, Array, Array]  # (n, 17) features, (n,) is it a door, (n,) number of the scan
+
+
+def fit(settings: DoorClassification, say: Say) -> dict[str, float]:
+    """Train; the scores of the best epoch.
+
+    Raises:
+        InputError: no scan to train on or to watch.
+    """
+    x, y, scan = door_examples(settings.data, settings, say)
+    watched = scan % settings.hold_out == 0
+    if len(np.unique(y[~watched])) < 2 or len(np.unique(y[watched])) < 2:
+        raise InputError(f"data.scans={settings.data.scans}: too few scans to learn doors from some and watch others")
+    torch.manual_seed(mixed(settings.seed))
+    job = DoorJob(settings, (x[~watched], y[~watched], scan[~watched]), (x[watched], y[watched], scan[watched]))
+    say(f"{len(y)} examples of {len(np.unique(scan))} scans, {y.mean():.3f} of them doors")
+    return run_network(job, settings, job.steps, say)
+
+
+def door_examples(recipe: PlanRecipe, settings: DoorClassification, say: Say) -> Doors:
+    """Examples of a set of scans, cached."""
+    paths, _ = build_plans(recipe, settings, say)
+    digest = hashlib.sha256(weights_file("topomerge.extraction.plans", PLAN_NETWORK_FILE).read_bytes()).hexdigest()[:16]
+    files, _ = derive(f"{recipe.name}_doors", scan_doors, [[path] for path in paths], settings, {"plan_network": digest}, say)
+    scans = [read_derived(file) for file in files]
+    if not scans:
+        raise InputError(f"{recipe.name}: no scan could be made; see the reasons above")
+    numbers = np.repeat(np.arange(len(scans)), [len(s["y"]) for s in scans])
+    return np.concatenate([s["x"] for s in scans]), np.concatenate([s["y"] for s in scans]), numbers
+
+
+def scan_doors(path: Path, plan_network: str) -> dict[str, Array]:
+    """Features and answers for the neighbouring regions of the plans of a scan.
+
+    Args:
+        plan_network: digest of the weights that cut the plans; they only name the cached file.
+    """
+    parts = [region_pairs(e.plan, e.room, set(e.visited.tolist())) for e in load_examples(path)]
+    x = np.array([row for rows, _ in parts for row in rows], float).reshape(-1, len(DOOR_FEATURES))
+    return {"x": x, "y": np.array([answer for _, answers in parts for answer in answers], bool)}
+
+
+def region_pairs(plan: StoreyPlan, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
+    """Features and answers for the neighbouring regions of one plan, before and while those of one room are merged."""
+    chance = column_probabilities(plan)
+    plan = without_furniture(plan, chance)
+    clearance = clearance_of(plan)
+    region = regions_of(plan, chance)
+    room, area = _rooms_of_regions(region, truth, plan.edge)
+    peak = np.zeros(len(room))
+    inside = region >= 0
+    np.maximum.at(peak, region[inside], clearance[inside])
+    links = dict(find_passages(plan, clearance, region, chance))
+    x: list[Array] = []
+    y: list[bool] = []
+
+    def add(pairs: list[tuple[int, int]]) -> None:
+        for a, b in pairs:
+            if room[a] >= 0 and room[b] >= 0 and (room[a] in visited or room[b] in visited):
+                x.append(door_features(links[a, b], (peak[a], peak[b]), (area[a], area[b])))
+                y.append(bool(room[a] != room[b]))
+
+    add(list(links))
+    while same := [p for p in links if room[p[0]] >= 0 and room[p[0]] == room[p[1]]]:
+        left, gone = max(same, key=lambda p: (links[p].width / min(peak[p[0]], peak[p[1]]), p))
+        del links[left, gone]
+        peak[left], area[left] = max(peak[left], peak[gone]), area[left] + area[gone]
+        for old in [p for p in links if gone in p]:
+            other = old[0] if old[1] == gone else old[1]
+            new, passage = (min(left, other), max(left, other)), links.pop(old)
+            if new not in links or passage.width > links[new].width:
+                links[new] = passage
+        add([p for p in links if left in p])
+    return x, y
+
+
+def _rooms_of_regions(region: Array, truth: Array, edge: float) -> tuple[Array, Array]:
+    """True room of each region, -1 where it lies between rooms, and the regions' areas, m2."""
+    count, rooms = int(region.max(initial=-1)) + 1, int(truth.max(initial=-1)) + 1
+    votes = np.zeros((count, rooms + 1))
+    inside = region >= 0
+    np.add.at(votes, (region[inside], truth[inside]), 1)
+    if not count:
+        return np.zeros(0, int), np.zeros(0)
+    room = np.where(votes.max(axis=1) >= PURE * votes.sum(axis=1), votes.argmax(axis=1), -1)
+    room[room == rooms] = -1
+    return room, votes.sum(axis=1) * edge**2
+
+
+class Perceptrons(nn.Module):
+    """Several networks with one hidden layer each, that know nothing of each other."""
+
+    def __init__(self, inputs: int, hidden: int, networks: int) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(
+            nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1)) for _ in range(networks)
+        )
+
+    def layers(self) -> list[tuple[Array, Array]]:
+        """The mean of their scores as one network with as many times the hidden units: weights (in, out) and biases."""
+        first = [member[0] for member in self.members]  # type: ignore[index]
+        last = [member[2] for member in self.members]  # type: ignore[index]
+        numbers = [[(m.weight.detach().numpy().T, m.bias.detach().numpy()) for m in layer] for layer in (first, last)]
+        w, b = np.concatenate([w for w, _ in numbers[0]], axis=1), np.concatenate([b for _, b in numbers[0]])
+        return [(w, b), (np.concatenate([v for v, _ in numbers[1]]) / len(last), np.mean([c for _, c in numbers[1]], axis=0))]
+
+
+class DoorJob(NetworkJob):
+    """All examples an epoch, in another order for each network; scans with many examples count less than proportionally."""
+
+    def __init__(self, settings: DoorClassification, learned: Doors, watched: Doors) -> None:
+        x, y, scan = learned
+        origin = {"set": settings.data.name, "split": settings.data.split, "examples": len(y), "watched": len(watched[1])}
+        super().__init__(settings, Perceptrons(x.shape[1], settings.hidden, settings.networks), origin)
+        self.options, self.watched = settings, watched
+        low, high = np.quantile(x, RANGE, axis=0)
+        clipped = np.clip(x, low, high)
+        self.scaling = {"low": low, "high": high, "mean": clipped.mean(axis=0), "scale": clipped.std(axis=0) + 1e-6}
+        weight = 1 / np.sqrt(np.unique(scan, return_counts=True)[1][np.unique(scan, return_inverse=True)[1]])
+        inputs = (clipped - self.scaling["mean"]) / self.scaling["scale"]
+        self.tensors = [torch.tensor(v, dtype=torch.float32) for v in (inputs, y, weight / weight.mean())]
+        self.steps = math.ceil(len(y) / settings.batch)
+
+    def batches(self, state: State) -> Generator[list[tuple[Tensor, ...]], None, None]:
+        """Of each network its rows: jittered inputs, answers, weights."""
+        options, count = self.options, len(self.tensors[0])
+        of_epoch = [torch.Generator().manual_seed(mixed(options.seed, k, state.epoch)) for k in range(options.networks)]
+        orders = [torch.randperm(count, generator=generator) for generator in of_epoch]
+        for step in range(state.step, self.steps):
+            batch: list[tuple[Tensor, ...]] = []
+            for k, order in enumerate(orders):
+                rows = order[step * options.batch :][: options.batch]
+                generator = torch.Generator().manual_seed(mixed(options.seed, k, state.epoch, step, 1))
+                inputs, answers, weight = (tensor[rows] for tensor in self.tensors)
+                noise = torch.randn(inputs.shape, generator=generator)
+                batch.append((inputs + options.noise * noise, answers, weight))
+            yield batch
+
+    def step(self, batch: list[tuple[Tensor, ...]], state: State) -> dict[str, float]:
+        """One step of the optimizer, of all networks."""
+        options = self.options
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.rate * 0.5 * (1 + math.cos(math.pi * state.epoch / options.epochs))
+        losses = []
+        for member, (inputs, answers, weight) in zip(self.network.members, batch, strict=True):  # type: ignore[arg-type]
+            scores = member(inputs)[:, 0]
+            each = nn.functional.binary_cross_entropy_with_logits(scores, answers, reduction="none")
+            losses.append((each * weight).mean())
+        self.optimizer.zero_grad()
+        torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        return {"loss": float(torch.stack(losses).mean().detach())}
+
+    def size(self, batch: list[tuple[Tensor, ...]]) -> int:
+        """Examples."""
+        return len(batch[0][0])
+
+    def weights(self) -> dict[str, Any]:
+        """As the package reads them."""
+        assert isinstance(self.network, Perceptrons)
+        values: dict[str, Any] = {name: numbers.round(4).tolist() for name, numbers in self.scaling.items()}
+        layers = [[w.round(4).tolist(), b.round(4).tolist()] for w, b in self.network.layers()]
+        return {"features": list(DOOR_FEATURES), **values, "layers": layers}
+
+    def scores(self) -> dict[str, float]:
+        """Of the scans that are watched."""
+        weights = self.weights()
+        arrays: dict[str, Any] = {name: np.array(weights[name]) for name in self.scaling}
+        layers = [(np.array(w), np.array(b)) for w, b in weights["layers"]]
+        return door_scores(probabilities(self.watched[0], {**arrays, "layers": layers}), self.watched[1])
+
+    def write_weights(self, path: Path) -> None:
+        """A table as JSON."""
+        with replacing(path) as beside:
+            beside.write_text(json.dumps(self.weights()), encoding="utf-8")
+
+
+def probabilities(x: Array, weights: dict[str, Any]) -> Array:
+    """(n,) probability of a door, as `door_classifier.door_probability` with these weights."""
+    z = (np.clip(x, weights["low"], weights["high"]) - weights["mean"]) / weights["scale"]
+    return sigmoid(perceptron(z, weights["layers"])[:, 0])
+
+
+def door_scores(p: Array, y: Array, threshold: float = 0.5) -> dict[str, float]:
+    """Precision and recall of doors from a probability on, area under the ROC curve, log loss and the share that is right."""
+    said, y = p > threshold, np.asarray(y, bool)
+    order = np.unique(p, return_inverse=True)[1]
+    ranks = (np.cumsum(np.bincount(order)) - (np.bincount(order) - 1) / 2)[order]
+    positive, negative = int(y.sum()), int((~y).sum())
+    auc = (ranks[y].sum() - positive * (positive + 1) / 2) / max(positive * negative, 1)
+    return {
+        "precision": float((said & y).sum() / max(said.sum(), 1)),
+        "recall": float((said & y).sum() / max(positive, 1)),
+        "auc": float(auc),
+        "log_loss": float(-np.mean(np.log(np.where(y, p, 1 - p) + 1e-6))),
+        "accuracy": float((said == y).mean()),
+        "doors": float(y.mean()),
+    }
+
+
+def judge(settings: DoorClassification, file: Path, say: Say) -> dict[str, Any]:
+    """Scores of weights on scans of buildings that trained nothing."""
+    x, y, scan = door_examples(settings.heldout, settings, say)
+    return {**door_scores(probabilities(x, read_classifier(file)), y), "examples": len(y), "scans": len(np.unique(scan))}

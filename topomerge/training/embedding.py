@@ -1,0 +1,233 @@
+"""Task `embedding`: the network that gives each room of a map a row of numbers, so that two views of one room get close ones.
+
+The loop is `training.loop`; several processes share its steps by fabric.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import sys
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from topomerge.checkpoint import load_state
+from topomerge.errors import InputError
+from topomerge.models.embedder import Embedder
+from topomerge.models.losses import Objective
+from topomerge.models.weights import read_embedder, save_embedder
+from topomerge.training.batches import MapPair, make_batch
+from topomerge.training.embedding_pictures import show_embedder
+from topomerge.training.log import Log
+from topomerge.training.loop import Loop, Schedule, State, mixed, pace
+from topomerge.training.packed import EXTRAS, GraphPair, load_pairs
+from topomerge.training.run_folder import export_files, write_settings
+from topomerge.training.settings import Augment, Training, check, to_dict
+from topomerge.training.validate import validate
+
+Say = Callable[[str], None]
+
+
+def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr, flush=True)) -> dict[str, float]:
+    """Train, and leave a run's folder: config.json, config.yaml, metrics.jsonl, best/, last/, tb/.
+
+    Returns:
+        The scores of the best epoch.
+
+    Raises:
+        InputError: settings that make no sense, data or a state that can't be read.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM; the state is saved.
+    """
+    if settings.overfit:
+        settings = replace(settings, watch="f1", patience=0)
+    check(settings)
+    fabric = _fabric(settings)
+    chief = fabric.is_global_zero
+    say = say if chief else lambda text: None
+    train, watched = _data(settings, say, fabric)
+    network = _network(settings, train)
+    trained = [p for p in network.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(trained, settings.rate, weight_decay=settings.decay)
+    state = State()
+    if settings.resume:
+        state = State(**load_state(settings.folder / "last", network, optimizer))
+    elif chief:
+        write_settings(settings.folder, to_dict(settings))
+    fabric.barrier()
+    job = EmbeddingJob(settings, fabric, network, optimizer, (train, watched))
+    log = Log(settings.folder, settings.tensorboard, state.epoch) if chief else None
+    perfect = 1.0 if settings.overfit else float("inf")
+    schedule = Schedule(settings.folder, settings.epochs, job.steps, settings.watch, settings.patience, perfect)
+    best = Loop(job, schedule, state, log, say).run()
+    if settings.export and chief:
+        export_files(settings.folder / "best", settings.export, "topomerge.embedding.pretrained")
+    return best
+
+
+class EmbeddingJob:
+    """What the loop does for an embedder.
+
+    Args:
+        pairs: to train on, and to watch.
+    """
+
+    def __init__(
+        self, settings: Training, fabric: Any, network: Embedder, optimizer: Any, pairs: tuple[Sequence[GraphPair], ...]
+    ) -> None:
+        self.settings, self.fabric, self.network = settings, fabric, network
+        self.objective, self.optimizer = fabric.setup(Objective(network, settings.loss), optimizer)
+        self.train, self.watched = pairs
+        self.steps = max(len(self.train) // (settings.batch * fabric.world_size), 1)
+        self.augment: Augment | None = None if settings.overfit else settings.augment
+
+    def batches(self, state: State) -> Generator[MapPair, None, None]:
+        """Those of the state's epoch from its step on, each made while the one before it is worked on."""
+        self.objective.train()
+        settings = self.settings
+        shuffle = torch.Generator().manual_seed(mixed(settings.seed, state.epoch))
+        order = torch.randperm(len(self.train), generator=shuffle).tolist()
+        if settings.overfit:
+            order = list(range(len(self.train)))
+        rank, world, size, names = self.fabric.global_rank, self.fabric.world_size, settings.batch, self.network.tensors
+
+        def make(step: int) -> MapPair:
+            chosen = order[step * size * world :][: size * world][rank::world]
+            generator = torch.Generator().manual_seed(mixed(settings.seed, state.epoch, step, rank))
+            return make_batch([self.train[i] for i in chosen], names, self.augment, generator)
+
+        with ThreadPoolExecutor(1) as beside:
+            coming = beside.submit(make, state.step) if state.step < self.steps else None
+            for step in range(state.step, self.steps):
+                assert coming is not None
+                batch = coming.result()
+                coming = beside.submit(make, step + 1) if step + 1 < self.steps else None
+                yield batch
+
+    def step(self, batch: MapPair, state: State) -> dict[str, float]:
+        """One step of the optimizer; the losses."""
+        settings, done = self.settings, state.epoch * self.steps + state.step
+        for group in self.optimizer.param_groups:
+            group["lr"] = settings.rate * pace(done / (settings.epochs * self.steps), settings.warmup)
+        torch.manual_seed(mixed(settings.seed, state.epoch, state.step, self.fabric.global_rank, 1))  # of the dropout
+        batch = batch.to(self.fabric.device)
+        losses = self.objective(batch.tensors, batch.truth)
+        self.optimizer.zero_grad()
+        self.fabric.backward(losses["loss"])
+        self.fabric.clip_gradients(self.objective, self.optimizer, max_norm=settings.clip)
+        self.optimizer.step()
+        return {name: float(value.detach()) for name, value in losses.items()}
+
+    def size(self, batch: MapPair) -> int:
+        """Rooms."""
+        return sum(batch.rooms)
+
+    def total(self, sizes: int) -> float:
+        """Rooms of all processes."""
+        return float(self.fabric.all_reduce(torch.tensor(float(sizes)), reduce_op="sum"))
+
+    def scores(self) -> dict[str, float]:
+        """Of the pairs watched (`validate`)."""
+        return validate(self.network, self.watched, self.fabric.device)
+
+    def optimizer_state(self) -> torch.optim.Optimizer:
+        """The optimizer within fabric's."""
+        optimizer: torch.optim.Optimizer = self.optimizer.optimizer
+        return optimizer
+
+    def write_network(self, folder: Path) -> None:
+        """The embedder's two files."""
+        save_embedder(self.network, folder, about(self.settings, {}))
+
+    def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
+        """The embedder's two files, and pictures of what it does."""
+        save_embedder(self.network, folder, about(self.settings, row))
+        show_embedder(log.board, self.network, self.watched, row["epoch"], row["val/least"], self.fabric.device)
+
+    def line(self, row: Mapping[str, Any]) -> str:
+        """The scores that tell most."""
+        scores = [row[f"val/{name}"] for name in ("recall@1", "recall@5", "f1", "merged")]
+        return "recall@1 {:.3f} @5 {:.3f} F1 {:.3f} merged {:.2f}".format(*scores)
+
+
+def about(settings: Training, row: Mapping[str, Any]) -> dict[str, Any]:
+    """What an embedder's file says about its training."""
+    origin = {"data": settings.data, "validation": settings.validation, "seed": settings.seed, "loss": settings.loss.kind}
+    return {"run": settings.name, **origin, **{k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}}
+
+
+def _fabric(settings: Training) -> Any:
+    from lightning_fabric import Fabric
+
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
+    devices = int(os.environ.get("LOCAL_WORLD_SIZE", settings.devices))
+    fabric = Fabric(
+        accelerator=settings.accelerator, devices=devices, precision=settings.precision,  # type: ignore[arg-type]
+        strategy="ddp" if devices > 1 else "auto",
+    )  # fmt: skip
+    fabric.launch()
+    return fabric
+
+
+def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], list[GraphPair]]:
+    """Pairs to train on, and to watch; a set is packed by one process while the others wait."""
+    extras = [part for part in settings.network.geometry.parts if part in EXTRAS]
+    extras += ["near"] if settings.network.node.near else []
+    with fabric.rank_zero_first():
+        around = settings.network.node.around
+        train = load_pairs(_manifest(settings, settings.data), extras, say, settings.limit, around)
+        watched = load_pairs(_manifest(settings, settings.validation), extras, say, around=around) if settings.validation else []
+    if settings.overfit:
+        matched = [pair for pair in train if len(pair.matches)][: settings.batch]
+        return matched, matched
+    if not watched:
+        train, watched = hold_out(train)
+    if not train:
+        raise InputError(f"{settings.data}: no pairs to train on")
+    return train, watched
+
+
+def hold_out(pairs: Sequence[GraphPair]) -> tuple[list[GraphPair], list[GraphPair]]:
+    """A tenth of the pairs, by whole buildings in the order of a hash of their names, is kept from training; at least one of
+    them has rooms that match.
+
+    Raises:
+        InputError: no pair has any, or all that have are of one building.
+    """
+    buildings = [str(p.about.get("building")) for p in pairs]
+    held: set[str] = set()
+    for name in sorted(set(buildings), key=lambda name: hashlib.sha256(name.encode()).digest()):
+        watched = [p for p, of in zip(pairs, buildings, strict=True) if of in held]
+        if 10 * len(watched) >= len(pairs) and any(len(p.matches) for p in watched):
+            break
+        held.add(name)
+    parts = tuple([p for p, of in zip(pairs, buildings, strict=True) if (of in held) is which] for which in (False, True))
+    if not all(any(len(p.matches) for p in part) for part in parts):
+        raise InputError("too few pairs whose rooms match, to train on some buildings and watch others; make more of them")
+    return parts[0], parts[1]
+
+
+def _manifest(settings: Training, name: str) -> Path:
+    path = Path(name)
+    return path if path.suffix in (".jsonl", ".npz") else Path(settings.cache) / f"{name}.jsonl"
+
+
+def _network(settings: Training, train: Sequence[GraphPair]) -> Embedder:
+    torch.manual_seed(mixed(settings.seed))
+    wanted = replace(settings.network, dropout=0.0) if settings.overfit else settings.network
+    network = Embedder(wanted)
+    network.fit_scales([graph for pair in train for graph in (pair.a, pair.b)])
+    if settings.geometry_from:
+        other, _ = read_embedder(settings.geometry_from)
+        try:
+            network.geometry.load_state_dict(other.geometry.state_dict())
+        except RuntimeError as error:
+            raise InputError(f"geometry_from={settings.geometry_from}: has another geometry encoder") from error
+    if settings.freeze == "geometry":
+        network.geometry.requires_grad_(False)
+    return network

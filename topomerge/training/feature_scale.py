@@ -1,0 +1,137 @@
+"""Task `feature_scale`: what the engineered features are scaled by (`embedding.engineered`).
+
+Their mean and spread over rooms, and the covariance of the differences between two maps' views of one room. Rooms weigh alike,
+looked-into ones (most of the outline unseen) not at all.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from topomerge.datasets.core.derived import derive, read_derived
+from topomerge.datasets.pairs.evaluation_pair import load_kept
+from topomerge.datasets.pairs.recipe import Recipe
+from topomerge.embedding.engineered import FEATURES, raw_features
+from topomerge.errors import InputError
+from topomerge.matching.scores import partner_ranks
+from topomerge.training.closed_form import Fitted, run_fit
+from topomerge.training.loop import Say
+from topomerge.training.match_odds import map_pairs
+from topomerge.training.task_settings import FeatureScale
+from topomerge.types import Array
+
+CLIPPED = 4.0  # standard deviations that a difference counts for at most
+FOLDS = 5  # of buildings, for the scores
+
+
+class PairFeatures(NamedTuple):
+    """Of a pair of maps: its building, features (R, 18) of the rooms of a and of b, which rooms were looked into only, rooms that
+    are one (M, 2), and which of these are seen well by both maps (M,)."""
+
+    building: str
+    a: Array
+    b: Array
+    glimpsed_a: Array
+    glimpsed_b: Array
+    matches: Array
+    clear: Array
+
+
+def fit(settings: FeatureScale, say: Say) -> dict[str, float]:
+    """Measure; recall@1 of rooms of left-out buildings."""
+    return run_fit(settings, fit_scale, say)
+
+
+def fit_scale(settings: FeatureScale, say: Say) -> Fitted:
+    """The scale from all pairs, and how well rooms of buildings are found by the scale of the others."""
+    pairs = pair_features(settings.data, settings, say)
+    names = sorted({p.building for p in pairs})
+    parts = np.array_split(np.random.default_rng(0).permutation(len(names)), min(FOLDS, len(names)))
+    ranks = []
+    for part in parts:
+        test = {names[k] for k in part}
+        rest = [p for p in pairs if p.building not in test]
+        if rest:
+            ranks.append(scaled_ranks([p for p in pairs if p.building in test], statistics(rest, settings.shrink)))
+    weights = statistics(pairs, settings.shrink)
+    origin = {"set": settings.data.name, "split": settings.data.split, "pairs": len(pairs)}
+    return Fitted(weights, rank_scores(np.concatenate([*ranks, np.zeros(0, int)])), origin)
+
+
+def pair_features(recipe: Recipe, settings: FeatureScale, say: Say) -> list[PairFeatures]:
+    """Of each pair of a set, cached."""
+    paths = map_pairs(recipe, settings, say)
+    files, _ = derive(f"{recipe.name}_features", features_of, [[path] for path in paths], settings, say=say)
+    pairs = []
+    for file in files:
+        arrays = read_derived(file)
+        pairs.append(PairFeatures(str(arrays.pop("building")), **arrays))
+    return pairs
+
+
+def features_of(path: Path) -> dict[str, Array]:
+    """`PairFeatures` of a pair's file."""
+    pair = load_kept(path)
+    maps = pair.maps()
+    a, b = (raw_features(m) for m in maps)
+    glimpsed = [np.asarray(m.rooms["glimpsed"], bool) for m in maps]
+    i, j = pair.matches.T
+    clear = pair.one[0][i] & pair.one[1][j] & ~glimpsed[0][i] & ~glimpsed[1][j]
+    building = np.array(str(pair.about["building"]))
+    both = {"glimpsed_a": glimpsed[0], "glimpsed_b": glimpsed[1]}
+    return {"building": building, "a": a, "b": b, **both, "matches": pair.matches, "clear": clear}
+
+
+def statistics(pairs: Sequence[PairFeatures], shrink: float) -> dict[str, Any]:
+    """What `engineered.json` holds.
+
+    Raises:
+        InputError: no room is seen by two maps.
+    """
+    rooms = np.concatenate([values for p in pairs for values in (p.a[~p.glimpsed_a], p.b[~p.glimpsed_b])])
+    differences = np.concatenate([(p.a[p.matches[:, 0]] - p.b[p.matches[:, 1]])[p.clear] for p in pairs])
+    if not len(differences):
+        raise InputError("data.pairs: too few pairs: no room is seen well by two maps")
+    limit = CLIPPED * rooms.std(axis=0)
+    differences = np.clip(differences, -limit, limit)
+    second = differences.T @ differences / len(differences)
+    second += np.diag(shrink * rooms.var(axis=0) + 1e-6)
+    return {
+        "features": list(FEATURES),
+        "rooms": len(rooms),
+        "pairs_of_rooms": len(differences),
+        "mean": np.round(rooms.mean(axis=0), 5).tolist(),
+        "spread": np.round(rooms.std(axis=0) + 1e-6, 5).tolist(),
+        "differences": np.round(second, 6).tolist(),
+    }
+
+
+def scaled_ranks(pairs: Sequence[PairFeatures], weights: dict[str, Any]) -> Array:
+    """(n,) rank of the partner of each room that has one, by the distance of features scaled as ``"matched"``."""
+    root = np.linalg.cholesky(np.linalg.inv(np.array(weights["differences"])))
+    ranks = [np.zeros(0, int)]
+    for p in pairs:
+        if len(p.matches):
+            a, b = ((values - weights["mean"]) @ root for values in (p.a, p.b))
+            alike = -np.linalg.norm(a[:, None] - b[None], axis=2)
+            ranks += [partner_ranks(alike, p.matches)[1], partner_ranks(alike.T, p.matches[:, ::-1])[1]]
+    return np.concatenate(ranks)
+
+
+def rank_scores(ranks: Array) -> dict[str, float]:
+    """Shares of partners that are first or among the first five, and their mean reciprocal rank."""
+    if not len(ranks):
+        return {"recall@1": 0.0, "recall@5": 0.0, "mrr": 0.0, "rooms": 0.0}
+    scores = {f"recall@{k}": float((ranks <= k).mean()) for k in (1, 5)}
+    return {**scores, "mrr": float((1 / ranks).mean()), "rooms": float(len(ranks))}
+
+
+def judge(settings: FeatureScale, file: Path, say: Say) -> dict[str, Any]:
+    """recall@1 of engineered features with these weights on pairs of buildings that trained nothing."""
+    weights = json.loads(file.read_text(encoding="utf-8"))
+    return rank_scores(scaled_ranks(pair_features(settings.heldout, settings, say), weights))

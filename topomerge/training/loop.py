@@ -1,0 +1,215 @@
+"""The loop that every network is trained by: the same settings and seed give the same weights, also where it was interrupted.
+
+A task gives a `Job`; the loop writes metrics.jsonl, TensorBoard events, `best/` and `last/`, stops early, and goes on where a run
+stopped. Nothing random may depend on what came before: a job draws from generators seeded by the seed, the epoch and the step.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from topomerge.checkpoint import save_state
+from topomerge.errors import InputError
+from topomerge.training.log import Clock, Log
+
+Say = Callable[[str], None]
+
+
+@dataclass
+class State:
+    """Where a training is: `epoch` and `step` of it come next; `sums` are those of the losses of the epoch so far."""
+
+    epoch: int = 0
+    step: int = 0
+    best: float = -1.0
+    best_epoch: int = -1
+    stale: int = 0
+    sums: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Args:
+    folder: of the run.
+    epochs: at most; steps: of each.
+    watch: score of validation whose highest value is best.
+    patience: epochs without a better one after which it ends; 0: never.
+    perfect: value of the score at which nothing is left to learn.
+    """
+
+    folder: Path
+    epochs: int
+    steps: int
+    watch: str
+    patience: int = 0
+    perfect: float = math.inf
+
+
+class Job(Protocol):
+    """What a task does in the loop."""
+
+    @property
+    def network(self) -> torch.nn.Module:
+        """What is trained."""
+
+    def batches(self, state: State) -> Generator[Any, None, None]:
+        """Those of the state's epoch, from its step on."""
+
+    def step(self, batch: Any, state: State) -> dict[str, float]:
+        """One step of the optimizer; the losses, `loss` among them."""
+
+    def size(self, batch: Any) -> int:
+        """How many rooms, columns or examples a batch has."""
+
+    def total(self, sizes: int) -> float:
+        """That of all processes."""
+
+    def scores(self) -> dict[str, float]:
+        """Scores of validation."""
+
+    def optimizer_state(self) -> torch.optim.Optimizer:
+        """The optimizer whose state is kept."""
+
+    def write_network(self, folder: Path) -> None:
+        """Write the network's files of `last/`."""
+
+    def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
+        """Write what is exported into `best/`."""
+
+    def line(self, row: Mapping[str, Any]) -> str:
+        """What an epoch's line says of the scores."""
+
+
+class Loop:
+    """A training under way.
+
+    Args:
+        log: None in all processes but the first.
+    """
+
+    def __init__(self, job: Job, schedule: Schedule, state: State, log: Log | None, say: Say) -> None:
+        self.job, self.schedule, self.state, self.log, self.say = job, schedule, state, log, say
+        self.stop = False
+
+    def run(self) -> dict[str, float]:
+        """Epochs until the last one, or until nothing has become better for long; the row of the best epoch.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C or SIGTERM; the state is saved.
+        """
+        with self._interrupts():
+            return self._epochs()
+
+    def _epochs(self) -> dict[str, float]:
+        schedule, clock = self.schedule, Clock(self.state.epoch, self.schedule.epochs)
+        best: dict[str, Any] = {}
+        if self.log is not None and self.state.best_epoch >= 0:
+            best = next((row for row in self.log.rows if row["epoch"] == self.state.best_epoch), {})
+        while self.state.epoch < schedule.epochs and not self._enough():
+            row = self._epoch()
+            scores = self.job.scores()
+            row |= {f"val/{name}": value for name, value in scores.items()}
+            state, score = self.state, scores[schedule.watch]
+            better = score > state.best
+            self.state = State(state.epoch + 1, 0, state.best, state.best_epoch, state.stale + 1)
+            if better:
+                best = row
+                self.state.best, self.state.best_epoch, self.state.stale = score, state.epoch, 0
+            self._keep(row, better)
+            left = clock.left(state.epoch + 1)
+            self.say(
+                f"epoch {state.epoch + 1}/{schedule.epochs} loss {row['train/loss']:.3f} {self.job.line(row)}"
+                f"{' *' if better else ''} {row['rooms_per_second']:.0f} rooms/s, {left} left"
+            )
+        if self.log is not None:
+            self.log.close()
+        return {name: value for name, value in best.items() if isinstance(value, float)}
+
+    def _enough(self) -> bool:
+        """Has nothing become better for long, or is nothing left to learn?"""
+        schedule, state = self.schedule, self.state
+        return bool(schedule.patience and state.stale >= schedule.patience) or state.best >= schedule.perfect
+
+    def _epoch(self) -> dict[str, Any]:
+        """The steps of an epoch that are left."""
+        began, waited, sizes, state = time.perf_counter(), 0.0, 0, self.state
+        batches = self.job.batches(state)
+        while True:
+            before = time.perf_counter()
+            batch = next(batches, None)
+            waited += time.perf_counter() - before
+            if batch is None:
+                break
+            losses = self.job.step(batch, state)
+            if not math.isfinite(losses["loss"]):
+                raise InputError(f"training diverged in epoch {state.epoch + 1}: lower rate")
+            for name, value in losses.items():
+                state.sums[name] = state.sums.get(name, 0.0) + value
+            sizes += self.job.size(batch)
+            state.step += 1
+            if self.stop:
+                batches.close()
+                self._save()
+                raise KeyboardInterrupt
+        took = max(time.perf_counter() - began, 1e-9)
+        row = {"epoch": state.epoch, "seconds": took, "rooms_per_second": self.job.total(sizes) / took, "waiting": waited / took}
+        return row | {f"train/{name}": value / self.schedule.steps for name, value in state.sums.items()}
+
+    def _keep(self, row: dict[str, Any], better: bool) -> None:
+        """Write metrics, the best network and the state after an epoch."""
+        if self.log is None:
+            return
+        self.log.row(row)
+        if better:
+            self.job.write_best(self.schedule.folder / "best", row, self.log)
+        self._save()
+
+    def _save(self) -> None:
+        """Write the state as it is."""
+        if self.log is not None:
+            optimizer = self.job.optimizer_state()
+            save_state(self.schedule.folder / "last", self.job.write_network, optimizer, vars(self.state))
+
+    @contextmanager
+    def _interrupts(self) -> Iterator[None]:
+        """Ctrl-C and SIGTERM let the step end and save; a second one ends at once."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def stop(number: int, _: object) -> None:
+            if self.stop:
+                raise KeyboardInterrupt
+            self.stop = True
+            self.say("saving, then ending")
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def pace(done: float, warmup: float) -> float:
+    """Share of the learning rate after this share of all steps: a rise, then half a cosine down to 0."""
+    if done < warmup:
+        return (done + 1e-3) / (warmup + 1e-3)
+    return 0.5 * (1 + math.cos(math.pi * (done - warmup) / (1 - warmup)))
+
+
+def mixed(*numbers: int) -> int:
+    """A seed out of several numbers."""
+    return int.from_bytes(hashlib.sha256(json.dumps(numbers).encode()).digest()[:7])

@@ -1,0 +1,71 @@
+"""What tasks that train a network on one machine share: a run from its data to its export, in the loop of `training.loop`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from topomerge.checkpoint import NETWORK_FILE, load_state, write_network
+from topomerge.training.log import Log
+from topomerge.training.loop import Job, Loop, Say, Schedule, State
+from topomerge.training.run_folder import export_files, write_card, write_settings
+from topomerge.training.task_settings import NetworkTask
+from topomerge.training.tasks import TASKS
+
+
+class NetworkJob:
+    """A job without processes beside it; a task adds batches, steps, scores and the file of weights."""
+
+    def __init__(self, settings: NetworkTask, network: torch.nn.Module, origin: Mapping[str, Any]) -> None:
+        self.settings, self.network, self.origin = settings, network, origin
+        self.optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.decay)
+
+    def total(self, sizes: int) -> float:
+        """Of the one process."""
+        return float(sizes)
+
+    def optimizer_state(self) -> torch.optim.Optimizer:
+        """The optimizer."""
+        return self.optimizer
+
+    def write_network(self, folder: Path) -> None:
+        """The weights as torch has them."""
+        write_network(self.network, folder)
+
+    def write_weights(self, path: Path) -> None:
+        """The weights as the package has them."""
+        raise NotImplementedError
+
+    def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
+        """The file of weights and its card."""
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / TASKS[self.settings.task].file
+        self.write_weights(path)
+        write_card(path, asdict(self.settings), self.origin, {k: v for k, v in row.items() if k.startswith("val/")})
+
+    def line(self, row: Mapping[str, Any]) -> str:
+        """The score that is watched."""
+        return f"{self.settings.watch} {row[f'val/{self.settings.watch}']:.3f}"
+
+
+def run_network(job: Job, settings: NetworkTask, steps: int, say: Say) -> dict[str, float]:
+    """Train a job of a task, and leave a run's folder.
+
+    Returns:
+        The row of the best epoch.
+    """
+    state = State()
+    if settings.resume:
+        state = State(**load_state(settings.folder / "last", job.network, job.optimizer_state(), NETWORK_FILE))
+    else:
+        write_settings(settings.folder, asdict(settings))
+    log = Log(settings.folder, settings.tensorboard, state.epoch)
+    schedule = Schedule(settings.folder, settings.epochs, steps, settings.watch, settings.patience)
+    best = Loop(job, schedule, state, log, say).run()
+    if settings.export:
+        export_files(settings.folder / "best", settings.export, TASKS[settings.task].package)
+    return best

@@ -1,0 +1,164 @@
+"""Task `plan_segmentation`: the network that says what stands in each column of a plan (`extraction.plans.plan_network`).
+
+Crops of simulated scans' plans, turned and mirrored, with things taken away now and then. Every n-th scan is watched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch.nn import functional
+
+from topomerge.datasets.pairs.plan_examples import PlanExample, PlanRecipe, build_plans, load_examples
+from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
+from topomerge.errors import InputError
+from topomerge.extraction.classified_storey import COLUMN_CLASSES
+from topomerge.extraction.plans.plan_network import column_probabilities, evidence, read_weights
+from topomerge.io import archive
+from topomerge.models.plan_unet import PlanUNet, exported_weights
+from topomerge.training.loop import Say, State, mixed, pace
+from topomerge.training.networks import NetworkJob, run_network
+from topomerge.training.task_settings import PlanAugment, PlanLoss, PlanSegmentation
+from topomerge.types import Array
+
+LEAST_COLUMNS = 100  # inside of a plan that trains
+UPPER_CHANNELS, FLOOR_CHANNEL = (5, 7, 8, 9), (6,)  # of `evidence`
+FLOOR_LOST = 0.3  # share of the crops without an upper half that lose their floor instead
+PlanTensors = tuple[Array, Array, Array]  # evidence, truth and weight of each column
+
+
+def fit(settings: PlanSegmentation, say: Say) -> dict[str, float]:
+    """Train; the scores of the best epoch.
+
+    Raises:
+        InputError: no scan to train on or to watch.
+    """
+    paths, _ = build_plans(settings.data, settings, say)
+    scans = [load_examples(path) for path in paths]
+    watched = [e for scan in scans[:: settings.hold_out] for e in scan]
+    learned = [e for k, scan in enumerate(scans) if k % settings.hold_out for e in scan]
+    learned = [e for e in learned if e.plan.inside.sum() > LEAST_COLUMNS]
+    if not learned or not watched:
+        raise InputError(f"data.scans={settings.data.scans}: too few scans to train on some and watch others")
+    torch.manual_seed(mixed(settings.seed))
+    job = PlanJob(settings, learned, watched)
+    say(f"{len(learned)} plans, {sum(p.numel() for p in job.network.parameters())} weights")
+    return run_network(job, settings, settings.steps, say)
+
+
+class PlanJob(NetworkJob):
+    """Crops of plans, larger plans more often."""
+
+    def __init__(self, settings: PlanSegmentation, learned: Sequence[PlanExample], watched: Sequence[PlanExample]) -> None:
+        origin = {"set": settings.data.name, "split": settings.data.split, "plans": len(learned), "watched": len(watched)}
+        super().__init__(settings, PlanUNet(settings.widths), origin)
+        self.options, self.watched = settings, watched
+        self.plans = [plan_tensors(e, settings.loss) for e in learned]
+        chance = np.sqrt([float(e.room.size) for e in learned])
+        self.chance = chance / chance.sum()
+
+    def batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
+        """Crops, from a generator of each step."""
+        self.network.train()
+        options = self.options
+        for step in range(state.step, options.steps):
+            rng = np.random.default_rng([options.seed, 1, state.epoch, step])
+            rows = rng.choice(len(self.plans), options.batch, p=self.chance)
+            crops = [crop(self.plans[row], options.crop, options.augment, rng) for row in rows]
+            x, truth, weight = (np.stack(arrays) for arrays in zip(*crops, strict=True))
+            labels = torch.from_numpy(truth.astype(np.int64))
+            yield torch.from_numpy(x).permute(0, 3, 1, 2), labels, torch.from_numpy(weight.astype(np.float32))
+
+    def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
+        """One step of the optimizer."""
+        options, (x, truth, weight) = self.options, batch
+        total, done = options.epochs * options.steps, state.epoch * options.steps + state.step
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.rate * max(pace(done / total, min(options.warmup / total, 0.5)), 0.01)
+        each = functional.cross_entropy(self.network(x), truth, reduction="none")
+        loss = (each * weight).sum() / weight.sum()
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        return {"loss": float(loss.detach())}
+
+    def size(self, batch: tuple[torch.Tensor, ...]) -> int:
+        """Crops."""
+        return len(batch[0])
+
+    def weights(self) -> dict[str, Array]:
+        """As the package reads them: half precision, normalisation in them."""
+        assert isinstance(self.network, PlanUNet)
+        self.network.eval()
+        return {name: values.astype(np.float16) for name, values in exported_weights(self.network).items()}
+
+    def scores(self) -> dict[str, float]:
+        """Of the scans that are watched."""
+        weights = {name: values.astype(np.float32) for name, values in self.weights().items()}
+        return class_scores(confusion(self.watched, weights))
+
+    def write_weights(self, path: Path) -> None:
+        """An archive of arrays."""
+        archive.write(self.weights(), path)
+
+
+def plan_tensors(example: PlanExample, loss: PlanLoss) -> PlanTensors:
+    """Evidence, truth and weight of each column."""
+    seen = ndimage.binary_dilation(example.plan.inside | example.plan.wall, np.ones((3, 3)))
+    weight = np.array(loss.classes, np.float32)[example.truth] * np.where(seen, 1.0, loss.unseen)
+    return evidence(example.plan).astype(np.float16), example.truth, weight.astype(np.float16)
+
+
+def crop(plan: PlanTensors, side: int, augment: PlanAugment, rng: np.random.Generator) -> PlanTensors:
+    """A square of a plan, turned by quarters, mirrored or not, with some of the evidence taken away."""
+    x, truth, weight = plan
+    inside = np.argwhere(x[..., 0] > 0)
+    i, j = (inside[rng.integers(len(inside))] - rng.integers(side // 4, 3 * side // 4, 2)).tolist()
+    box = tuple(slice(max(k, 0), max(k + side, 0)) for k in (i, j))
+    pad = [(max(-k, 0), side - max(-k, 0) - (min(k + side, n) - max(k, 0))) for k, n in zip((i, j), truth.shape, strict=True)]
+    x = np.pad(x[box], [*pad, (0, 0)])
+    truth = np.pad(truth[box], pad, constant_values=TRUE_CLASSES.index("outside"))
+    weight = np.pad(weight[box], pad)
+    turn, mirror = int(rng.integers(4)), rng.random() < 0.5
+    x, truth, weight = (np.rot90(array, turn)[:: -1 if mirror else 1] for array in (x, truth, weight))
+    x = np.array(x, np.float32)
+    if rng.random() < augment.upper:
+        x[..., list(FLOOR_CHANNEL if rng.random() < FLOOR_LOST else UPPER_CHANNELS)] = 0
+    if rng.random() < augment.columns:
+        x[..., 1:10] *= rng.random((side, side, 1)) > rng.uniform(0, augment.lost)
+    return x, truth, weight
+
+
+def confusion(examples: Sequence[PlanExample], weights: dict[str, Array]) -> Array:
+    """(5, 5) columns by true and by said class, of those of which something is known."""
+    table = np.zeros((len(COLUMN_CLASSES), len(COLUMN_CLASSES)), np.int64)
+    for example in examples:
+        seen = example.plan.inside | example.plan.wall
+        said = column_probabilities(example.plan, weights).argmax(axis=-1)
+        np.add.at(table, (example.truth[seen], said[seen]), 1)
+    return table
+
+
+def class_scores(table: Array) -> dict[str, float]:
+    """IoU and F1 of each class, their means over the classes that there are, and the share of columns that are right."""
+    right, true, said = np.diag(table), table.sum(axis=1), table.sum(axis=0)
+    iou = right / np.maximum(true + said - right, 1)
+    f1 = 2 * right / np.maximum(true + said, 1)
+    scores = {f"iou_{name}": float(v) for name, v in zip(COLUMN_CLASSES, iou, strict=True)}
+    scores |= {f"f1_{name}": float(v) for name, v in zip(COLUMN_CLASSES, f1, strict=True)}
+    there = true > 0
+    means = {f"mean_{what}": float(v[there].mean()) if there.any() else 0.0 for what, v in (("iou", iou), ("f1", f1))}
+    return {**scores, **means, "accuracy": float(right.sum() / max(table.sum(), 1))}
+
+
+def judge(settings: PlanSegmentation, file: Path, say: Say) -> dict[str, Any]:
+    """Scores of weights on scans of buildings that trained nothing."""
+    recipe: PlanRecipe = settings.heldout
+    paths, _ = build_plans(recipe, settings, say)
+    examples = [e for path in paths for e in load_examples(path)]
+    return {**class_scores(confusion(examples, read_weights(file))), "scans": len(paths), "plans": len(examples)}

@@ -1,0 +1,93 @@
+"""A run is a folder: its settings, what it reports, the best weights, the state to go on from; and what it exports.
+
+    config.json, config.yaml     what was asked for
+    metrics.jsonl, tb/           `training.log`
+    best/                        files as the package has them, and their card
+    last/                        `topomerge.checkpoint`, of networks
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import topomerge
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+from topomerge.io.listing import plain
+
+PACKAGE = "package"  # export: into the package itself
+CARD = ".card.json"
+
+
+def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Write config.json and config.yaml.
+
+    Raises:
+        InputError: the folder can't be written.
+    """
+    import yaml
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be written ({error.strerror or error})") from error
+    texts = {"config.json": json.dumps(settings, indent=1) + "\n", "config.yaml": yaml.safe_dump(dict(settings), sort_keys=False)}
+    for name, text in texts.items():
+        with replacing(folder / name) as beside:
+            beside.write_text(text, encoding="utf-8")
+
+
+def write_card(file: Path, settings: Mapping[str, Any], data: Mapping[str, Any], metrics: Mapping[str, Any]) -> Path:
+    """Write the card of a file of weights beside it: what it is trained on, by which command and version, and how good it is.
+
+    Args:
+        settings: of the run.
+        data: what was learned from: counts, names of sets.
+        metrics: on what was held out of the training.
+    """
+    keys = (f"{k}={v}" for k, v in settings.items() if isinstance(v, int | float | str) and k in ("seed", "epochs"))
+    command = f"python train.py task={settings['task']} {' '.join(keys)} export=package".replace("  ", " ")
+    card = {
+        "file": file.name,
+        "task": settings["task"],
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "version": topomerge.__version__,
+        "command": command,
+        "settings": settings,
+        "data": data,
+        "metrics": {k: round(v, 5) if isinstance(v, float) else v for k, v in metrics.items()},
+    }
+    path = file.with_name(f"{file.stem}{CARD}")
+    with replacing(path) as beside:
+        beside.write_text(json.dumps(plain(card), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    return path
+
+
+def export_files(best: Path, target: str, package: str) -> list[Path]:
+    """Copy the best weights and their card to where they are read.
+
+    Args:
+        target: `PACKAGE`: into the package; else a folder, which TOPOMERGE_WEIGHTS can then name.
+        package: that reads them.
+
+    Raises:
+        InputError: nothing was trained yet, or the folder can't be written.
+    """
+    folder = Path(str(resources.files(package))) if target == PACKAGE else Path(target)
+    files = sorted(path for path in best.glob("*") if path.is_file())
+    if not files:
+        raise InputError(f"{best}: holds no weights to export")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in files:
+            with replacing(folder / path.name) as beside:
+                shutil.copyfile(path, beside)
+    except OSError as error:
+        raise InputError(f"export={target}: can't be written ({error.strerror or error})") from error
+    return [folder / path.name for path in files]

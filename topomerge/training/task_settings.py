@@ -1,0 +1,215 @@
+"""Settings of the tasks of `train.py` but `embedding` (`training.settings`), as Hydra composes them: configs/task/<task>.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from topomerge.datasets.pairs.grid_pairs import GridRecipe
+from topomerge.datasets.pairs.plan_examples import PlanRecipe
+from topomerge.datasets.pairs.recipe import Recipe
+from topomerge.errors import InputError
+
+
+@dataclass
+class TaskSettings:
+    """What every task has.
+
+    Args:
+        task: which of the learned parts.
+        name: of the run; its folder is `runs`/`name`.
+        cache: folder of the data, which is made where it is missing, by so many processes (`jobs`), or those of a Dask cluster.
+        part: [k, n]: make every n-th item of the data from the k-th on, for machines that share nothing.
+        resume: go on where the run of this name stopped.
+        export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
+    """
+
+    task: str = ""
+    name: str = "run"
+    runs: str = "runs"
+    cache: str = "cache"
+    seed: int = 0
+    jobs: int = 1
+    cluster: str | None = None
+    part: list[int] = field(default_factory=lambda: [1, 1])
+    resume: bool = False
+    tensorboard: bool = True
+    export: str = ""
+
+    @property
+    def folder(self) -> Path:
+        """Where the run is written."""
+        return Path(self.runs) / self.name
+
+
+@dataclass
+class NetworkTask(TaskSettings):
+    """What tasks that train a network have besides.
+
+    Args:
+        epochs: at most; rate: of learning; decay: of weights; batch: examples a step.
+        patience: epochs without a better validation after which it ends; 0: never.
+        hold_out: every n-th scan is watched and trains nothing.
+        watch: what is best: a score of validation.
+    """
+
+    epochs: int = 10
+    batch: int = 8
+    rate: float = 2e-3
+    decay: float = 1e-3
+    patience: int = 0
+    hold_out: int = 8
+    watch: str = ""
+
+
+@dataclass
+class PlanLoss:
+    """Weights in the cross-entropy.
+
+    Args:
+        classes: of the five classes (`plan_network.CLASSES`).
+        unseen: of columns of which nothing is known.
+    """
+
+    classes: list[float] = field(default_factory=lambda: [1.0, 2.0, 4.0, 6.0, 1.0])
+    unseen: float = 0.05
+
+
+@dataclass
+class PlanAugment:
+    """What is taken away from crops while training, now and then.
+
+    Args:
+        upper: share of crops without ceiling or without floor.
+        columns: share of crops that lose single columns; lost: share of these, drawn between 0 and this.
+    """
+
+    upper: float = 0.2
+    columns: float = 0.3
+    lost: float = 0.3
+
+
+@dataclass
+class PlanSegmentation(NetworkTask):
+    """Args:
+    steps: of an epoch; warmup: steps in which the rate rises.
+    crop: columns of a side, a multiple of 16.
+    widths: channels of the levels a to d down, and e to h up again.
+    """
+
+    task: str = "plan_segmentation"
+    name: str = "plan_segmentation"
+    data: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    epochs: int = 27
+    steps: int = 500
+    warmup: int = 100
+    crop: int = 128
+    widths: list[int] = field(default_factory=lambda: [16, 32, 40, 40, 40, 32, 16, 12])
+    loss: PlanLoss = field(default_factory=PlanLoss)
+    augment: PlanAugment = field(default_factory=PlanAugment)
+    watch: str = "mean_f1"
+
+
+@dataclass
+class DoorClassification(NetworkTask):
+    """Args:
+    hidden: units of each network; networks: that are averaged.
+    noise: standard deviations that features jitter by while training.
+    """
+
+    task: str = "door_classification"
+    name: str = "door_classification"
+    data: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    epochs: int = 60
+    batch: int = 256
+    rate: float = 5e-3
+    decay: float = 3e-2
+    hidden: int = 16
+    networks: int = 5
+    noise: float = 0.1
+    watch: str = "auc"
+
+
+@dataclass
+class MergeBelief(TaskSettings):
+    """Args:
+    hypotheses: of a pair; inspected: how many of them are looked at more closely.
+    pose_strength, winner_strength: of the two models; the smaller, the simpler.
+    missed: weight of a pair whose right hypothesis is taken away.
+    strict: weight of a wrong hypothesis where a slice or a drawing hides what tells storeys apart: rather refused than wrong.
+    folds: of buildings, for the scores.
+    threshold: probability from which on a merge is believed.
+    """
+
+    task: str = "merge_belief"
+    name: str = "merge_belief"
+    data: GridRecipe = field(default_factory=GridRecipe)
+    heldout: GridRecipe = field(default_factory=GridRecipe)
+    hypotheses: int = 25
+    inspected: int = 2
+    pose_strength: float = 1.0
+    winner_strength: float = 0.3
+    missed: float = 0.2
+    strict: float = 1.25
+    folds: int = 8
+    threshold: float = 0.8
+    watch: str = "right_believed"
+
+
+@dataclass
+class MatchOdds(TaskSettings):
+    """Args:
+    pull: to 0, of all weights but the constant.
+    folds: of buildings, for the scores.
+    """
+
+    task: str = "match_odds"
+    name: str = "match_odds"
+    data: Recipe = field(default_factory=Recipe)
+    heldout: Recipe = field(default_factory=Recipe)
+    pull: float = 0.05
+    folds: int = 5
+    watch: str = "match_accuracy"
+
+
+@dataclass
+class FeatureScale(TaskSettings):
+    """Args:
+    shrink: share of the features' own variances in the covariance of the differences: few rooms give a noisy one.
+    """
+
+    task: str = "feature_scale"
+    name: str = "feature_scale"
+    data: Recipe = field(default_factory=Recipe)
+    heldout: Recipe = field(default_factory=Recipe)
+    shrink: float = 0.1
+    watch: str = "recall@1"
+
+
+def check_task(settings: TaskSettings) -> None:
+    """Refuse what makes no sense.
+
+    Raises:
+        InputError: names the key.
+    """
+    keys = ("epochs", "batch", "steps", "hidden", "networks", "hypotheses", "inspected")
+    at_least = {**dict.fromkeys(keys, 1), "jobs": 1, "patience": 0, "seed": 0, "warmup": 0, "folds": 2, "hold_out": 2}
+    for key, least in at_least.items():
+        if getattr(settings, key, least) < least:
+            raise InputError(f"{key} must be {least} or more, not {getattr(settings, key)}")
+    for key in ("rate", "pose_strength", "winner_strength"):
+        if not getattr(settings, key, 1.0) > 0:
+            raise InputError(f"{key} must be above 0, not {getattr(settings, key)}")
+    if not 0 <= getattr(settings, "threshold", 0.5) <= 1:
+        raise InputError(f"threshold must be 0 to 1, not {settings.threshold}")  # type: ignore[attr-defined]
+    if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
+        raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
+    if isinstance(settings, PlanSegmentation):
+        if settings.crop < 16 or settings.crop % 16:
+            raise InputError(f"crop must be a multiple of 16, not {settings.crop}")
+        if len(settings.widths) != 8 or min(settings.widths) < 1:
+            raise InputError(f"widths must be 8 numbers of channels, not {settings.widths}")
+        if len(settings.loss.classes) != 5 or min(settings.loss.classes) <= 0:
+            raise InputError(f"loss.classes must be 5 weights above 0, not {settings.loss.classes}")

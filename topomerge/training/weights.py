@@ -1,0 +1,98 @@
+"""Make all weights that ship again, in their order: ``python -m topomerge.training.weights`` (``make weights``).
+
+A step that has ended is left as it is, one that was cut off goes on. Before each step it says how long what is left takes: by the
+seconds that the steps took the last time, or about, where they never ran. Words like ``jobs=2`` or ``cache=...`` go to every
+step; ``only=match_odds,feature_scale`` makes these only; ``export=`` (nothing) leaves the weights in the runs.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+from topomerge.training.tasks import TASKS, settings_of, train
+
+RUNS = Path("runs/weights")
+SHIPPED = {"embedding": ["experiment=gat_around", "data.pairs=400", "epochs=14", "batch=8"]}  # words beside the defaults
+SETS = {"embedding": ("train_small data.pairs=400", "val_small")}  # that are built before
+
+
+def main(words: Sequence[str]) -> int:
+    """Train every task that has not ended."""
+    if {"-h", "--help"} & set(words):
+        print(__doc__)
+        return 0
+    only = next((word[5:].split(",") for word in words if word.startswith("only=")), list(TASKS))
+    runs = Path(next((word[5:] for word in words if word.startswith("runs=")), str(RUNS)))
+    shared = [word for word in words if not word.startswith(("only=", "runs="))]
+    try:
+        if unknown := next((task for task in only if task not in TASKS), ""):
+            raise InputError(f"only={unknown}: {', '.join(TASKS)} are possible")
+        for task in [task for task in TASKS if task in only]:
+            seconds = _seconds(runs)
+            left = [t for t in TASKS if t in only and not _ended(runs, t)]
+            if task not in left:
+                _say(f"{task}: is there ({runs / task})")
+                continue
+            _say(f"{task}: about {_hours(seconds, [task])}; in all about {_hours(seconds, left)} left")
+            began = time.time()
+            make_task(task, runs, shared)
+            _record(runs, task, seconds.get(f"{task} so far", 0.0) + time.time() - began)
+    except InputError as error:
+        print(f"weights: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("weights: interrupted; start it again to go on", file=sys.stderr)
+        return 130
+    return 0
+
+
+def make_task(task: str, runs: Path, shared: Sequence[str]) -> None:
+    """Build the sets of a task where it does not do so itself, and train it, or go on training it."""
+    own = [word for word in shared if word.partition("=")[0] in ("cache", "jobs", "cluster")] if task == "embedding" else shared
+    if task == "embedding":
+        from topomerge.config import compose
+        from topomerge.datasets.pairs.build import Build, build
+
+        for text in SETS[task]:
+            words = [f"data={text.split()[0]}", *text.split()[1:], *own]
+            build(compose("build", Build, words), _say)
+        own = [word for word in shared if not word.startswith(("jobs=", "cluster=", "part="))]
+    resume = f"resume={'true' if (runs / task / 'last').exists() else 'false'}"
+    exported = [] if any(word.startswith("export=") for word in shared) else ["export=package"]
+    train(settings_of([f"task={task}", *SHIPPED.get(task, []), f"runs={runs}", f"name={task}", resume, *exported, *own]), _say)
+
+
+def _say(text: str) -> None:
+    print(f"weights: {text}", file=sys.stderr, flush=True)
+
+
+def _ended(runs: Path, task: str) -> bool:
+    return f"{task} ended" in _seconds(runs)
+
+
+def _seconds(runs: Path) -> dict[str, float]:
+    """What was recorded of the steps."""
+    path = runs / "seconds.json"
+    seconds: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return seconds
+
+
+def _record(runs: Path, task: str, seconds: float) -> None:
+    with replacing(runs / "seconds.json") as beside:
+        beside.write_text(json.dumps({**_seconds(runs), task: seconds, f"{task} ended": time.time()}, indent=1) + "\n")
+
+
+def _hours(seconds: Mapping[str, float], tasks: Sequence[str]) -> str:
+    """How long steps take, by what they took or by what is usual."""
+    hours = sum(seconds.get(task, 3600 * TASKS[task].hours) for task in tasks) / 3600
+    return f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.0f} min"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
