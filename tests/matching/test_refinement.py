@@ -1,0 +1,25 @@
+"""Poses move to where walls meet; those that end in one place are one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.fusion.plans_of import MOVE, grid_of, off, office
+from topomerge.fusion.storey_plan import plans
+from topomerge.matching.plan_fields import PlanFields
+from topomerge.matching.poses import PoseHypothesis
+from topomerge.matching.refinement import refine, storeys_at
+from topomerge.types import Sim3
+
+
+def test_near_poses_end_as_one_and_a_wrong_height_is_left_out():
+    points = office().points()
+    a, b = ([PlanFields(p) for p in plans(grid)] for grid in (grid_of(points), grid_of(points, MOVE)))
+    true = MOVE.inverse()
+    x, y, z = true.translation
+    near = [Sim3(true.yaw + turn, (x + step, y, z)) for turn, step in ((0.01, 0.1), (-0.01, -0.1))]
+    moved = refine(a, b, [PoseHypothesis(pose, from_rooms=True) for pose in (*near, Sim3(true.yaw, (x, y, z + 5.0)))])
+    middle = tuple(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0])
+    assert len(moved) == 1 and moved[0].from_rooms and 0.5 < moved[0].score <= 1
+    assert off(moved[0].transform, true, middle)[0] < 0.1
+    assert storeys_at(a, b, z) and not storeys_at(a, b, z + 5.0)
