@@ -15,14 +15,14 @@ from topomerge.matching.growing import align
 from topomerge.matching.scores import assign_certain
 from topomerge.types import Array, Sim3
 
-LEAST = 0.05  # certainty of a match that is looked at
-MOST = 100  # places
-APART = 1.0  # m between two places that tell a direction
-STRETCH = 0.5  # m by which two places may be farther apart in one map than in the other
-DOOR, MIDDLE = 0.5, 1.5  # m by which one door may be off, and the middle of one room: a map that saw a part has it elsewhere
-LEVEL = 0.7  # m
-ROUNDS = 3
-RIGHT = (0.5, 5.0)  # m, degrees
+LEAST_CERTAINTY = 0.05  # certainty of a match that is looked at
+MOST_PLACES = 100  # places
+PLACES_APART = 1.0  # m between two places that tell a direction
+LARGEST_STRETCH = 0.5  # m by which two places may be farther apart in one map than in the other
+DOOR_OFF, MIDDLE_OFF = 0.5, 1.5  # m by which one door, and the middle of one room may be off: a map may have seen a part
+LEVEL_OFF = 0.7  # m
+REFINEMENT_ROUNDS = 3
+RIGHT_WITHIN = (0.5, 5.0)  # m, degrees
 
 
 class Places(NamedTuple):
@@ -41,7 +41,7 @@ def pose_of_matches(a: Mapping[str, Array], b: Mapping[str, Array], certain: Arr
         a, b: `pos`, `edge_pos` and `edge_index` of both graphs (`embedding.graph`).
         certain: (R_a, R_b) `matching.scores.certainty`.
     """
-    pairs = assign_certain(certain, LEAST)
+    pairs = assign_certain(certain, LEAST_CERTAINTY)
     pairs = pairs[np.argsort(-certain[tuple(pairs.T)], kind="stable")]
     places = _places(a, b, pairs)
     turn, move, rise = _candidates(places)
@@ -49,16 +49,16 @@ def pose_of_matches(a: Mapping[str, Array], b: Mapping[str, Array], certain: Arr
         return None
     flat = [x[:, 0] + 1j * x[:, 1] for x in (places.to, places.of)]
     away = abs(turn[:, None] * flat[1] + move[:, None] - flat[0])
-    level = abs(places.of[:, 2] + rise[:, None] - places.to[:, 2]) <= LEVEL
+    level = abs(places.of[:, 2] + rise[:, None] - places.to[:, 2]) <= LEVEL_OFF
     fit = np.maximum(1 - away / places.off, 0) * level
     first = np.flatnonzero(np.diff(places.match, prepend=-1))
     score = np.maximum.reduceat(fit, first, axis=1) @ certain[tuple(pairs[places.match[first]].T)]
     best = int(score.argmax())
-    kept = fit[best] > 0
-    for _ in range(ROUNDS):
-        pose, _ = align(places.to[kept], places.of[kept], weight=1 / places.off[kept] ** 2)
-        kept = np.linalg.norm(pose.apply(places.of) - places.to, axis=1) <= places.off
-        if kept.sum() < 2:
+    agreeing = fit[best] > 0
+    for _ in range(REFINEMENT_ROUNDS):
+        pose, _ = align(places.to[agreeing], places.of[agreeing], weight=1 / places.off[agreeing] ** 2)
+        agreeing = np.linalg.norm(pose.apply(places.of) - places.to, axis=1) <= places.off
+        if agreeing.sum() < 2:
             break
     return pose
 
@@ -69,21 +69,21 @@ def _places(a: Mapping[str, Array], b: Mapping[str, Array], pairs: Array) -> Pla
     match: list[int] = []
     off: list[float] = []
     for k, (i, j) in enumerate(pairs.tolist()):
-        if len(to) > MOST:
+        if len(to) > MOST_PLACES:
             break
         doors = [g["edge_pos"][g["edge_index"][0] == room] for g, room in ((a, i), (b, j))]
         here, there = (n.ravel() for n in np.meshgrid(*(np.arange(len(d)) for d in doors), indexing="ij"))
         to += [a["pos"][i], *doors[0][here]]
         of += [b["pos"][j], *doors[1][there]]
         match += [k] * (len(here) + 1)
-        off += [MIDDLE, *[DOOR] * len(here)]
+        off += [MIDDLE_OFF, *[DOOR_OFF] * len(here)]
     return Places(np.array(to).reshape(-1, 3), np.array(of).reshape(-1, 3), np.array(match, int), np.array(off))
 
 
 def _candidates(places: Places) -> tuple[Array, Array, Array]:
     """(C,) turn and move as complex numbers, and rise, m, of every two places that are as far apart in both maps."""
     far = [np.linalg.norm(x[:, None, :2] - x[None, :, :2], axis=2) for x in (places.to, places.of)]
-    alike = (np.minimum(*far) >= APART) & (abs(far[0] - far[1]) <= STRETCH)
+    alike = (np.minimum(*far) >= PLACES_APART) & (abs(far[0] - far[1]) <= LARGEST_STRETCH)
     p, q = np.nonzero(np.triu(alike, 1))
     to, of = (x[:, 0] + 1j * x[:, 1] for x in (places.to, places.of))
     turn = (to[q] - to[p]) / (of[q] - of[p])
@@ -103,4 +103,5 @@ def merged_right(pose: Sim3 | None, truth: Array, at: Array) -> bool:
         return False
     off = pose.apply(at[None])[0] - (truth[:3, :3] @ at + truth[:3, 3])
     turned = pose.yaw - np.arctan2(truth[1, 0], truth[0, 0])
-    return bool(np.linalg.norm(off) <= RIGHT[0] and abs(np.degrees((turned + np.pi) % (2 * np.pi) - np.pi)) <= RIGHT[1])
+    turned = abs(np.degrees((turned + np.pi) % (2 * np.pi) - np.pi))
+    return bool(np.linalg.norm(off) <= RIGHT_WITHIN[0] and turned <= RIGHT_WITHIN[1])

@@ -17,9 +17,9 @@ from topomerge.training.packed import GraphPair
 from topomerge.training.success import merged_right, pose_of_matches
 from topomerge.types import Array
 
-SIZES = (0, 3, 4)  # area, length, width: columns of x
-AT_ONCE = 8  # pairs
-LEAST = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)  # certainty of a match: the best of these is told
+SIZE_COLUMNS = (0, 3, 4)  # area, length, width: columns of x
+PAIRS_AT_ONCE = 8  # pairs
+LEAST_CERTAINTIES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)  # certainty of a match: the best of these is reported
 
 
 @torch.no_grad()
@@ -28,11 +28,11 @@ def embed(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") ->
     training = network.training
     network.eval()
     out: list[tuple[Tensor, Tensor]] = []
-    for start in range(0, len(pairs), AT_ONCE):
-        batch = make_batch(pairs[start : start + AT_ONCE], network.tensors).to(device)
+    for start in range(0, len(pairs), PAIRS_AT_ONCE):
+        batch = make_batch(pairs[start : start + PAIRS_AT_ONCE], network.tensors).to(device)
         embedding, dustbin = network(batch.tensors)
-        found = (part.float().cpu().split(batch.rooms) for part in (embedding, dustbin))
-        out += list(zip(*found, strict=True))
+        sides = (part.float().cpu().split(batch.rooms) for part in (embedding, dustbin))
+        out += list(zip(*sides, strict=True))
     network.train(training)
     return out
 
@@ -42,10 +42,10 @@ def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu")
     near-identical twin; precision, recall and F1 of the assignment in which a room may stay alone, at the certainty
     (`least`) that is best; and of the pairs with rooms in common (`mergeable`) the share whose matches give the true transform
     within 0.5 m and 5 degrees (`merged`: `training.success`)."""
-    found, temperature = embed(network, pairs, device), float(network.temperature.detach())
-    ranks, twins, clear, counts = [], [], [], np.zeros((len(LEAST), 4), int)
+    embeddings, temperature = embed(network, pairs, device), float(network.temperature.detach())
+    ranks, twins, clear, counts = [], [], [], np.zeros((len(LEAST_CERTAINTIES), 4), int)
     right: list[bool] = []
-    for pair, (a, bin_a), (b, bin_b) in zip(pairs, found[::2], found[1::2], strict=True):
+    for pair, (a, bin_a), (b, bin_b) in zip(pairs, embeddings[::2], embeddings[1::2], strict=True):
         similarity, matches = (a @ b.T).numpy(), pair.matches.numpy()
         links = torch.zeros(similarity.shape, dtype=torch.bool)
         links[pair.matches[:, 0], pair.matches[:, 1]] = True
@@ -55,11 +55,11 @@ def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu")
             rooms, rank = partner_ranks(one, truth)
             ranks.append(rank)
             clear.append(well[rooms])
-            twins.append(has_twin(other["x"][:, SIZES].numpy(), truth, rooms))
+            twins.append(has_twin(other["x"][:, SIZE_COLUMNS].numpy(), truth, rooms))
         rows, columns = match_scores(a, b, bin_a, bin_b, temperature)
         certain = certainty(rows.exp().numpy(), columns.exp().numpy())
         right += _merged(pair, certain)
-        counts += [pair_counts(assign_certain(certain, least), matches) for least in LEAST]
+        counts += [pair_counts(assign_certain(certain, least), matches) for least in LEAST_CERTAINTIES]
     merged = {"merged": float(np.mean(right)) if right else 0.0, "mergeable": float(len(right))}
     return scores(np.concatenate(ranks), np.concatenate(twins), np.concatenate(clear), counts) | merged
 
@@ -76,16 +76,16 @@ def _merged(pair: GraphPair, certain: Array) -> list[bool]:
 
 def _places(graph: Mapping[str, Tensor]) -> dict[str, Array]:
     """Where rooms and doors are; rooms that are neighbours by distance only have none."""
-    known = {name: graph[name].numpy() for name in ("pos", "edge_pos", "edge_index", "edge_attr")}
-    doors = through_doors(known)
-    return {"pos": known["pos"], "edge_pos": known["edge_pos"][doors], "edge_index": known["edge_index"][:, doors]}
+    arrays = {name: graph[name].numpy() for name in ("pos", "edge_pos", "edge_index", "edge_attr")}
+    doors = through_doors(arrays)
+    return {"pos": arrays["pos"], "edge_pos": arrays["edge_pos"][doors], "edge_index": arrays["edge_index"][:, doors]}
 
 
 def scores(ranks: Array, twins: Array, clear: Array, counts: Array) -> dict[str, float]:
     """Ranks (n,), whether each room has a twin (n,), and whether both maps saw it well (n,); the sums of `pair_counts`
-    for each of `LEAST`."""
-    found, right, wanted, got = counts.T
-    precision, recall = right / np.maximum(found, 1), got / np.maximum(wanted, 1)
+    for each of `LEAST_CERTAINTIES`."""
+    matched, right, wanted, got = counts.T
+    precision, recall = right / np.maximum(matched, 1), got / np.maximum(wanted, 1)
     f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-9)
     best = int(f1.argmax())
 
@@ -108,6 +108,6 @@ def scores(ranks: Array, twins: Array, clear: Array, counts: Array) -> dict[str,
         "precision": float(precision[best]),
         "recall": float(recall[best]),
         "f1": float(f1[best]),
-        "least": LEAST[best],
+        "least": LEAST_CERTAINTIES[best],
         "rooms": float(len(ranks)),
     }
