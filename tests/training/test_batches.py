@@ -10,7 +10,7 @@ from torch_geometric.loader import DataLoader
 
 from tests.graphs import pair
 from topomerge.embedding.network import Geometry, Network, Node
-from topomerge.training.batches import MapPair, make_batch, map_pair
+from topomerge.training.batches import ChangedPairs, MapPair, make_batch, map_pair
 from topomerge.training.settings import Augment
 
 
@@ -54,3 +54,12 @@ def test_rooms_that_are_left_out_take_their_matches_along():
     assert sum(batch.rooms) < 24 and len(batch.x) == len(batch.side) == len(batch.true) == sum(batch.rooms)
     first, second = batch.match_index
     assert torch.equal(batch.true[first], batch.true[second]) and batch.edge_index.max() < len(batch.x)
+
+
+def test_changes_of_a_pair_depend_on_its_seed_only():
+    pairs, names = [pair(k, 8) for k in range(4)], ("x", "edge_index", "edge_attr")
+    first, again, later = (ChangedPairs(pairs, names, Augment(), seed_of) for seed_of in (int, int, lambda number: number + 100))
+    together = next(iter(DataLoader(first, batch_sampler=[[3, 1]])))
+    alone = Batch.from_data_list([again[3], again[1]])
+    assert len(first) == 4 and torch.equal(together.x, alone.x) and torch.equal(together.edge_index, alone.edge_index)
+    assert not torch.equal(first[0].x[:2], later[0].x[:2])

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils.data import Dataset
 from torch_geometric.data import Batch, Data
 
 from topomerge.embedding.schema import column, columns_of_power
@@ -64,6 +65,28 @@ class MapPair(Data):
         map = 2 * pair + side
         piece = (map[:, None] == map[None]) & (true[:, None] == true[None]) & (true >= 0)[:, None]
         return Truth(pair, side, same, piece.fill_diagonal_(False), self["clear"])
+
+
+class ChangedPairs(Dataset[MapPair]):
+    """Pairs as graphs, changed anew each epoch, for torch-geometric's `DataLoader`.
+
+    Args:
+        names: tensors that the network reads.
+        augment: how maps are changed; None: not at all.
+        seed_of: number of a pair -> seed of its changes: they depend on nothing else, so neither on the batch nor on the process.
+    """
+
+    def __init__(
+        self, pairs: Sequence[GraphPair], names: Sequence[str], augment: Augment | None, seed_of: Callable[[int], int]
+    ) -> None:
+        self.pairs, self.names, self.augment, self.seed_of = pairs, names, augment, seed_of
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, number: int) -> MapPair:
+        generator = torch.Generator().manual_seed(self.seed_of(number))
+        return map_pair(self.pairs[number], self.names, self.augment, generator)
 
 
 def make_batch(

@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch_geometric.loader import DataLoader
 
 from topomerge.checkpoint import load_state
 from topomerge.errors import InputError
 from topomerge.models.embedder import Embedder
 from topomerge.models.losses import Objective
 from topomerge.models.weights import read_embedder, save_embedder
-from topomerge.training.batches import MapPair, make_batch
+from topomerge.training.batches import ChangedPairs, MapPair
 from topomerge.training.embedding_pictures import show_embedder
 from topomerge.training.log import Log
 from topomerge.training.loop import Loop, Schedule, State, mixed, pace
@@ -94,19 +95,14 @@ class EmbeddingJob:
         order = torch.randperm(len(self.train), generator=shuffle).tolist()
         if settings.overfit:
             order = list(range(len(self.train)))
-        rank, world, size, names = self.fabric.global_rank, self.fabric.world_size, settings.batch, self.network.tensors
-
-        def make(step: int) -> MapPair:
-            chosen = order[step * size * world :][: size * world][rank::world]
-            generator = torch.Generator().manual_seed(mixed(settings.seed, state.epoch, step, rank))
-            return make_batch([self.train[i] for i in chosen], names, self.augment, generator)
-
+        rank, world, size = self.fabric.global_rank, self.fabric.world_size, settings.batch
+        steps = [order[k * size * world :][: size * world][rank::world] for k in range(state.step, self.steps)]
+        pairs = ChangedPairs(self.train, self.network.tensors, self.augment, lambda pair: mixed(settings.seed, state.epoch, pair))
+        loader = iter(DataLoader(pairs, batch_sampler=steps, generator=shuffle))
         with ThreadPoolExecutor(1) as beside:
-            coming = beside.submit(make, state.step) if state.step < self.steps else None
-            for step in range(state.step, self.steps):
-                assert coming is not None
-                batch = coming.result()
-                coming = beside.submit(make, step + 1) if step + 1 < self.steps else None
+            coming = beside.submit(next, loader, None)
+            while (batch := coming.result()) is not None:
+                coming = beside.submit(next, loader, None)
                 yield batch
 
     def step(self, batch: MapPair, state: State) -> dict[str, float]:
