@@ -16,10 +16,6 @@ ROOT = Path(__file__).parent.parent
 LONGEST_FILE, LONGEST_FUNCTION, MOST_PARAMETERS = 300, 60, 8
 SAME_CONSTANT = 2  # files that may define a constant of one name
 REPEATED = 6  # lines: a run of so many stands in one place only
-PROTOCOLS = {  # constants that modules of one kind must all have, as the module that calls them says
-    "datasets/real/sources.py": {"FOLDER"},
-    "datasets/public/sources.py": {"FOLDER"},
-}
 VAGUE = {"found", "known", "kept", "told"}  # they say that a thing is there, never what it is
 
 
@@ -79,11 +75,10 @@ def test_names_say_what_a_thing_is(path: Path) -> None:
 def test_constants_are_qualified() -> None:
     homes: dict[str, set[str]] = defaultdict(set)
     for path in product_files():
-        protocol = PROTOCOLS.get(f"{identify(path.parent)}/sources.py", set())
         for node in ast.parse(path.read_text()).body:
             targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
             for name in (n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)):
-                if re.fullmatch(r"[A-Z][A-Z0-9_]*", name) and name not in protocol:
+                if re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
                     homes[name].add(identify(path))
     shared = {name: sorted(files) for name, files in homes.items() if len(files) > SAME_CONSTANT}
     assert not shared, "\n".join(f"{name}: {', '.join(files)}" for name, files in sorted(shared.items()))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topomerge.datasets.simulation.floor_truth import CELL, Truth
+from topomerge.datasets.simulation.floor_truth import TRUTH_CELL, Truth
 
 from topomerge.io.atomic import replacing
 from topomerge.metrics import consistency
@@ -32,7 +32,7 @@ def agreement(a: Path, b: Path) -> tuple[float, float]:
         return 0.0, 0.0
     with np.load(a, allow_pickle=False) as first, np.load(b, allow_pickle=False) as second:
         both = first["visited"] & second["visited"]
-        labels, least = (first["columns"][both], second["columns"][both]), round(LEAST / CELL**2)
+        labels, least = (first["columns"][both], second["columns"][both]), round(LEAST / TRUTH_CELL**2)
         return consistency(*labels, least, every=False), consistency(*labels, least)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from topomerge.datasets.simulation.floor_truth import CELL
+from topomerge.datasets.simulation.floor_truth import TRUTH_CELL
 
 from benchmarks.extraction.scans import Scan
 from topomerge.io.atomic import replacing
@@ -42,7 +42,7 @@ def save(scan: Scan, map: TopometricMap, columns: Array, verdict: Any, title: st
 def _storey(axes: Any, scan: Scan, map: TopometricMap, labels: Array, k: int, verdict: Any, points: Array) -> None:
     truth = scan.truth
     assert truth is not None
-    high, (x, y) = truth.origin + np.array(labels.shape[::-1]) * CELL, truth.origin
+    high, (x, y) = truth.origin + np.array(labels.shape[::-1]) * TRUTH_CELL, truth.origin
     extent = (x, high[0], y, high[1])
     image = np.full((*labels.shape, 3), 255, np.uint8)
     if len(map.rooms):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topomerge.datasets.pairs.evaluation_pair import KeptPair, load_set
+from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_set
 
 from topomerge.embedding.embedders import embedder
 from topomerge.evaluation.score import FLAT, pose_error, within
@@ -30,7 +30,7 @@ PARTNERS = (1, 2, 3, CONSISTENCY.partners)  # of a room
 MOST = 1000  # poses that are looked through
 
 
-def right(pose: Sim3, pair: KeptPair, limits: tuple[float, float]) -> bool:
+def right(pose: Sim3, pair: EvaluationPair, limits: tuple[float, float]) -> bool:
     """Is a pose near the true one, in the middle of what both maps saw?"""
     assert pair.transform is not None
     flat = any(sensor in FLAT for sensor in pair.about["sensors"])
@@ -38,7 +38,7 @@ def right(pose: Sim3, pair: KeptPair, limits: tuple[float, float]) -> bool:
 
 
 def proposed(
-    a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], cost: Array, partners: int, pair: KeptPair
+    a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], cost: Array, partners: int, pair: EvaluationPair
 ) -> tuple[int, float]:
     """Number of poses, and the place of the first right one in the order of how many rooms speak for each; inf without one."""
     pairs = best_partners(cost, partners)
@@ -49,7 +49,7 @@ def proposed(
     return len(poses), float(next(places, np.inf)) + 1
 
 
-def measured(pair: KeptPair, name: str, merged: bool) -> dict[str, Any]:
+def measured(pair: EvaluationPair, name: str, merged: bool) -> dict[str, Any]:
     """A row of a pair and a descriptor."""
     (a, b), describe = pair.maps(), embedder(name)
     began = time.process_time()

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from topomerge.datasets.buildings.drafting import Draft, point
 from topomerge.datasets.buildings.layouts import Core, Layout, Row
-from topomerge.datasets.buildings.profiles import WIDTHS, Profile, Range
+from topomerge.datasets.buildings.profiles import CORE_WIDTHS, Profile, Range
 from topomerge.datasets.buildings.stairs import length_for, width_for
 from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.core.plan import Flight
@@ -55,7 +55,7 @@ def _core_size(kind: str, flight: str, height: float, wall: float, rng: np.rando
         behind = FOOT_OF_FLIGHT if flight == "straight" else 0.02
         lane = FOOT_OF_FLIGHT if flight == "straight" else 0.05  # beside the flight, to walk back on
         return width_for(flight, height) + lane + wall, FOOT_OF_FLIGHT + length_for(flight, height) + behind + wall
-    width = round(float(rng.uniform(*WIDTHS[kind])), 2)
+    width = round(float(rng.uniform(*CORE_WIDTHS[kind])), 2)
     return width, {"lift": 2.4, "hall": round(float(rng.uniform(12, 18)), 2), "atrium": 9.0}.get(kind, 0.0)
 
 

@@ -11,8 +11,8 @@ from topomerge.datasets.core.plan import Flight, Opening, Plan, PlanRoom, Point,
 
 from topomerge.types import Array
 
-SPREAD = 0.01  # m, standard deviation of the clear width of doors of one make, as built
-MARGIN = 0.12  # m between an opening and the corner of its room
+DOOR_WIDTH_SPREAD = 0.01  # m, standard deviation of the clear width of doors of one make, as built
+CORNER_MARGIN = 0.12  # m between an opening and the corner of its room
 
 
 @dataclass(eq=False)
@@ -54,7 +54,7 @@ class Draft:
         """
         line = self.outlines[a].intersection(self.outlines[b])
         if kind == "door":
-            width = round(max(width * self.wide + float(self.rng.normal(0, SPREAD)), 0.72), 2)
+            width = round(max(width * self.wide + float(self.rng.normal(0, DOOR_WIDTH_SPREAD)), 0.72), 2)
         return self.cut(line, width, kind, at, **more) or (width < 1.3 and self.cut(line, 0.72, kind, at, **more))
 
     def entrance(self, a: int, width: float) -> bool:
@@ -70,7 +70,7 @@ class Draft:
     def cut(self, line: shapely.Geometry, width: float, kind: str, at: float | None, **more: float | str) -> bool:
         """An opening in the longest straight piece of a line; False where it is too short, or where an opening is already."""
         edges = straight(line)
-        spare = self.wall / 2 + MARGIN
+        spare = self.wall / 2 + CORNER_MARGIN
         if not len(edges):
             return False
         start, end = max(edges, key=lambda e: float(np.hypot(*(e[1] - e[0]))))

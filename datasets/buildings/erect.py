@@ -58,9 +58,9 @@ def erect(
     vertices, triangles, labels, thing_of = soup.arrays()
     levels = np.zeros(len(plans), LEVEL_DTYPE)
     levels["floor"], levels["ceiling"] = floors[:-1], [z + p.ceiling for z, p in zip(floors, plans, strict=False)]
-    known = {"difficulty": asdict(difficulty), **(parameters or {})}
+    recorded = {"difficulty": asdict(difficulty), **(parameters or {})}
     rooms = tuple(true_room(s) for s in spaces if s.room >= 0)
-    return Building(name, kind, vertices, triangles, labels, thing_of, rooms, doors, stairs, levels, things, seed, known)
+    return Building(name, kind, vertices, triangles, labels, thing_of, rooms, doors, stairs, levels, things, seed, recorded)
 
 
 def _stairs(plans: Sequence[Plan], floors: Array, spaces: list[Space]) -> tuple[Array, list[Prism], Soup]:
@@ -110,11 +110,11 @@ def _shell(spaces: list[Space], holes: list[Hole], wells: list[Prism], floors: A
     for flat, label, up in ((faces.ups, "floor", 0.02), (faces.downs[faces.downs[:, 0, 2] < roof + 0.5], "ceiling", -0.02)):
         centre = flat.mean(axis=1) + [0, 0, up]
         outer = _outdoors(centre, plans, floors)
-        kept = ~(outer & ground) if label == "floor" else np.ones(len(flat), bool)
+        shown = ~(outer & ground) if label == "floor" else np.ones(len(flat), bool)
         values = np.where(outer, SURFACES.index("facade"), np.where(_indoors(centre, spaces), SURFACES.index(label), 0))
         at_floor = (np.abs(flat[:, 0, 2, None] - floors) < 1e-3).any(axis=1) & (label == "floor") & ~outer
         values[at_floor] = SURFACES.index("floor")
-        soup.add(flat[kept].reshape(-1, 3), np.arange(3 * kept.sum()).reshape(-1, 3), values[kept])
+        soup.add(flat[shown].reshape(-1, 3), np.arange(3 * shown.sum()).reshape(-1, 3), values[shown])
 
 
 def _outdoors(points: Array, plans: list[shapely.Geometry], floors: Array) -> Array:

@@ -17,10 +17,10 @@ from topomerge.datasets.core.solids import Soup, boxes, column, flat, rotation
 
 from topomerge.types import Array
 
-LEAF = 0.04  # m, thickness
+LEAF_THICKNESS = 0.04  # m, thickness
 SWING = {"shut": (0.0, 0.0), "half": (0.5, 1.1), "open": (1.4, 1.9)}  # rad
-PLAIN = ("stairs", "lift", "atrium", "bath", "hotel", "bedroom", "living", "void")  # rooms without ducts
-DOUBLE = 1.25  # m; wider doors have two leaves
+ROOMS_WITHOUT_DUCTS = ("stairs", "lift", "atrium", "bath", "hotel", "bedroom", "living", "void")  # rooms without ducts
+TWO_LEAVES = 1.25  # m; wider doors have two leaves
 
 
 def fit(
@@ -74,14 +74,14 @@ def _leaves(soup: Soup, things: list[tuple], spaces: list[Space], doors: Array, 
         into = max(door["rooms"]) if into < 0 else into
         probe = door["centre"][:2] + normal * (door["thickness"] / 2 + 0.1)
         side = 1.0 if shapes[into].covers(shapely.Point(probe)) else -1.0
-        ends = (-1.0, 1.0) if door["width"] > DOUBLE else (float(rng.choice([-1.0, 1.0])),)
+        ends = (-1.0, 1.0) if door["width"] > TWO_LEAVES else (float(rng.choice([-1.0, 1.0])),)
         angle = float(rng.uniform(*SWING[str(door["state"])]))
         for end in ends:
             pivot = door["centre"][:2] + end * along * (door["width"] / 2 - 0.01)
-            pivot = pivot + side * normal * (door["thickness"] / 2 - LEAF / 2)
+            pivot = pivot + side * normal * (door["thickness"] / 2 - LEAF_THICKNESS / 2)
             yaw, length = leaf_yaw(door, pivot, angle), door["width"] / len(ends) - 0.02
             centre = [*(pivot + length / 2 * np.array([np.cos(yaw), np.sin(yaw)])), door["centre"][2]]
-            size = (length, LEAF, door["height"] - 0.03)
+            size = (length, LEAF_THICKNESS, door["height"] - 0.03)
             mesh = boxes(np.array([[0, 0, size[2] / 2 + 0.01, *size]]), np.array(centre), yaw)
             soup.add(*mesh, "leaf", len(things))
             centre[2] += size[2] / 2
@@ -199,7 +199,7 @@ def _ducts(
         frame: middle (2,), yaw (rad), length and width (m) of the rectangle around the room.
     """
     spare = space.ceiling - space.floor - 2.15
-    if rng.random() >= difficulty.ducts or space.plan.kind in PLAIN or spare < 0.25:
+    if rng.random() >= difficulty.ducts or space.plan.kind in ROOMS_WITHOUT_DUCTS or spare < 0.25:
         return
     middle, yaw, long, wide = frame
     rows = rng.random() < 0.3  # panels of one make, side by side; else ducts and pipes, each by itself

@@ -6,16 +6,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from topomerge.datasets.buildings.furniture import FURNITURE_OF, MIDDLE, ROWS, WALL, Item, footprints, make_item
+from topomerge.datasets.buildings.furniture import BY_WALL, FURNITURE_OF, IN_MIDDLE, IN_ROWS, Item, footprints, make_item
 from topomerge.datasets.core.solids import rotation
 
 from topomerge.types import Array
 
-TRIES = 10
-SHIFT, TURN, GAPS = 0.06, 0.03, 0.08  # m and rad (standard deviations) and share by which rows of furniture are irregular
-BODY = 0.28  # m, half of what a person needs to pass
+PLACES_TRIED = 10
+ROW_SHIFT, ASKEW, ROW_GAPS = (
+    0.06,
+    0.03,
+    0.08,
+)  # m and rad (standard deviations) and share by which rows of furniture are irregular
+HALF_BODY = 0.28  # m, half of what a person needs to pass
 ANYHOW = ("clutter", "person", "armchair", "plant")  # stand at any angle
-EMPTY = ("stairs", "lift", "void")
+UNFURNISHED = ("stairs", "lift", "void")
 
 
 @dataclass(eq=False)
@@ -36,14 +40,14 @@ class Floor:
 
     def put(self, item: Item, where: str) -> Item | None:
         """The item at a place that is free, or None when none was found."""
-        at, yaw = self._by_wall(item) if where == WALL else self._in_middle(item)
+        at, yaw = self._by_wall(item) if where == BY_WALL else self._in_middle(item)
         yaw = yaw + self._askew(item)
         free = np.flatnonzero(self.fits(at, yaw, item))
         return self._place(item, at[free[0]], float(yaw[free[0]])) if len(free) else None
 
     def _askew(self, item: Item) -> float:
         """rad by which a thing is not parallel to the walls; what is fitted stands straight."""
-        return float(self.rng.normal(0, TURN)) if item.movable else 0.0
+        return float(self.rng.normal(0, ASKEW)) if item.movable else 0.0
 
     def fits(self, at: Array, yaw: Array, item: Item) -> Array:
         """(n,) bool: does the item lie within the room and clear of everything, at each place?"""
@@ -62,20 +66,20 @@ class Floor:
         """Places with the back to a wall; half of them in corners, as people put things."""
         width, depth = item.size[:2]
         weight = np.maximum(self.lengths - width, 0) + 1e-9
-        wall = self.rng.choice(len(weight), TRIES, p=weight / weight.sum())
+        wall = self.rng.choice(len(weight), PLACES_TRIED, p=weight / weight.sum())
         along, spare = self.along[wall], np.maximum(self.lengths[wall] - width, 0.0)
         inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
-        free = self.rng.uniform(0, 1, TRIES) * spare
-        corner = np.where(self.rng.random(TRIES) < 0.5, 0.04, spare - 0.04)
-        offset = np.where(self.rng.random(TRIES) < 0.5, corner, free) + width / 2
-        gap = 0.05 + self.rng.exponential(0.03, TRIES) if item.movable else np.full(TRIES, 0.03)
+        free = self.rng.uniform(0, 1, PLACES_TRIED) * spare
+        corner = np.where(self.rng.random(PLACES_TRIED) < 0.5, 0.04, spare - 0.04)
+        offset = np.where(self.rng.random(PLACES_TRIED) < 0.5, corner, free) + width / 2
+        gap = 0.05 + self.rng.exponential(0.03, PLACES_TRIED) if item.movable else np.full(PLACES_TRIED, 0.03)
         at = self.corners[wall] + along * offset[:, None] + inward * (depth / 2 + gap)[:, None]
         return at, np.arctan2(-inward[:, 1], -inward[:, 0]) - np.pi / 2
 
     def _in_middle(self, item: Item) -> tuple[Array, Array]:
         low, high = np.array(self.shape.bounds).reshape(2, 2)
-        turn = self.rng.uniform(0, 4, TRIES) if item.kind in ANYHOW else self.rng.integers(4, size=TRIES)
-        return self.rng.uniform(low, high, (TRIES, 2)), self.bearing() + turn * np.pi / 2
+        turn = self.rng.uniform(0, 4, PLACES_TRIED) if item.kind in ANYHOW else self.rng.integers(4, size=PLACES_TRIED)
+        return self.rng.uniform(low, high, (PLACES_TRIED, 2)), self.bearing() + turn * np.pi / 2
 
     def bearing(self) -> float:
         """rad, direction of the longest wall."""
@@ -90,9 +94,9 @@ class Floor:
         size, aisle = np.array(item.size[:2]), self.rng.uniform(0.5, 0.9, 2)
         xs, ys = (np.arange(low[k] + size[k] / 2, high[k] - size[k] / 2 + 1e-6, size[k] + aisle[k]) for k in (0, 1))
         spots = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2) @ rotation(yaw)
-        spots = spots + self.rng.normal(0, SHIFT, spots.shape)
-        yaws = yaw + self.rng.normal(0, TURN, len(spots))
-        free = self.fits(spots, yaws, item) & (self.rng.random(len(spots)) > GAPS) if len(spots) else np.zeros(0, bool)
+        spots = spots + self.rng.normal(0, ROW_SHIFT, spots.shape)
+        yaws = yaw + self.rng.normal(0, ASKEW, len(spots))
+        free = self.fits(spots, yaws, item) & (self.rng.random(len(spots)) > ROW_GAPS) if len(spots) else np.zeros(0, bool)
         return [self._place(item, spot, float(y)) for spot, y in zip(spots[free][:count], yaws[free][:count], strict=True)]
 
 
@@ -106,19 +110,19 @@ def furnish(floor: Floor, kind: str, density: float, clutter: float, doors: Arra
         clutter: things on the floor of 10 m2.
         doors: (d, 2) where the doors are; all must stay reachable from each other.
     """
-    if kind in EMPTY:
+    if kind in UNFURNISHED:
         return []
     area, rng = floor.shape.area, floor.rng
     out: list[Item | None] = []
     for name, where, least, every in FURNITURE_OF.get(kind, FURNITURE_OF["office"]):
         count = (least + (area / every if every else 0.0)) * density
         number = int(count) + int(rng.random() < count % 1)
-        if where == ROWS:
+        if where == IN_ROWS:
             out += floor.rows(name, number)
         else:
             out += [floor.put(make_item(name, rng), where) for _ in range(number)]
     strewn = int(rng.poisson(clutter * area / 10))
-    out += [floor.put(make_item("clutter", rng), MIDDLE) for _ in range(strewn)]
+    out += [floor.put(make_item("clutter", rng), IN_MIDDLE) for _ in range(strewn)]
     items = [item for item in out if item is not None and item.size[2] < floor.height]
     while items and not passable(floor.shape, items, doors):
         items = items[: len(items) * 2 // 3]
@@ -130,7 +134,7 @@ def passable(shape: shapely.Polygon, items: list[Item], doors: Array) -> bool:
     if not len(doors):
         return True
     standing = [footprints(i.at[None], np.array([i.yaw]), i.size) for i in items if i.kind != "board"]
-    blocked = shapely.union_all(shapely.polygons(np.concatenate(standing)) if standing else []).buffer(BODY, 2)
-    parts = shapely.get_parts(shape.buffer(0.1, 2).buffer(-0.1 - BODY * 0.9, 2).difference(blocked))
+    blocked = shapely.union_all(shapely.polygons(np.concatenate(standing)) if standing else []).buffer(HALF_BODY, 2)
+    parts = shapely.get_parts(shape.buffer(0.1, 2).buffer(-0.1 - HALF_BODY * 0.9, 2).difference(blocked))
     near = shapely.distance(parts[:, None], shapely.points(doors)[None]) < 0.45
     return bool((near.all(axis=1) & (shapely.area(parts) > 0.15 * shape.area * (shape.area > 8))).any())

@@ -173,45 +173,63 @@ ITEMS: dict[str, Make] = {
 }
 FIXED = {"kitchen", "toilet", "sink", "shower", "bath", "bench", "hood", "board", "radiator", "counterdesk"}
 # kind of room -> (item, where, number, m2 for each further one: 0 none). "rows" fill the room's middle.
-WALL, MIDDLE, ROWS = "wall", "middle", "rows"
+BY_WALL, IN_MIDDLE, IN_ROWS = "wall", "middle", "rows"
 FURNITURE_OF: dict[str, list[tuple[str, str, int, float]]] = {
     "office": [
-        ("desk", WALL, 1, 9), ("shelf", WALL, 1, 14), ("cabinet", WALL, 1, 16),
-        ("radiator", WALL, 1, 0), ("plant", WALL, 0, 25),
+        ("desk", BY_WALL, 1, 9), ("shelf", BY_WALL, 1, 14), ("cabinet", BY_WALL, 1, 16),
+        ("radiator", BY_WALL, 1, 0), ("plant", BY_WALL, 0, 25),
     ],
-    "openplan": [("desk", ROWS, 4, 7), ("cabinet", WALL, 2, 25), ("partition", MIDDLE, 1, 40), ("plant", WALL, 1, 40)],
-    "meeting": [("meeting", MIDDLE, 1, 60), ("board", WALL, 1, 0), ("cabinet", WALL, 0, 30)],
-    "corridor": [("cabinet", WALL, 0, 40), ("plant", WALL, 0, 60), ("sidebench", WALL, 0, 60), ("printer", WALL, 0, 70)],
-    "lobby": [("counterdesk", MIDDLE, 1, 0), ("sofa", WALL, 1, 40), ("lowtable", MIDDLE, 1, 60), ("plant", WALL, 1, 30)],
-    "atrium": [("sofa", MIDDLE, 1, 60), ("lowtable", MIDDLE, 1, 60), ("plant", WALL, 2, 40), ("dining", MIDDLE, 0, 60)],
-    "lounge": [("sofa", MIDDLE, 1, 30), ("lowtable", MIDDLE, 1, 40), ("plant", WALL, 1, 30), ("shelf", WALL, 0, 30)],
-    "kitchen": [("kitchen", WALL, 1, 0), ("dining", MIDDLE, 1, 0), ("cabinet", WALL, 0, 15)],
+    "openplan": [
+        ("desk", IN_ROWS, 4, 7), ("cabinet", BY_WALL, 2, 25),
+        ("partition", IN_MIDDLE, 1, 40), ("plant", BY_WALL, 1, 40),
+    ],
+    "meeting": [("meeting", IN_MIDDLE, 1, 60), ("board", BY_WALL, 1, 0), ("cabinet", BY_WALL, 0, 30)],
+    "corridor": [
+        ("cabinet", BY_WALL, 0, 40), ("plant", BY_WALL, 0, 60),
+        ("sidebench", BY_WALL, 0, 60), ("printer", BY_WALL, 0, 70),
+    ],
+    "lobby": [
+        ("counterdesk", IN_MIDDLE, 1, 0), ("sofa", BY_WALL, 1, 40),
+        ("lowtable", IN_MIDDLE, 1, 60), ("plant", BY_WALL, 1, 30),
+    ],
+    "atrium": [
+        ("sofa", IN_MIDDLE, 1, 60), ("lowtable", IN_MIDDLE, 1, 60),
+        ("plant", BY_WALL, 2, 40), ("dining", IN_MIDDLE, 0, 60),
+    ],
+    "lounge": [("sofa", IN_MIDDLE, 1, 30), ("lowtable", IN_MIDDLE, 1, 40), ("plant", BY_WALL, 1, 30), ("shelf", BY_WALL, 0, 30)],
+    "kitchen": [("kitchen", BY_WALL, 1, 0), ("dining", IN_MIDDLE, 1, 0), ("cabinet", BY_WALL, 0, 15)],
     "living": [
-        ("sofa", WALL, 1, 25), ("lowtable", MIDDLE, 1, 0), ("tv", WALL, 1, 0), ("shelf", WALL, 1, 12),
-        ("dining", MIDDLE, 0, 22), ("armchair", MIDDLE, 0, 15), ("plant", WALL, 1, 0),
+        ("sofa", BY_WALL, 1, 25), ("lowtable", IN_MIDDLE, 1, 0), ("tv", BY_WALL, 1, 0), ("shelf", BY_WALL, 1, 12),
+        ("dining", IN_MIDDLE, 0, 22), ("armchair", IN_MIDDLE, 0, 15), ("plant", BY_WALL, 1, 0),
     ],
-    "bedroom": [("bed", WALL, 1, 0), ("wardrobe", WALL, 1, 18), ("nightstand", WALL, 1, 0), ("desk", WALL, 0, 14)],
+    "bedroom": [("bed", BY_WALL, 1, 0), ("wardrobe", BY_WALL, 1, 18), ("nightstand", BY_WALL, 1, 0), ("desk", BY_WALL, 0, 14)],
     "hotel": [
-        ("bed", WALL, 1, 0), ("wardrobe", WALL, 1, 0), ("nightstand", WALL, 1, 0),
-        ("tv", WALL, 1, 0), ("armchair", WALL, 0, 20),
+        ("bed", BY_WALL, 1, 0), ("wardrobe", BY_WALL, 1, 0), ("nightstand", BY_WALL, 1, 0),
+        ("tv", BY_WALL, 1, 0), ("armchair", BY_WALL, 0, 20),
     ],
-    "ward": [("hospitalbed", WALL, 1, 11), ("nightstand", WALL, 1, 11), ("wardrobe", WALL, 1, 30), ("trolley", WALL, 0, 20)],
-    "bath": [("toilet", WALL, 1, 0), ("sink", WALL, 1, 0), ("shower", WALL, 1, 0), ("bath", WALL, 0, 6)],
-    "toilets": [("toilet", WALL, 1, 5), ("sink", WALL, 1, 7)],
+    "ward": [
+        ("hospitalbed", BY_WALL, 1, 11), ("nightstand", BY_WALL, 1, 11),
+        ("wardrobe", BY_WALL, 1, 30), ("trolley", BY_WALL, 0, 20),
+    ],
+    "bath": [("toilet", BY_WALL, 1, 0), ("sink", BY_WALL, 1, 0), ("shower", BY_WALL, 1, 0), ("bath", BY_WALL, 0, 6)],
+    "toilets": [("toilet", BY_WALL, 1, 5), ("sink", BY_WALL, 1, 7)],
     "classroom": [
-        ("board", WALL, 1, 0), ("seat", ROWS, 6, 4.5), ("desk", MIDDLE, 1, 0),
-        ("shelf", WALL, 1, 40), ("cabinet", WALL, 1, 40),
+        ("board", BY_WALL, 1, 0), ("seat", IN_ROWS, 6, 4.5), ("desk", IN_MIDDLE, 1, 0),
+        ("shelf", BY_WALL, 1, 40), ("cabinet", BY_WALL, 1, 40),
     ],
-    "hall": [("sidebench", WALL, 2, 50), ("seat", ROWS, 0, 60), ("cabinet", WALL, 1, 80)],
-    "canteen": [("dining", ROWS, 3, 12), ("counterdesk", WALL, 1, 0)],
+    "hall": [("sidebench", BY_WALL, 2, 50), ("seat", IN_ROWS, 0, 60), ("cabinet", BY_WALL, 1, 80)],
+    "canteen": [("dining", IN_ROWS, 3, 12), ("counterdesk", BY_WALL, 1, 0)],
     "lab": [
-        ("bench", ROWS, 1, 16), ("hood", WALL, 1, 30), ("shelf", WALL, 1, 20),
-        ("desk", WALL, 0, 25), ("cabinet", WALL, 1, 25),
+        ("bench", IN_ROWS, 1, 16), ("hood", BY_WALL, 1, 30), ("shelf", BY_WALL, 1, 20),
+        ("desk", BY_WALL, 0, 25), ("cabinet", BY_WALL, 1, 25),
     ],
-    "storage": [("rack", WALL, 2, 5), ("clutter", MIDDLE, 1, 5)],
-    "nurses": [("counterdesk", MIDDLE, 1, 0), ("desk", WALL, 1, 12), ("shelf", WALL, 1, 10), ("trolley", WALL, 1, 12)],
-    "library": [("shelf", ROWS, 4, 6), ("desk", WALL, 1, 25), ("dining", MIDDLE, 0, 40)],
-    "cloakroom": [("locker", WALL, 2, 6), ("sidebench", MIDDLE, 1, 12)],
+    "storage": [("rack", BY_WALL, 2, 5), ("clutter", IN_MIDDLE, 1, 5)],
+    "nurses": [
+        ("counterdesk", IN_MIDDLE, 1, 0), ("desk", BY_WALL, 1, 12),
+        ("shelf", BY_WALL, 1, 10), ("trolley", BY_WALL, 1, 12),
+    ],
+    "library": [("shelf", IN_ROWS, 4, 6), ("desk", BY_WALL, 1, 25), ("dining", IN_MIDDLE, 0, 40)],
+    "cloakroom": [("locker", BY_WALL, 2, 6), ("sidebench", IN_MIDDLE, 1, 12)],
 }  # fmt: skip
 
 

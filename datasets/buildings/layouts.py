@@ -15,7 +15,7 @@ from topomerge.datasets.core.solids import rotation
 
 from topomerge.types import Array
 
-MOST = 140.0  # m2; larger corridors are parted by fire doors
+LARGEST_CORRIDOR = 140.0  # m2; larger corridors are parted by fire doors
 SHAPES = ("single", "double", "ring", "L", "T", "U", "comb")
 
 
@@ -170,7 +170,7 @@ def draw(layout: Layout, draft: Draft, kind: str = "corridor", merge: bool = Fal
     if merge:
         for a, b in layout.joints:
             union = outlines[a].union(outlines[b])
-            if union.geom_type == "Polygon" and not union.interiors and union.area < MOST:
+            if union.geom_type == "Polygon" and not union.interiors and union.area < LARGEST_CORRIDOR:
                 outlines[a], owner[b] = union, a
     rooms = {i: draft.room(outlines[i].simplify(1e-3), kind) for i in sorted(set(owner))}
     for a, b in layout.joints:

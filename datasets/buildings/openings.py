@@ -71,8 +71,8 @@ def _which(probes: Array, shapes: list[shapely.Polygon], here: list[int]) -> Arr
 
 
 def _first(which: Array, steps: Array, limit: float) -> tuple[int, float]:
-    found = np.flatnonzero((which != -2) & (steps <= limit))
-    return (int(which[found[0]]), float(steps[found[0]])) if len(found) else (-2, 0.0)
+    open_steps = np.flatnonzero((which != -2) & (steps <= limit))
+    return (int(which[open_steps[0]]), float(steps[open_steps[0]])) if len(open_steps) else (-2, 0.0)
 
 
 def _hole(

@@ -13,7 +13,7 @@ from topomerge.datasets.buildings.cores import add_cores, draw_core
 from topomerge.datasets.buildings.drafting import Draft
 from topomerge.datasets.buildings.erect import erect
 from topomerge.datasets.buildings.layouts import SHAPES, Layout, Size, draw, make_layout
-from topomerge.datasets.buildings.profiles import DARK, INNER, KINDS, PROFILES, Deck, Profile
+from topomerge.datasets.buildings.profiles import BUILDING_KINDS, DARK, INNER, PROFILES, Deck, Profile
 from topomerge.datasets.buildings.row_rooms import fill_row
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.difficulty import Difficulty
@@ -21,7 +21,7 @@ from topomerge.datasets.core.plan import Plan
 
 from topomerge.errors import InputError
 
-TRIES = 20
+BUILDINGS_TRIED = 20
 
 
 def make_building(
@@ -30,7 +30,7 @@ def make_building(
     """A building of a kind; the same arguments give the same bytes.
 
     Args:
-        kind: one of `KINDS`.
+        kind: one of `BUILDING_KINDS`.
         storeys: 1 to 8.
         shape: of the corridors, one of `layouts.SHAPES`; empty: drawn from what is usual for the kind.
         stairs: straight, dogleg, spiral or ramp; empty: drawn.
@@ -40,19 +40,19 @@ def make_building(
     """
     difficulty = difficulty or Difficulty()
     if kind not in PROFILES:
-        raise InputError(f"building kind {kind!r}: {', '.join(KINDS)} are possible")
+        raise InputError(f"building kind {kind!r}: {', '.join(BUILDING_KINDS)} are possible")
     if not 1 <= storeys <= 8:
         raise InputError(f"storeys must be 1 to 8, not {storeys}")
     if shape and shape not in SHAPES:
         raise InputError(f"shape {shape!r}: {', '.join(SHAPES)} are possible")
     profile = PROFILES[kind]
     profile = replace(profile, shapes=(shape,) if shape else profile.shapes, stairs=(stairs,) if stairs else profile.stairs)
-    rng = np.random.default_rng([seed, KINDS.index(kind), storeys])
+    rng = np.random.default_rng([seed, BUILDING_KINDS.index(kind), storeys])
     name = f"{kind}-{seed}-{storeys}"
-    known = {"kind": kind, "seed": seed, "storeys": storeys, "shape": shape, "stairs": stairs}
-    for _ in range(TRIES):
+    parameters = {"kind": kind, "seed": seed, "storeys": storeys, "shape": shape, "stairs": stairs}
+    for _ in range(BUILDINGS_TRIED):
         plans = make_plans(profile, storeys, difficulty, rng)
-        building = erect(plans, difficulty, rng, name, kind, known)
+        building = erect(plans, difficulty, rng, name, kind, parameters)
         if connected(building):
             return replace(building, seed=seed)
     raise InputError(f"{name}: no plan found in which every room can be reached; another seed will do")

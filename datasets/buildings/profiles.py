@@ -66,8 +66,8 @@ PROFILES = {
         upper=("bedroom", "bedroom", "bath", "bedroom"), cores=(), height=(2.8, 3.0), stairs=("dogleg", "spiral"), lift=False,
     ),
 }  # fmt: skip
-KINDS = tuple(PROFILES)
-WIDTHS: dict[str, Range] = {
+BUILDING_KINDS = tuple(PROFILES)
+CORE_WIDTHS: dict[str, Range] = {
     "office": (2.6, 4.6), "meeting": (4.0, 9.0), "storage": (1.9, 3.0), "kitchen": (2.8, 4.0), "openplan": (9.0, 16.0),
     "flat": (7.6, 9.4), "hotel": (3.5, 4.1), "ward": (3.8, 4.6), "classroom": (7.2, 9.4), "library": (9.0, 13.0),
     "cloakroom": (3.0, 4.5), "lab": (5.4, 9.5), "living": (4.2, 6.5), "bath": (2.0, 2.6), "bedroom": (2.9, 4.4),
@@ -90,11 +90,11 @@ class Deck:
         self.left: list[str] = []
         self.module = float(rng.choice([0.0, 0.0, 1.2, 1.5]))
         fixed = np.random.default_rng(style)
-        self.widths = {} if style is None else {k: float(fixed.uniform(*WIDTHS[k])) for k in sorted(set(kinds))}
+        self.widths = {} if style is None else {k: float(fixed.uniform(*CORE_WIDTHS[k])) for k in sorted(set(kinds))}
 
     def _width(self, kind: str) -> float:
         """m; some rooms are as wide as two, as where a wall was left out."""
-        width = float(self.rng.uniform(*WIDTHS[kind]))
+        width = float(self.rng.uniform(*CORE_WIDTHS[kind]))
         wide = kind in MERGED and self.rng.random() < self.spread
         return width * float(self.rng.uniform(1.4, 2.2)) if wide else width
 
@@ -103,7 +103,7 @@ class Deck:
         for _ in range(2 * len(self.kinds)):
             self.left = self.left or self.rng.permutation(np.array(self.kinds)).tolist()
             kind = self.left.pop()
-            if WIDTHS[kind][0] * 0.85 <= most:
+            if CORE_WIDTHS[kind][0] * 0.85 <= most:
                 width = self.widths.get(kind) or self._width(kind)
                 return kind, max(round(width / self.module), 2) * self.module if self.module else width
         return ("storage" if most < 2.8 or "flat" in self.kinds else "office"), most

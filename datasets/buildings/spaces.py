@@ -71,7 +71,7 @@ def footprint(shapes: Sequence[shapely.Geometry]) -> shapely.Geometry:
     closed = shapely.union_all([s.buffer(2 * OUTER_WALL, join_style="mitre") for s in shapes]).buffer(
         -OUTER_WALL, join_style="mitre"
     )
-    kept = [
+    outlines = [
         shapely.Polygon(p.exterior, [h for h in p.interiors if shapely.Polygon(h).area > 9]) for p in shapely.get_parts(closed)
     ]
-    return shapely.union_all(kept)
+    return shapely.union_all(outlines)

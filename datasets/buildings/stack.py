@@ -24,14 +24,14 @@ from topomerge.errors import InputError
 from topomerge.types import Array
 
 SAMPLE = 0.25  # m between points along walls
-NEAR = 0.5  # m; walls that lie over each other
-WALLS = 0.55  # least share of the walls, where the storeys overlap, that do
-COMMON = 0.4  # least share of walls where the frame is known to be the same
+WALL_NEAR = 0.5  # m; walls that lie over each other
+DRAWN_WALLS = 0.55  # least share of the walls, where the storeys overlap, that do
+SURVEYED_WALLS = 0.4  # least share of walls where the frame is known to be the same
 COVER = 0.75  # least share of the smaller storey that lies over the larger one
-SCALES = (0.35, 2.9)  # of one plan by the other
+STOREY_SCALES = (0.35, 2.9)  # of one plan by the other
 SHAFTS = 7  # largest stairwells and lifts that hypotheses are made of
 STAIRWELL = 18.0  # m2, usual
-ALIKE = 0.8  # IoU of two rooms, above each other, of the same plan
+SAME_OUTLINE = 0.8  # IoU of two rooms, above each other, of the same plan
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Fit:
     """How a storey lies over the one beneath: `scale` and `shift` take its own frame there.
 
     Args:
-        walls: share of the walls within `NEAR` of a wall of the other storey, where the two overlap.
+        walls: share of the walls within `WALL_NEAR` of a wall of the other storey, where the two overlap.
         cover: share of the smaller storey's area that lies over the larger one.
         common: the two plans had the same frame.
     """
@@ -75,18 +75,18 @@ def iter_stacks(folder: str | Path, plans: dict[str, Plan | Refusal] | None = No
     Raises:
         InputError: no such folder.
     """
-    known = dict(iter_plans(folder)) if plans is None else plans
+    plan_of = dict(iter_plans(folder)) if plans is None else plans
     frames = frame_of(folder)
     for group in siblings(folder):
         for names in pairwise(group):
-            found = [known.get(name) for name in names]
-            refused = [n for n, p in zip(names, found, strict=True) if not isinstance(p, Plan)]
+            storeys = [plan_of.get(name) for name in names]
+            refused = [n for n, p in zip(names, storeys, strict=True) if not isinstance(p, Plan)]
             name = " + ".join(names)
             try:
                 if refused:
                     raise InputError(f"a storey is missing or was refused: {', '.join(refused)}")
                 common = frames[names[0]] == frames[names[1]]
-                yield name, stack([p for p in found if isinstance(p, Plan)], names, common)
+                yield name, stack([p for p in storeys if isinstance(p, Plan)], names, common)
             except InputError as error:
                 yield name, Refusal(name, str(error))
 
@@ -104,7 +104,7 @@ def stack(plans: Sequence[Plan], names: Sequence[str] = (), common: bool = False
         raise InputError("a stack needs two storeys or more")
     names = tuple(names) or tuple(f"storey {k}" for k in range(len(plans)))
     fits = [register(low, high, common) for low, high in pairwise(plans)]
-    least = COMMON if common else WALLS
+    least = SURVEYED_WALLS if common else DRAWN_WALLS
     for fit, name in zip(fits, names[1:], strict=True):
         if fit.walls < least or fit.cover < COVER:
             raise InputError(
@@ -188,12 +188,12 @@ class _Storey:
         rings = [s.exterior for s in shapes]
         points = np.concatenate([shapely.get_coordinates(shapely.segmentize(ring, SAMPLE)) for ring in rings])
         floor = shapely.union_all([s.buffer(0.4, join_style="mitre") for s in shapes]).simplify(0.2)
-        found = [
+        shafts = [
             (r.kind, s.area, shapely.get_coordinates(s.centroid)[0])
             for r, s in zip(plan.rooms, shapes, strict=True)
             if r.kind in ("stairs", "lift")
         ]
-        return cls(points, cKDTree(points), floor, sorted(found, key=lambda shaft: -shaft[1])[:SHAFTS])
+        return cls(points, cKDTree(points), floor, sorted(shafts, key=lambda shaft: -shaft[1])[:SHAFTS])
 
 
 def _shape(room: object) -> shapely.Polygon:
@@ -208,14 +208,14 @@ def _hypotheses(target: _Storey, source: _Storey) -> Iterator[tuple[float, float
     sizes = (low[1] - low[0]) / (high[1] - high[0])
     for (_, area, at), (_, other, there) in shafts:
         for scale in (1.0, float(np.sqrt(area / other)), *sizes.tolist()):
-            if SCALES[0] <= scale <= SCALES[1]:
+            if STOREY_SCALES[0] <= scale <= STOREY_SCALES[1]:
                 yield scale, *(at - scale * there).tolist()
     for (a, b), (c, d) in product(shafts, shafts):
         v, w = c[2] - a[2], d[2] - b[2]
         if a is c or b is d or min(np.hypot(*v), np.hypot(*w)) < 3:
             continue
         scale = float(np.hypot(*v) / np.hypot(*w))
-        if SCALES[0] <= scale <= SCALES[1] and v @ w > 0.985 * np.hypot(*v) * np.hypot(*w):
+        if STOREY_SCALES[0] <= scale <= STOREY_SCALES[1] and v @ w > 0.985 * np.hypot(*v) * np.hypot(*w):
             yield scale, *((a[2] + c[2]) / 2 - scale * (b[2] + d[2]) / 2).tolist()
     for scale in (1.0, float(sizes[0]), float(sizes[1]), float(np.sqrt(sizes.prod()))):
         for i, j in product((0, 1), repeat=2):
@@ -225,13 +225,13 @@ def _hypotheses(target: _Storey, source: _Storey) -> Iterator[tuple[float, float
 
 def _refine(target: _Storey, source: _Storey, scale: float, x: float, y: float) -> tuple[float, float, float]:
     points, shift = source.points[::2], np.array([x, y])
-    for reach in np.geomspace(1.5, NEAR, 12):
+    for reach in np.geomspace(1.5, WALL_NEAR, 12):
         apart, nearest = target.tree.query(scale * points + shift)
         p, q = points[apart < reach], target.points[nearest[apart < reach]]
         if len(p) < 20:
             break
         a, b = p - p.mean(axis=0), q - q.mean(axis=0)
-        scale = float(np.clip((a * b).sum() / (a * a).sum(), *SCALES))
+        scale = float(np.clip((a * b).sum() / (a * a).sum(), *STOREY_SCALES))
         shift = q.mean(axis=0) - scale * p.mean(axis=0)
     return scale, float(shift[0]), float(shift[1])
 
@@ -243,7 +243,9 @@ def _score(target: _Storey, source: _Storey, scale: float, shift: Array, step: i
 
 def _overlay(target: _Storey, source: _Storey, scale: float, shift: Array, step: int = 1) -> tuple[float, float]:
     """Shares of walls over walls, and of floor over floor."""
-    near = NEAR * min(scale, 1.0)  # a plan that shrinks has more walls a metre, so that more of them lie near others by chance
+    near = WALL_NEAR * min(
+        scale, 1.0
+    )  # a plan that shrinks has more walls a metre, so that more of them lie near others by chance
     floor = shapely.transform(source.floor, lambda p: p * scale + shift)
     common = floor.intersection(target.floor)
     cover = common.area / min(floor.area, target.floor.area)
@@ -267,9 +269,9 @@ def _fit(target: _Storey, source: _Storey, scale: float, shift: Array, common: b
 
 
 def alike(low: Plan, high: Plan) -> int:
-    """Number of rooms of one storey that lie over a room of the same outline (IoU above `ALIKE`)."""
+    """Number of rooms of one storey that lie over a room of the same outline (IoU above `SAME_OUTLINE`)."""
     a, b = ([_shape(r) for r in plan.rooms if r.kind != "lift"] for plan in (low, high))
     i, j = shapely.STRtree(b).query(a, predicate="intersects")
     one, other = np.array(a)[i], np.array(b)[j]
     both = shapely.area(shapely.intersection(one, other))
-    return len(np.unique(i[both > ALIKE * (shapely.area(one) + shapely.area(other) - both)]))
+    return len(np.unique(i[both > SAME_OUTLINE * (shapely.area(one) + shapely.area(other) - both)]))

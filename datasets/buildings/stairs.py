@@ -17,10 +17,10 @@ from topomerge.types import Array
 
 MAX_RISER, MIN_TREAD = 0.19, 0.25  # m
 RISER, TREAD = 0.175, 0.28  # m, what is aimed at
-LANDING = 1.25  # m, depth of a half landing
-GAP = 0.1  # m, between the two flights of a dog-leg
-RAIL, SLAB = 0.9, 0.22  # m
-TURN = np.radians(330)  # of a spiral
+HALF_LANDING = 1.25  # m, depth of a half landing
+DOGLEG_GAP = 0.1  # m, between the two flights of a dog-leg
+RAIL, STEP_SLAB = 0.9, 0.22  # m
+SPIRAL_TURN = np.radians(330)  # of a spiral
 MAX_SLOPE = 0.125  # of a ramp
 
 
@@ -52,13 +52,13 @@ def risers(rise: float) -> int:
 def length_for(kind: str, rise: float) -> float:
     """m of floor that a flight needs along its heading, landings at its ends not counted."""
     n = risers(rise)
-    lengths = {"straight": (n - 1) * TREAD, "dogleg": (n // 2 - 1) * TREAD + LANDING, "ramp": rise / 0.2 + LANDING}
+    lengths = {"straight": (n - 1) * TREAD, "dogleg": (n // 2 - 1) * TREAD + HALF_LANDING, "ramp": rise / 0.2 + HALF_LANDING}
     return lengths.get(kind, width_for(kind, rise))
 
 
 def width_for(kind: str, rise: float) -> float:
     """m across that a flight needs; a spiral's treads must be deep enough along its walking line."""
-    spiral = max(2.6, np.ceil((risers(rise) - 1) * 0.265 / TURN * 3 / 2 * 2 * 20) / 20)
+    spiral = max(2.6, np.ceil((risers(rise) - 1) * 0.265 / SPIRAL_TURN * 3 / 2 * 2 * 20) / 20)
     return {"straight": 1.3, "spiral": float(spiral), "lift": 1.0}.get(kind, 2.5)
 
 
@@ -111,7 +111,7 @@ def _steps(x: float, width: float, y: float, tread: float, riser: float, count: 
     """Boxes of `count` steps that go up along y (down along it for a negative tread), with a rail at `x + rail`."""
     i = np.arange(count)
     top = bottom + (i + 1) * riser
-    thick = np.minimum(top, SLAB + riser)
+    thick = np.minimum(top, STEP_SLAB + riser)
     middle = y + (i + 0.5) * tread
     whole = np.full(count, 1.0)
     steps = np.stack([whole * (x + width / 2), middle, top - thick / 2, whole * width, whole * abs(tread), thick], axis=1)
@@ -138,36 +138,36 @@ def _straight(width: float, length: float, rise: float) -> Parts:
 
 def _dogleg(width: float, length: float, rise: float) -> Parts:
     n = risers(rise)
-    each, run, wide = n // 2 - 1, length - LANDING, (width - GAP) / 2
+    each, run, wide = n // 2 - 1, length - HALF_LANDING, (width - DOGLEG_GAP) / 2
     tread, riser = run / each, rise / n
     parts = [_steps(0, wide, 0, tread, riser, each, 0, wide)]
-    parts += [_steps(wide + GAP, wide, run, -tread, riser, each, rise / 2, 0)]
-    parts += [np.array([[width / 2, length - LANDING / 2, rise / 2 - SLAB / 2, width, LANDING, SLAB]])]
-    a, b, far = wide / 2, wide * 1.5 + GAP, length - LANDING / 2
+    parts += [_steps(wide + DOGLEG_GAP, wide, run, -tread, riser, each, rise / 2, 0)]
+    parts += [np.array([[width / 2, length - HALF_LANDING / 2, rise / 2 - STEP_SLAB / 2, width, HALF_LANDING, STEP_SLAB]])]
+    a, b, far = wide / 2, wide * 1.5 + DOGLEG_GAP, length - HALF_LANDING / 2
     path = [[a, -0.6, 0], [a, 0, 0], [a, run, rise / 2], [a, far, rise / 2]]
     path += [[b, far, rise / 2], [b, run, rise / 2], [b, 0, rise], [b, -0.6, rise]]
     return np.concatenate(parts), NOTHING, np.array(path), riser, tread
 
 
 def _ramp(width: float, length: float, rise: float) -> Parts:
-    run, wide = length - LANDING, (width - GAP) / 2
+    run, wide = length - HALF_LANDING, (width - DOGLEG_GAP) / 2
     if rise / 2 / run > MAX_SLOPE + 1e-6:
         raise InputError(f"ramp of {length:.1f} m for {rise:.2f} m: steeper than 1:8, lengthen it")
-    near = [[x, 0, z] for z in (-SLAB, 0) for x in (0, wide)]
-    far = [[x, run, rise / 2 + z] for z in (-SLAB, 0) for x in (0, wide)]
+    near = [[x, 0, z] for z in (-STEP_SLAB, 0) for x in (0, wide)]
+    far = [[x, run, rise / 2 + z] for z in (-STEP_SLAB, 0) for x in (0, wide)]
     up = np.array(near + far)
-    down = up * [1, 1, -1] + [wide + GAP, 0, rise - SLAB]
+    down = up * [1, 1, -1] + [wide + DOGLEG_GAP, 0, rise - STEP_SLAB]
     faces = np.array([[2, 3, 6], [3, 7, 6], [0, 4, 1], [1, 4, 5], [0, 2, 4], [2, 6, 4], [1, 5, 3], [3, 5, 7]])
     sheet = (np.concatenate([up, down]), np.concatenate([faces, faces[:, ::-1] + 8]))
-    landing = np.array([[width / 2, length - LANDING / 2, rise / 2 - SLAB / 2, width, LANDING, SLAB]])
-    wall = np.array([[wide + GAP / 2, run / 2, rise / 2, GAP, run, rise + 1.8]])
+    landing = np.array([[width / 2, length - HALF_LANDING / 2, rise / 2 - STEP_SLAB / 2, width, HALF_LANDING, STEP_SLAB]])
+    wall = np.array([[wide + DOGLEG_GAP / 2, run / 2, rise / 2, DOGLEG_GAP, run, rise + 1.8]])
     path = _dogleg(width, length, rise)[2]
     return np.concatenate([landing, wall]), sheet, path, 0.0, 0.0
 
 
 def _spiral(width: float, length: float, rise: float) -> Parts:
     n, radius = risers(rise), width / 2
-    angle = np.radians(-75) + TURN * np.arange(n) / (n - 1)
+    angle = np.radians(-75) + SPIRAL_TURN * np.arange(n) / (n - 1)
     riser, walk = rise / n, radius * 2 / 3
     vertices, triangles = [], []
     for i in range(n - 1):
@@ -186,7 +186,7 @@ def _spiral(width: float, length: float, rise: float) -> Parts:
     ring = np.column_stack([radius + walk * np.cos(angle), radius + walk * np.sin(angle), np.arange(n) * riser])
     start, end = [[ring[0, 0], -0.6, 0]], [[ring[-1, 0], ring[-1, 1], rise], [ring[-1, 0], -0.6, rise]]
     mesh = (np.concatenate([*vertices, pole]), np.concatenate([*triangles, sides + 8 * (n - 1)]))
-    return np.array(rail), mesh, np.concatenate([start, ring, end]), riser, walk * TURN / (n - 1)
+    return np.array(rail), mesh, np.concatenate([start, ring, end]), riser, walk * SPIRAL_TURN / (n - 1)
 
 
 def _lift(width: float, length: float, rise: float) -> Parts:

@@ -8,17 +8,17 @@ from itertools import pairwise, product
 
 import numpy as np
 import shapely
-from topomerge.datasets.buildings.stairs import GAP, LANDING, MIN_TREAD, TREAD, risers, staircase, width_for
+from topomerge.datasets.buildings.stairs import DOGLEG_GAP, HALF_LANDING, MIN_TREAD, TREAD, risers, staircase, width_for
 from topomerge.datasets.core.plan import Flight, Plan
 from topomerge.datasets.core.solids import rotation
 
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-LEAST = 4.0  # m2 of a stairwell that both storeys have
+LEAST_STAIRWELL = 4.0  # m2 of a stairwell that both storeys have
 APRON = 0.9  # m of floor before a flight
-STEP = 0.15  # m between places that are tried
-SPARE = 0.28  # m, half of what a person needs beside the flight
+PLACE_STEP = 0.15  # m between places that are tried
+PASSING_SPACE = 0.28  # m, half of what a person needs beside the flight
 DOORSTEP = 0.8  # m from a door's middle to the free floor
 POCKET = 0.5  # m2 of free floor that a flight may cut off
 TRIED = 60  # places of a kind of stairs
@@ -33,20 +33,20 @@ def add_stairs(plans: Sequence[Plan]) -> tuple[list[Plan], tuple[int, ...]]:
     out, count = list(plans), []
     arrives: dict[int, Flight] = {}  # room of the lower storey -> the flight that ends there
     for k, (low, high) in enumerate(pairwise(plans)):
-        found: dict[int, Flight] = {}
+        flights: dict[int, Flight] = {}
         taken: set[int] = set()
         for i, j in _wells(low, high):
-            if i in taken or j in found:
+            if i in taken or j in flights:
                 continue
             rooms = (_shape(low, i), _shape(high, j))
             doors = (_doors(low, rooms[0]), _doors(high, rooms[1]))
             flight = fit_flight(rooms, doors, low.height, arrives.get(i))
             if flight is not None:
                 taken.add(i)
-                found[j] = flight
-        out[k] = replace(out[k], flights=(*out[k].flights, *found.values()))
-        count.append(len(found))
-        arrives = found
+                flights[j] = flight
+        out[k] = replace(out[k], flights=(*out[k].flights, *flights.values()))
+        count.append(len(flights))
+        arrives = flights
     return out, tuple(count)
 
 
@@ -58,7 +58,7 @@ def _wells(low: Plan, high: Plan) -> list[tuple[int, int]]:
     """Stairwells of the two plans that lie over each other, those with most floor in common first."""
     rooms = [[i for i, r in enumerate(plan.rooms) if r.kind == "stairs"] for plan in (low, high)]
     common = {(i, j): _shape(low, i).intersection(_shape(high, j)).area for i, j in product(*rooms)}
-    return sorted((pair for pair, area in common.items() if area > LEAST), key=lambda pair: (-common[pair], pair))
+    return sorted((pair for pair, area in common.items() if area > LEAST_STAIRWELL), key=lambda pair: (-common[pair], pair))
 
 
 def _doors(plan: Plan, room: shapely.Polygon) -> Array:
@@ -81,7 +81,7 @@ def fit_flight(
     """
     well = rooms[0].intersection(rooms[1]).buffer(-0.03, join_style="mitre")
     well = max((p for p in shapely.get_parts(well) if p.geom_type == "Polygon"), key=lambda p: p.area, default=None)
-    if well is None or well.area < LEAST:
+    if well is None or well.area < LEAST_STAIRWELL:
         return None
     if given is not None:
         return given if _climbs(given, rise) and _leaves_free(given, rooms, doors) else None
@@ -106,7 +106,10 @@ def _climbs(flight: Flight, rise: float) -> bool:
 def _sizes(rise: float) -> list[tuple[str, float, float]]:
     """Kinds of stairs with width and length, the comfortable ones first."""
     n, spiral = risers(rise), width_for("spiral", rise)
-    dogleg = [("dogleg", wide, (n // 2 - 1) * tread + LANDING) for tread, wide in product((TREAD, MIN_TREAD), (2.5, 2.0 + GAP))]
+    dogleg = [
+        ("dogleg", wide, (n // 2 - 1) * tread + HALF_LANDING)
+        for tread, wide in product((TREAD, MIN_TREAD), (2.5, 2.0 + DOGLEG_GAP))
+    ]
     straight = [("straight", 1.3, (n - 1) * tread) for tread in (TREAD, MIN_TREAD)]
     return [*dogleg, *straight, ("spiral", spiral, spiral)]
 
@@ -120,7 +123,7 @@ def _places(well: shapely.Polygon, kind: str, width: float, length: float, headi
     spans = high - low - (width, length + APRON + after)
     if min(spans) < 0:
         return []
-    x, y = (np.arange(0, span + 1e-9, STEP) + start for span, start in zip(spans, low, strict=True))
+    x, y = (np.arange(0, span + 1e-9, PLACE_STEP) + start for span, start in zip(spans, low, strict=True))
     x, y = (g.ravel() for g in np.meshgrid(x, y + APRON))
     boxes = shapely.box(x, y - APRON, x + width, y + length + after)
     shapely.prepare(shape)
@@ -142,7 +145,7 @@ def _leaves_free(flight: Flight, rooms: tuple[shapely.Polygon, shapely.Polygon],
     across = {"straight": (0.5, 0.5), "dogleg": (0.25, 0.75), "spiral": (0.75, 0.5)}[flight.kind]
     landings = place(np.array([[across[0] * flight.width, -0.6], [across[1] * flight.width, far]]))
     for room, middles, landing in zip(rooms, doors, landings, strict=True):
-        free = room.difference(body.buffer(0.02)).buffer(-SPARE, join_style="mitre")
+        free = room.difference(body.buffer(0.02)).buffer(-PASSING_SPACE, join_style="mitre")
         parts = [p for p in shapely.get_parts(free) if p.distance(shapely.Point(landing)) < 0.3]
         reached = max(parts, key=lambda p: p.area, default=None)
         if reached is None or free.area - reached.area > POCKET or not len(middles):

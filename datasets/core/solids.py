@@ -54,8 +54,8 @@ class Soup:
         vertices = np.concatenate(self.vertices).astype(np.float32)
         triangles = np.concatenate(self.triangles).astype(np.int32)
         a, b, c = np.moveaxis(vertices[triangles].astype(np.float64), 1, 0)
-        kept = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-6
-        return vertices, triangles[kept], np.concatenate(self.labels)[kept], np.concatenate(self.things)[kept]
+        solid = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-6
+        return vertices, triangles[solid], np.concatenate(self.labels)[solid], np.concatenate(self.things)[solid]
 
 
 def rotation(yaw: float | Array) -> Array:

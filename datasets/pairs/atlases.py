@@ -40,10 +40,10 @@ def make_atlas(
         raise InputError(f"an atlas needs two or more sensors, not {len(sensors)}")
     rng, difficulty = np.random.default_rng(rng), difficulty or Difficulty()
     frames = draw_frames(len(sensors), scale, rng)
-    known = sorted(room_graph(building))
+    reachable = sorted(room_graph(building))
     maps, visited = [], set[int]()
     for sensor, frame in zip(sensors, frames, strict=True):
-        start = int(rng.choice(sorted(visited) or known))
+        start = int(rng.choice(sorted(visited) or reachable))
         walked = part(building, rooms, rng, start=start)
         visited |= set(walked.tolist())
         maps.append(scan(session(building, difficulty, rng), sensor, walked, rng, frame=frame))

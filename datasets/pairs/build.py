@@ -36,7 +36,7 @@ def build(settings: Build, say: Callable[[str], None] = lambda text: None, every
     """Make what is missing of a set, then write its manifest.
 
     Args:
-        say: is told the progress, a line each `every` seconds.
+        say: gets the progress, a line each `every` seconds.
 
     Raises:
         InputError: a recipe that nothing can be made of, or a cluster that can't be reached.

@@ -78,9 +78,9 @@ def _holed(cloud: PointCloud, share: float, rng: np.random.Generator) -> PointCl
     return taken(cloud, ~lost)
 
 
-def taken(cloud: PointCloud, kept: Array) -> PointCloud:
+def taken(cloud: PointCloud, rows: Array) -> PointCloud:
     """Some points of a cloud."""
-    some = {n: v[kept] for n in ("points", "colors", "labels", "pose_of") if (v := getattr(cloud, n)) is not None}
+    some = {n: v[rows] for n in ("points", "colors", "labels", "pose_of") if (v := getattr(cloud, n)) is not None}
     return replace(cloud, **some)
 
 

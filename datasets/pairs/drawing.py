@@ -15,8 +15,8 @@ from topomerge.datasets.simulation.floors import draw_floors
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-CELL = 0.05  # m
-WALL = 0.2  # m beside a room that is drawn as wall
+DRAWING_CELL = 0.05  # m
+DRAWN_WALL = 0.2  # m beside a room that is drawn as wall
 SAME_LEVEL = 1.0  # m between a door and the floor of its storey, at most
 
 
@@ -44,24 +44,29 @@ def with_plan(pair: Pair, building: Building) -> Pair:
 
 def draw(building: Building, storey: int = 0) -> Flat:
     """Walls and floor of a storey; inner doors are open, outer ones shut."""
-    floors = draw_floors(building, CELL)
+    floors = draw_floors(building, DRAWING_CELL)
     room = floors.room[storey] >= 0
     door = np.zeros(room.shape, bool)
     level = np.abs(building.doors["centre"][:, 2] - building.storeys["floor"][storey]) < SAME_LEVEL
     for one in building.doors[level & (building.doors["rooms"] >= 0).all(axis=1)]:
         _open(one, door, floors.origin)
-    walls = ~room & ~door & (ndimage.distance_transform_edt(~room) * CELL <= WALL)
+    walls = ~room & ~door & (ndimage.distance_transform_edt(~room) * DRAWING_CELL <= DRAWN_WALL)
     source = f"{building.name}:drawing"
-    flat = from_masks(walls[::-1], (room | door)[::-1], CELL, (*floors.origin.tolist(), 0.0), rays=False, source=source)
+    flat = from_masks(walls[::-1], (room | door)[::-1], DRAWING_CELL, (*floors.origin.tolist(), 0.0), rays=False, source=source)
     return replace(flat, rooms=tuple(replace(r, floor=0.0, ceiling=r.ceiling - r.floor) for r in building.rooms))
 
 
 def _open(door: Array, image: Array, origin: Array) -> None:
     """Set the cells of the opening, through the whole wall."""
     x, y = door["centre"][:2].tolist()
-    reach = float(door["thickness"] + door["width"]) / 2 + 4 * CELL
-    row, column = (slice(max(int((v - reach) / CELL), 0), int((v + reach) / CELL) + 1) for v in (y - origin[1], x - origin[0]))
+    reach = float(door["thickness"] + door["width"]) / 2 + 4 * DRAWING_CELL
+    row, column = (
+        slice(max(int((v - reach) / DRAWING_CELL), 0), int((v + reach) / DRAWING_CELL) + 1)
+        for v in (y - origin[1], x - origin[0])
+    )
     rows, columns = np.indices(image[row, column].shape) + np.array([row.start, column.start])[:, None, None]
-    x, y = origin[0] + (columns + 0.5) * CELL - x, origin[1] + (rows + 0.5) * CELL - y
+    x, y = origin[0] + (columns + 0.5) * DRAWING_CELL - x, origin[1] + (rows + 0.5) * DRAWING_CELL - y
     c, s = np.cos(door["direction"]), np.sin(door["direction"])
-    image[row, column] |= (abs(x * c + y * s) <= door["thickness"] / 2 + 2 * CELL) & (abs(y * c - x * s) <= door["width"] / 2)
+    image[row, column] |= (abs(x * c + y * s) <= door["thickness"] / 2 + 2 * DRAWING_CELL) & (
+        abs(y * c - x * s) <= door["width"] / 2
+    )

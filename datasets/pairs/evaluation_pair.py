@@ -26,17 +26,17 @@ from topomerge.matching.room_plans import room_plans
 from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
 
 TWIN_AREA, TWIN_SIDE = 0.05, 0.25  # share, m: rooms that differ by less are near-identical
-GLIMPSED = column("x", "glimpsed")
-COLUMN = 0.2  # m, columns by which the area in common is measured
-BELOW = 0.15  # m: what is that far below a floor is the ceiling of the storey below
-STOREY = 1.0  # m between two storeys, at least
-FEW = 50  # columns: maps that share fewer have no middle of what both saw
-LAID = 0.4  # IoU from which rooms that lie over each other are one
+GLIMPSED_COLUMN = column("x", "glimpsed")
+COLUMN_SIZE = 0.2  # m, columns by which the area in common is measured
+UNDER_FLOOR = 0.15  # m: what is that far below a floor is the ceiling of the storey below
+STOREY_APART = 1.0  # m between two storeys, at least
+FEWEST_COLUMNS = 50  # columns: maps that share fewer have no middle of what both saw
+LAID_IOU = 0.4  # IoU from which rooms that lie over each other are one
 
 
 @dataclass(frozen=True, eq=False)
-class KeptPair:
-    """What is true of a kept pair; `maps` reads the maps.
+class EvaluationPair:
+    """What is true of an evaluation pair; `maps` reads the maps.
 
     Args:
         name: of the files.
@@ -69,32 +69,32 @@ class KeptPair:
 
 def save_maps(maps: Sequence[TopometricMap], folder: Path, name: str) -> None:
     """Write both maps under the name of their pair."""
-    for side, found in zip("ab", maps, strict=True):
-        save_map(found, folder / f"{name}{side}.tmap")
+    for side, map in zip("ab", maps, strict=True):
+        save_map(map, folder / f"{name}{side}.tmap")
 
 
-def load_kept(path: Path) -> KeptPair:
-    """What is true of a kept pair, from its file.
+def load_evaluation_pair(path: Path) -> EvaluationPair:
+    """What is true of an evaluation pair, from its file.
 
     Raises:
         InputError: no such file, damaged, or its maps were not kept.
     """
-    data = archive.read(path, "kept pair")
+    data = archive.read(path, "evaluation pair")
     if "anchor" not in data:
         raise InputError(f"{path}: its maps were not kept; build it with data.maps=true")
     about = json.loads(data["about"].tobytes())
     true, one, twin = ((data[f"a.{name}"], data[f"b.{name}"]) for name in ("true_room", "true_one", "twin"))
-    glimpsed = (data["a.x"][:, GLIMPSED] > 0.5, data["b.x"][:, GLIMPSED] > 0.5)
+    glimpsed = (data["a.x"][:, GLIMPSED_COLUMN] > 0.5, data["b.x"][:, GLIMPSED_COLUMN] > 0.5)
     laid = about["rooms"] == "laid"
     matches = data["laid" if laid else "matches"]
     if laid:  # no labels: the rooms that lie over each other stand for true ones
         true = _rooms_of_matches(matches, tuple(len(t) for t in true))
         one = (true[0] >= 0, true[1] >= 0)
     pose = sim3_of(data["transform"])
-    return KeptPair(path.stem, path.parent, matches, true, one, twin, glimpsed, pose, data["anchor"], about)
+    return EvaluationPair(path.stem, path.parent, matches, true, one, twin, glimpsed, pose, data["anchor"], about)
 
 
-def load_set(manifest: Path) -> list[KeptPair]:
+def load_set(manifest: Path) -> list[EvaluationPair]:
     """All pairs of a manifest that `build` wrote.
 
     Raises:
@@ -103,7 +103,7 @@ def load_set(manifest: Path) -> list[KeptPair]:
     if not manifest.is_file():
         raise InputError(f"{manifest}: no such manifest; make it with python -m topomerge.datasets.pairs.build")
     rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
-    return [load_kept(manifest.parent / "pairs" / row["file"]) for row in rows]
+    return [load_evaluation_pair(manifest.parent / "pairs" / row["file"]) for row in rows]
 
 
 def _rooms_of_matches(matches: Array, sizes: Sequence[int]) -> tuple[Array, Array]:
@@ -122,8 +122,8 @@ def sim3_of(matrix: Array) -> Sim3 | None:
     return Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), (x, y, z), float(matrix[2, 2]))
 
 
-def told_of_maps(pair: Pair, maps: Sequence[TopometricMap]) -> dict[str, Any]:
-    """What the file of a kept pair tells beside the usual."""
+def pair_statistics(pair: Pair, maps: Sequence[TopometricMap]) -> dict[str, Any]:
+    """What the file of an evaluation pair tells beside the usual."""
     return {
         "source": pair.source,
         "kind": pair.kind,
@@ -134,8 +134,8 @@ def told_of_maps(pair: Pair, maps: Sequence[TopometricMap]) -> dict[str, Any]:
     }
 
 
-def kept_arrays(pair: Pair, maps: Sequence[TopometricMap], true: tuple[Array, Array]) -> dict[str, Array]:
-    """The arrays that the file of a kept pair has beside the usual."""
+def evaluation_arrays(pair: Pair, maps: Sequence[TopometricMap], true: tuple[Array, Array]) -> dict[str, Array]:
+    """The arrays that the file of an evaluation pair has beside the usual."""
     arrays = {"anchor": anchor(pair, maps)}
     rooms = (pair.a.rooms, pair.b.rooms)
     same = pair.kind == "overlap"
@@ -178,15 +178,15 @@ def common_area(maps: Sequence[TopometricMap], truth: Sim3 | None) -> float:
     if truth is None:
         return 0.0
     floors = np.sort([*maps[0].storeys["floor"], *(truth.scale * maps[1].storeys["floor"] + truth.translation[2])])
-    floors = floors[np.diff(floors, prepend=-np.inf) > STOREY] - BELOW
+    floors = floors[np.diff(floors, prepend=-np.inf) > STOREY_APART] - UNDER_FLOOR
     both = np.intersect1d(_columns(maps[0], Sim3(), floors), _columns(maps[1], truth, floors))
-    return float(len(both) * COLUMN**2)
+    return float(len(both) * COLUMN_SIZE**2)
 
 
 def _columns(map: TopometricMap, into: Sim3, floors: Array) -> Array:
     """Sorted keys of the (storey, x, y) columns of which a map knows anything, in another frame."""
     at = into.apply(np.concatenate([map.grid.centroids(), map.navigable.centroids()]))
-    rows = np.column_stack([np.searchsorted(floors, at[:, 2]) - 1, np.floor(at[:, :2] / COLUMN)]).astype(np.int64)
+    rows = np.column_stack([np.searchsorted(floors, at[:, 2]) - 1, np.floor(at[:, :2] / COLUMN_SIZE)]).astype(np.int64)
     return np.unique(rows[:, 0] * 2**40 + (rows[:, 1] + 2**18) * 2**20 + rows[:, 2] + 2**18)
 
 
@@ -197,7 +197,7 @@ def anchor(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
         seen = [np.floor(c / 0.5).astype(np.int64) for c in (maps[0].grid.centroids(), pair.truth.apply(cells))]
         keys = [k[:, 0] * 2**42 + k[:, 1] * 2**21 + k[:, 2] for k in seen]
         both = np.isin(keys[1], keys[0])
-        cells = cells[both] if both.sum() > FEW else cells
+        cells = cells[both] if both.sum() > FEWEST_COLUMNS else cells
     middle: Array = cells.mean(axis=0)
     return middle
 
@@ -208,8 +208,8 @@ def laid(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
     if t is None or pair.kind != "overlap":
         return np.zeros((0, 2), np.int64)
     rooms, fit = matches_under(t, (room_plans(maps[0]), room_plans(maps[1])))
-    kept: list[tuple[int, int]] = []
-    for i, j in rooms[np.argsort(-fit, kind="stable")][: int((fit >= LAID).sum())].tolist():
-        if i not in {k[0] for k in kept} and j not in {k[1] for k in kept}:
-            kept.append((i, j))
-    return np.array(sorted(kept), np.int64).reshape(-1, 2)
+    matches: list[tuple[int, int]] = []
+    for i, j in rooms[np.argsort(-fit, kind="stable")][: int((fit >= LAID_IOU).sum())].tolist():
+        if i not in {k[0] for k in matches} and j not in {k[1] for k in matches}:
+            matches.append((i, j))
+    return np.array(sorted(matches), np.int64).reshape(-1, 2)

@@ -16,7 +16,7 @@ from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.pairs.degrade import UNCHANGED, degraded
 from topomerge.datasets.pairs.drawing import with_plan
-from topomerge.datasets.pairs.evaluation_pair import kept_arrays, save_maps, told_of_maps
+from topomerge.datasets.pairs.evaluation_pair import evaluation_arrays, pair_statistics, save_maps
 from topomerge.datasets.pairs.items import Item, difficulty_of
 from topomerge.datasets.pairs.pairs import Pair, make_pair
 from topomerge.datasets.pairs.truth import room_truth, true_matches
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch_geometric.data import Data
 
-FEWEST = 2  # rooms that must come out of each map
-LONGEST = 600.0  # s a pair: a hundred times what is usual, so that no slow machine makes another set
+FEWEST_ROOMS = 2  # rooms that must come out of each map
+LONGEST_PAIR = 600.0  # s a pair: a hundred times what is usual, so that no slow machine makes another set
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,10 @@ class Example:
 def make_file(item: Item, plans: Sequence[Sequence[Plan]], folder: str) -> Row:
     """Make an item's file in a folder, or one that says why there is none (`core.builder.make_item`)."""
     return make_item(
-        item.name, folder, lambda: keep(item, plans, Path(folder)) if item.maps else make_arrays(item, plans), LONGEST
+        item.name,
+        folder,
+        lambda: make_evaluation_arrays(item, plans, Path(folder)) if item.maps else make_arrays(item, plans),
+        LONGEST_PAIR,
     )
 
 
@@ -68,15 +71,15 @@ def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]
         InputError: no candidate has such a pair, or a map has hardly a room.
     """
     pair = degraded(_first_pair(item, plans), item.change, item.seed)
-    return pair_arrays(pair, extracted(pair, item), told_of(item))
+    return pair_arrays(pair, extracted(pair, item), entries_of(item))
 
 
-def keep(item: Item, plans: Sequence[Sequence[Plan]], folder: Path) -> dict[str, Array]:
-    """As `make_arrays`, with what evaluation needs (`kept`); the maps are written into the folder."""
+def make_evaluation_arrays(item: Item, plans: Sequence[Sequence[Plan]], folder: Path) -> dict[str, Array]:
+    """As `make_arrays`, with what evaluation needs (`evaluation_pair`); the maps are written into the folder."""
     pair = degraded(_first_pair(item, plans), item.change, item.seed)
     maps = extracted(pair, item)
-    arrays = pair_arrays(pair, maps, {**told_of(item), **told_of_maps(pair, maps)})
-    arrays |= kept_arrays(pair, maps, (arrays["a.true_room"], arrays["b.true_room"]))
+    arrays = pair_arrays(pair, maps, {**entries_of(item), **pair_statistics(pair, maps)})
+    arrays |= evaluation_arrays(pair, maps, (arrays["a.true_room"], arrays["b.true_room"]))
     save_maps(maps, folder, item.name)
     return arrays
 
@@ -88,33 +91,33 @@ def extracted(pair: Pair, item: Item) -> tuple[TopometricMap, TopometricMap]:
         InputError: hardly a room comes out of one of them.
     """
     a, b = (extract(cloud, voxel_size=item.voxel_size, carve=item.maps) for cloud in (pair.a, pair.b))
-    if min(len(a.rooms), len(b.rooms)) < FEWEST:
-        raise InputError(f"fewer than {FEWEST} rooms were extracted from a map of {' or '.join(item.sensors)}")
+    if min(len(a.rooms), len(b.rooms)) < FEWEST_ROOMS:
+        raise InputError(f"fewer than {FEWEST_ROOMS} rooms were extracted from a map of {' or '.join(item.sensors)}")
     return a, b
 
 
-def told_of(item: Item) -> dict[str, Any]:
-    """What a file tells of its item; names of what came later are left out where they say nothing."""
-    told = asdict(item)
+def entries_of(item: Item) -> dict[str, Any]:
+    """What stands in a file about its item; names of what came later are left out where they say nothing."""
+    entries = asdict(item)
     if item.change == UNCHANGED:
-        del told["change"]
+        del entries["change"]
     if not item.maps:
-        del told["maps"]
-    return {**told, "file": f"{item.name}.npz", "asked_overlap": item.overlap, "points_per_room": item.points_per_room}
+        del entries["maps"]
+    return {**entries, "file": f"{item.name}.npz", "asked_overlap": item.overlap, "points_per_room": item.points_per_room}
 
 
-def pair_arrays(pair: Pair, maps: Sequence[TopometricMap], told: Mapping[str, Any]) -> dict[str, Array]:
-    """The arrays of a file: the graphs of two maps, their true rooms, and what is told of them."""
+def pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: Mapping[str, Any]) -> dict[str, Array]:
+    """The arrays of a file: the graphs of two maps, their true rooms, and what stands about them."""
     truths = [room_truth(m, cloud) for m, cloud in zip(maps, (pair.a, pair.b), strict=True)]
     matches = true_matches(truths[0], truths[1], pair.shared)
     arrays: dict[str, Array] = {}
-    for side, found, truth in zip("ab", maps, truths, strict=True):
-        arrays |= {f"{side}.{name}": array for name, array in graph_arrays(found, told["points_per_room"]).items()}
+    for side, map, truth in zip("ab", maps, truths, strict=True):
+        arrays |= {f"{side}.{name}": array for name, array in graph_arrays(map, item_entries["points_per_room"]).items()}
         arrays |= {f"{side}.true_{name}": truth[name] for name in ("room", "iou", "one")}
     arrays["matches"] = matches
     arrays["transform"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
-    known = {
-        **told,
+    entries = {
+        **item_entries,
         "building": pair.building,
         "overlap": round(pair.overlap, 4),
         "visited": [len(v) for v in pair.visited],
@@ -124,7 +127,7 @@ def pair_arrays(pair: Pair, maps: Sequence[TopometricMap], told: Mapping[str, An
         "partners": [len(set(matches[:, k].tolist())) for k in (0, 1)],
         "points": [len(pair.a), len(pair.b)],
     }
-    text = json.dumps(plain(known), sort_keys=True, ensure_ascii=False)
+    text = json.dumps(plain(entries), sort_keys=True, ensure_ascii=False)
     arrays["about"] = np.frombuffer(text.encode(), np.uint8)
     return arrays
 
@@ -166,10 +169,10 @@ def load_example(path: str | Path) -> Example:
     import torch
 
     arrays = archive.read(path, "cached pair")
-    told = json.loads(arrays.pop("about").tobytes())
+    entries = json.loads(arrays.pop("about").tobytes())
     sides = [from_arrays({n[2:]: a for n, a in arrays.items() if n.startswith(f"{s}.")}) for s in "ab"]
     matches, transform = torch.from_numpy(arrays["matches"]), torch.from_numpy(arrays["transform"])
-    return Example(sides[0], sides[1], matches, transform, told)
+    return Example(sides[0], sides[1], matches, transform, entries)
 
 
 class PairSet:

@@ -19,10 +19,10 @@ from topomerge.errors import InputError
 from topomerge.io import grid
 from topomerge.types import Array, PointCloud, Sim3, TrueRoom, VoxelGrid
 
-HEIGHT = 2.5  # m of the walls
+WALL_HEIGHT = 2.5  # m of the walls
 LASER = 0.3  # m above the floor
-EDGE = 0.1  # m of a free cell
-BESIDE = 0.5  # m from a wall to the nearest free floor
+FREE_CELL = 0.1  # m of a free cell
+FLOOR_NEAR_WALL = 0.5  # m from a wall to the nearest free floor
 ROOM_CELL, ROOM_REACH = 0.1, 0.3  # m; a wall belongs to the room that is as near as that
 
 
@@ -92,7 +92,7 @@ def from_masks(
     """
     # A ray that met a wall went through free space first: letters and frames drawn beside the map are no walls.
     surface = occupied & ndimage.binary_dilation(~occupied, np.ones((3, 3)))
-    surface &= ndimage.distance_transform_edt(~free) * cell < BESIDE
+    surface &= ndimage.distance_transform_edt(~free) * cell < FLOOR_NEAR_WALL
     frame = Sim3(float(origin[2]), (float(origin[0]), float(origin[1]), 0.0))
     at = [np.argwhere(mask)[:, ::-1] for mask in (surface, free)]
     walls, floor = (_flat(frame, (np.column_stack([x, len(free) - 1 - y]) + 0.5) * cell) for x, y in (a.T for a in at))
@@ -100,9 +100,9 @@ def from_masks(
 
 
 def raise_flat(flat: Flat, z: float = 0.0) -> PointCloud:
-    """The cloud of a floor at height `z`, m: floor, walls of `HEIGHT` and, where the sensor's rays went, free cells."""
+    """The cloud of a floor at height `z`, m: floor, walls of `WALL_HEIGHT` and, where the sensor's rays went, free cells."""
     spacing = max(flat.cell, 0.05)
-    levels = np.linspace(0.0, HEIGHT, round(HEIGHT / spacing) + 1)
+    levels = np.linspace(0.0, WALL_HEIGHT, round(WALL_HEIGHT / spacing) + 1)
     free, walls = (thin(p, spacing) if flat.cell < 0.9 * spacing else p for p in (flat.free, flat.walls))
     points = np.concatenate([_at(free, [0.0]), _at(walls, levels)]) + [0.0, 0.0, z]
     poses = None
@@ -110,8 +110,8 @@ def raise_flat(flat: Flat, z: float = 0.0) -> PointCloud:
         poses = np.array([Sim3(yaw, (x, y, z + LASER)).matrix for x, y, yaw in flat.poses.tolist()])
     rooms = tuple(replace(r, floor=r.floor + z, ceiling=r.ceiling + z) for r in flat.rooms)
     labels = rooms_at(points[:, :2], rooms) if rooms else None
-    known = _free(flat, z) if flat.rays else None
-    return PointCloud(points.astype(np.float32), labels=labels, poses=poses, free=known, rooms=rooms, source=flat.source)
+    free_cells = _free(flat, z) if flat.rays else None
+    return PointCloud(points.astype(np.float32), labels=labels, poses=poses, free=free_cells, rooms=rooms, source=flat.source)
 
 
 def keys(*sets: Array) -> tuple[Array, ...]:
@@ -140,12 +140,12 @@ def _at(points: Array, levels: Sequence[float] | Array) -> Array:
 
 def _free(flat: Flat, z: float) -> VoxelGrid:
     """Cells at the laser's height that hold free floor and no wall."""
-    corner = np.concatenate([flat.free, flat.walls]).min(axis=0) - 1.5 * EDGE  # a lattice of this step falls on middles
-    free = thin(flat.free - corner, EDGE)
-    rows, walls = keys(squares(free, EDGE), squares(flat.walls - corner, EDGE))
-    cells = squares(free[~np.isin(rows, walls)], EDGE)
-    origin = np.array([*corner, z + LASER - EDGE / 2])
-    return VoxelGrid.from_cells(np.column_stack([cells, np.zeros(len(cells), np.int64)]), origin, EDGE)
+    corner = np.concatenate([flat.free, flat.walls]).min(axis=0) - 1.5 * FREE_CELL  # a lattice of this step falls on middles
+    free = thin(flat.free - corner, FREE_CELL)
+    rows, walls = keys(squares(free, FREE_CELL), squares(flat.walls - corner, FREE_CELL))
+    cells = squares(free[~np.isin(rows, walls)], FREE_CELL)
+    origin = np.array([*corner, z + LASER - FREE_CELL / 2])
+    return VoxelGrid.from_cells(np.column_stack([cells, np.zeros(len(cells), np.int64)]), origin, FREE_CELL)
 
 
 def rooms_at(points: Array, rooms: Sequence[TrueRoom]) -> Array:

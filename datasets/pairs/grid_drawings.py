@@ -163,9 +163,7 @@ def places_of(pair: GridPair, item: GridItem, plans: Plans) -> list[Place]:
     return []
 
 
-def drawing_arrays(
-    path: Path, here: Place, there: Place, storey: int, kind: str, frame: Sim3, file: str
-) -> dict[str, Array]:
+def drawing_arrays(path: Path, here: Place, there: Place, storey: int, kind: str, frame: Sim3, file: str) -> dict[str, Array]:
     """What is cached of a map of the pair at `path` and a drawing in `frame`: as `grid_pairs.pair_arrays`."""
     data = archive.read(path, "cached pair")
     about = json.loads(data["about"].tobytes())

@@ -134,13 +134,13 @@ def _draw(recipe: Recipe, shelves: Mapping[str, _Shelf], i: int) -> Item:
     storeys = 2 if hard == "other-storey" or rng.random() < recipe.two_storeys else 1
     if overlap == 0 and not hard:  # one corridor can't be in neither
         hard, storeys = ("", 2) if source == "procedural" or of else ("other-building", 1)
-    known = {} if source == "procedural" else of or shelf.singles
+    digest_of = {} if source == "procedural" else of or shelf.singles
     storeys = storeys if source == "procedural" else 2 if of else 1
     first, last = splits.seeds(recipe.split)
-    names = sorted(known)
+    names = sorted(digest_of)
     chosen = [names[i] for i in rng.integers(len(names), size=CANDIDATES + 1)] if names else []
     seeds = rng.integers(first, last + 1, size=CANDIDATES + 1).tolist()
-    digests = [known[n] for n in chosen] or [""] * (CANDIDATES + 1)
+    digests = [digest_of[n] for n in chosen] or [""] * (CANDIDATES + 1)
     named = chosen or [str(s) for s in seeds]
     return Item(
         source=source,

@@ -18,12 +18,12 @@ from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3
 
 HARD = ("other-building", "other-storey", "twin-wing")
-KINDS = ("overlap", *HARD)
+PAIR_KINDS = ("overlap", *HARD)
 ROOMS_A_MAP = 15  # a map
-SCALES = (0.5, 2.0)  # a map of unknown scale is larger or smaller by so much
-AWAY = 20.0  # m, frames lie that far apart along x and y
-TURN = np.radians(3)  # frames are turned against each other by more than this
-SEEN = 50  # points of a room, from which on a map has seen it
+MAP_SCALES = (0.5, 2.0)  # a map of unknown scale is larger or smaller by so much
+FRAMES_APART = 20.0  # m, frames lie that far apart along x and y
+LEAST_TURN = np.radians(3)  # frames are turned against each other by more than this
+SEEN_POINTS = 50  # points of a room, from which on a map has seen it
 ELSEWHERE = Difficulty(moved=0.5, gone=0.3, doors_moved=1.0)  # furniture of a twin wing
 
 
@@ -41,7 +41,7 @@ class Pair:
         sensors: of a and of b.
         source: procedural, r2v, utexas, ...: splits are by source and building.
         building: its name within the source.
-        kind: one of `KINDS`; all but "overlap" are maps of two places.
+        kind: one of `PAIR_KINDS`; all but "overlap" are maps of two places.
         visited: rooms of `a.rooms` and of `b.rooms` that the surveyors went into; the others were seen through doors at most.
         frames: building -> cloud, of a and of b, where both come from a building that is known.
     """
@@ -60,8 +60,8 @@ class Pair:
     frames: tuple[Sim3, Sim3] | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise InputError(f"{self.name}: kind of pair {self.kind!r}: {', '.join(KINDS)} are possible")
+        if self.kind not in PAIR_KINDS:
+            raise InputError(f"{self.name}: kind of pair {self.kind!r}: {', '.join(PAIR_KINDS)} are possible")
         if not 0 <= self.overlap <= 1:
             raise InputError(f"{self.name}: overlap must be 0 to 1, not {self.overlap}")
         if self.kind != "overlap" and self.shared:
@@ -175,8 +175,8 @@ def make_pair(
 
 
 def seen_by_both(a: PointCloud, b: PointCloud) -> tuple[tuple[int, int], ...]:
-    """(i, i) of the rooms, numbered alike in both maps, of which both have `SEEN` points."""
-    seen = [np.bincount(c.labels[c.labels >= 0], minlength=len(c.rooms)) >= SEEN for c in (a, b) if c.labels is not None]
+    """(i, i) of the rooms, numbered alike in both maps, of which both have `SEEN_POINTS` points."""
+    seen = [np.bincount(c.labels[c.labels >= 0], minlength=len(c.rooms)) >= SEEN_POINTS for c in (a, b) if c.labels is not None]
     return tuple((int(i), int(i)) for i in np.flatnonzero(np.logical_and.reduce(seen)))
 
 
@@ -201,18 +201,18 @@ def _another(building: Building) -> Building:
     """A building of the same kind from another seed, of the same split: seeds come in pairs there."""
     if building.seed < 0 or not building.kind:
         raise InputError(f"{building.name}: name the other building of the hard negative")
-    known = building.parameters
-    return make_building(building.kind, building.seed ^ 1, len(building.storeys), Difficulty(**known["difficulty"]))
+    parameters = building.parameters
+    return make_building(building.kind, building.seed ^ 1, len(building.storeys), Difficulty(**parameters["difficulty"]))
 
 
 def draw_frames(count: int, scale: bool, rng: np.random.Generator) -> list[Sim3]:
     """Random frames, building -> cloud; no two are turned alike. With `scale` all but the first have a scale of their own."""
     frames: list[Sim3] = []
     while len(frames) < count:
-        low, high = np.log(SCALES)
+        low, high = np.log(MAP_SCALES)
         size = float(np.exp(rng.uniform(low, high))) if scale and frames else 1.0
-        x, y, z = (rng.uniform(-1, 1, 3) * (AWAY, AWAY, 2.0)).round(3).tolist()
+        x, y, z = (rng.uniform(-1, 1, 3) * (FRAMES_APART, FRAMES_APART, 2.0)).round(3).tolist()
         frame = Sim3(float(rng.uniform(-np.pi, np.pi)), (x, y, z), size)
-        if all(abs((f.inverse() @ frame).yaw) > TURN for f in frames):
+        if all(abs((f.inverse() @ frame).yaw) > LEAST_TURN for f in frames):
             frames.append(frame)
     return frames

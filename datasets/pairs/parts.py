@@ -12,9 +12,9 @@ from topomerge.datasets.core.building import Building
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-TRIES = 40
-LEAST = 3  # rooms a part
-ALIKE, JOINING = 0.8, 0.3  # IoU of two rooms of the same plan, and of two that connect the others
+PARTS_TRIED = 40
+LEAST_ROOMS_A_PART = 3  # rooms a part
+SAME_PLAN, SAME_CORRIDOR = 0.8, 0.3  # IoU of two rooms of the same plan, and of two that connect the others
 CONNECTING = ("corridor", "hall", "lobby", "stairs")
 CLOSE = 0.1  # an overlap may miss what was asked for by so much, or by half a room
 
@@ -52,23 +52,23 @@ def two_parts(
     Raises:
         InputError: the building has no such parts.
     """
-    if not 0 <= overlap <= 1 or rooms < LEAST:
-        raise InputError(f"overlap must be 0 to 1 and rooms {LEAST} or more, not {overlap:g} and {rooms}")
+    if not 0 <= overlap <= 1 or rooms < LEAST_ROOMS_A_PART:
+        raise InputError(f"overlap must be 0 to 1 and rooms {LEAST_ROOMS_A_PART} or more, not {overlap:g} and {rooms}")
     neighbours = room_graph(building, among)
     count = min(rooms, int(len(neighbours) / (2 - overlap)))
     flights = building.stairs["rooms"][building.stairs["kind"] != "lift"]
     flights = [f for f in flights.tolist() if f[1] in neighbours.get(f[0], ())] if over_stairs else []
     best, least = None, np.inf
-    for _ in range(TRIES if count >= LEAST else 0):
+    for _ in range(PARTS_TRIED if count >= LEAST_ROOMS_A_PART else 0):
         ends = rng.permutation(flights[int(rng.integers(len(flights)))]).tolist() if flights else []
         a, b = _grow(neighbours, count, round(overlap * count), ends, rng)
         miss = abs(share(a, b) - overlap) + 0.02 * (2 * count - len(a) - len(b))
-        if min(len(a), len(b)) >= LEAST and miss < least:
+        if min(len(a), len(b)) >= LEAST_ROOMS_A_PART and miss < least:
             best, least = (a, b), miss
     if best is None or abs(share(*best) - overlap) > max(CLOSE, 0.5 / len(best[0])):
         raise InputError(
-            f"{building.name} has no two connected parts of {LEAST} rooms or more with {100 * overlap:.0f} % of them in common; "
-            "take another overlap, another seed or more storeys"
+            f"{building.name} has no two connected parts of {LEAST_ROOMS_A_PART} rooms or more with {100 * overlap:.0f} % of "
+            "them in common; take another overlap, another seed or more storeys"
         )
     return np.array(sorted(best[0]), np.int64), np.array(sorted(best[1]), np.int64)
 
@@ -110,9 +110,10 @@ def _step(part: set[int], other: set[int], neighbours: Neighbours, rng: np.rando
 
 
 def twin_rooms(building: Building) -> dict[int, int]:
-    """Rooms of one storey -> the rooms over them with the same plan (IoU above `ALIKE`): of the two storeys that share most.
+    """Rooms of one storey -> the rooms over them with the same plan (IoU above `SAME_PLAN`): of the two storeys that share most.
 
-    Corridors, halls and stairwells need to have less in common (`JOINING`): they lead from room to room, also where they differ.
+    Corridors, halls and stairwells need to have less in common (`SAME_CORRIDOR`): they lead from room to room, also where
+    they differ.
 
     Raises:
         InputError: no two storeys have the same plan.
@@ -122,9 +123,9 @@ def twin_rooms(building: Building) -> dict[int, int]:
     fits = np.array([room.kind not in ("lift", "void") for room in building.rooms])
     best: dict[int, int] = {}
     for low, high in combinations(range(len(building.storeys)), 2):
-        found = _over(building, shapes, np.flatnonzero(fits & (storey == low)), np.flatnonzero(fits & (storey == high)))
-        best = max(best, found, key=len)
-    if len(best) < LEAST:
+        room_over_room = _over(building, shapes, np.flatnonzero(fits & (storey == low)), np.flatnonzero(fits & (storey == high)))
+        best = max(best, room_over_room, key=len)
+    if len(best) < LEAST_ROOMS_A_PART:
         raise InputError(f"{building.name}: no two of its storeys have the same plan")
     return best
 
@@ -141,6 +142,6 @@ def _over(building: Building, shapes: Array, low: Array, high: Array) -> dict[in
     for k in np.argsort(-iou, kind="stable").tolist():
         a, b = int(i[k]), int(j[k])
         joins = building.rooms[a].kind == building.rooms[b].kind and building.rooms[a].kind in CONNECTING
-        if iou[k] > (JOINING if joins else ALIKE) and a not in out and b not in out.values():
+        if iou[k] > (SAME_CORRIDOR if joins else SAME_PLAN) and a not in out and b not in out.values():
             out[a] = b
     return dict(sorted(out.items()))

@@ -15,9 +15,9 @@ from topomerge.datasets.pairs.pairs import Pair
 
 from topomerge.types import Array, PointCloud, Sim3, TrueRoom
 
-ONLY_A, ONLY_B, BOTH, NEITHER, INK = "#aaccee", "#f3c0a5", "#b5dca9", "#f4f4f4", "#555555"
+ONLY_A, ONLY_B, BOTH, NEITHER, OUTLINE_INK = "#aaccee", "#f3c0a5", "#b5dca9", "#f4f4f4", "#555555"
 COLOURS = ("#1f5fa8", "#c2410c")  # points and walk of a and of b
-POINTS = 60_000  # of a cloud, drawn
+DRAWN_POINTS = 60_000  # of a cloud, drawn
 SLICE = (0.3, 2.0)  # m above the floor: walls and furniture
 WIDEST = 1600  # pixels
 
@@ -74,7 +74,7 @@ def _draw(panels: list[Any], title: str, maps: int) -> Figure:
     fills = [(ONLY_A, "visited by a"), (ONLY_B, "visited by b"), (BOTH, "visited by both"), (NEITHER, "not visited")]
     fills = fills if maps == 2 else [fills[0], fills[3]]
     lines = [(COLOURS[k], f"walls and walk of {'ab'[k]}") for k in range(maps)]
-    handles = [Patch(facecolor=c, edgecolor=INK, label=t) for c, t in [*fills, *lines]]
+    handles = [Patch(facecolor=c, edgecolor=OUTLINE_INK, label=t) for c, t in [*fills, *lines]]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
     return figure
 
@@ -84,18 +84,18 @@ def _draw_storey(ax: Axes, rooms: tuple[TrueRoom, ...], storey: int, sides: list
     for i in here:
         by = {side[3] for side in sides if i in side[2]}
         colour = BOTH if len(by) == 2 else NEITHER if not by else (ONLY_A, ONLY_B)[by.pop()]
-        ax.add_patch(Polygon(rooms[i].polygon, facecolor=colour, edgecolor=INK, linewidth=0.8))
+        ax.add_patch(Polygon(rooms[i].polygon, facecolor=colour, edgecolor=OUTLINE_INK, linewidth=0.8))
         x, y = rooms[i].polygon.mean(axis=0).tolist()
-        ax.annotate(str(i), (x, y), fontsize=7, ha="center", va="center", color=INK)
+        ax.annotate(str(i), (x, y), fontsize=7, ha="center", va="center", color=OUTLINE_INK)
     floor = min(rooms[i].floor for i in here)
     above = min((r.floor for r in rooms if r.floor > floor + 1.0), default=floor + 20.0)
     for cloud, frame, _, which in sides:
         back = frame.inverse()
-        step = max(len(cloud) // (4 * POINTS), 1)
+        step = max(len(cloud) // (4 * DRAWN_POINTS), 1)
         points = back.apply(cloud.points[::step])
         height = points[:, 2] - floor
-        kept = points[(height > SLICE[0]) & (height < SLICE[1])][:, :2]
-        ax.plot(*kept[:: max(len(kept) // POINTS, 1)].T, ",", color=COLOURS[which], alpha=0.35, zorder=3, rasterized=True)
+        walls = points[(height > SLICE[0]) & (height < SLICE[1])][:, :2]
+        ax.plot(*walls[:: max(len(walls) // DRAWN_POINTS, 1)].T, ",", color=COLOURS[which], alpha=0.35, zorder=3, rasterized=True)
         if cloud.poses is not None:
             _draw_walk(ax, back.apply(cloud.poses[:, :3, 3]), floor, above, COLOURS[which])
     corners = np.concatenate([rooms[i].polygon for i in here])

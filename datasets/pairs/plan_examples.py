@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 from topomerge.datasets.buildings.erect import erect
-from topomerge.datasets.buildings.procedural import KINDS, make_building
+from topomerge.datasets.buildings.procedural import make_building
+from topomerge.datasets.buildings.profiles import BUILDING_KINDS
 from topomerge.datasets.core.builder import Report, Row, Say, Sharing, build_set, check_sharing, make_item
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.difficulty import Difficulty
@@ -212,7 +213,7 @@ def make_examples(item: PlanItem, plan: Plan | None) -> list[PlanExample]:
         building = erect([plan], difficulty, rng, f"{source}-{seed}")
     else:
         floors = 1 if sensor in ("laser2d", "drawn") else int(rng.choice([1, 1, 1, 2]))
-        building = make_building(str(rng.choice(KINDS)), seed, floors, difficulty)
+        building = make_building(str(rng.choice(BUILDING_KINDS)), seed, floors, difficulty)
     visited = part(building, int(rng.integers(*ROOMS_VISITED)), rng)
     if sensor == "drawn":
         cloud, shift = drawn_map(building, visited, rng), None

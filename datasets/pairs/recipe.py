@@ -19,8 +19,8 @@ from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.embedding import graph
 from topomerge.errors import InputError
 
-LEAST_ROOMS = 5  # of a real plan: fewer have no two parts
-LEAST_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told apart
+LEAST_PLAN_ROOMS = 5  # of a real plan: fewer have no two parts
+LEAST_PLAN_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told apart
 LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
 PLACES = {**splits.FOLDERS, "ipa": splits.TEST_ONLY["ipa"][0]}  # source -> folder; IPA's are for the test only
 Library = Mapping[str, Mapping[str, tuple[Plan, ...]]]  # source -> name -> plans of its storeys, lowest first
@@ -46,7 +46,7 @@ class Recipe:
         voxel_size: of the extraction, m.
         stacks: share of the real buildings with two storeys, where the source has sibling storeys that fit (`stack`).
         over_stairs: share of the overlapping pairs in buildings of several storeys whose walks lead over stairs.
-        maps: keep the extracted maps (`kept`), too: for evaluation.
+        maps: keep the extracted maps (`evaluation_pair`), too: for evaluation.
         vary: name of a change (`degrade.CHANGES`) -> values; every pair is made once for each of all these.
     """
 
@@ -81,12 +81,12 @@ def check(recipe: Recipe) -> None:
     splits.seeds(recipe.split)
     for sensor in recipe.sensors:
         get_sensor(sensor)
-    known = {"sources": ("procedural", *PLACES), "kinds": tuple(PROFILES), "hard": HARD}
+    possible = {"sources": ("procedural", *PLACES), "kinds": tuple(PROFILES), "hard": HARD}
     for key in ("sources", "kinds", "sensors", "hard"):
         weights: dict[str, float] = getattr(recipe, key)
         for name, weight in weights.items():
-            if name not in known.get(key, (name,)):
-                raise InputError(f"{key}: unknown {name!r}; {', '.join(known[key])} are possible")
+            if name not in possible.get(key, (name,)):
+                raise InputError(f"{key}: unknown {name!r}; {', '.join(possible[key])} are possible")
             if not 0 <= weight < np.inf:
                 raise InputError(f"{key}.{name} must be 0 or more, not {weight}")
         if key != "hard" and sum(weights.values()) <= 0:
@@ -126,11 +126,11 @@ def library(recipe: Recipe) -> Library:
             raise InputError(f"sources.{source}: no plan of split {recipe.split} in {recipe.folder}")
         out[source] = {name: (plan,) for name, plan in plans.items()}
         if source not in ("r2v", "ipa") and (recipe.stacks > 0 or recipe.hard.get("other-storey", 0) > 0):  # of one storey
-            found = iter_stacks(folder, dict(plans))
-            out[source] |= {name: stack.plans for name, stack in found if isinstance(stack, Stack)}
+            stacks = iter_stacks(folder, dict(plans))
+            out[source] |= {name: stack.plans for name, stack in stacks if isinstance(stack, Stack)}
     return out
 
 
 def _fits(plan: Plan) -> bool:
     areas = [shapely.Polygon(room.polygon).area for room in plan.rooms]
-    return len(areas) >= LEAST_ROOMS and sum(areas) >= LEAST_AREA and max(areas) <= LARGEST_ROOM
+    return len(areas) >= LEAST_PLAN_ROOMS and sum(areas) >= LEAST_PLAN_AREA and max(areas) <= LARGEST_ROOM

@@ -20,7 +20,7 @@ from topomerge.datasets.simulation.walk import part
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3, TrueRoom
 
-FORMAT = 1
+TRUTH_FORMAT = 1
 Output = tuple[Path, Callable[[Path], None]]
 
 
@@ -50,8 +50,8 @@ def simulate(
         get_sensor(sensor)
     if rooms is not None and rooms < 1:
         raise InputError(f"a map must have 1 room or more, not {rooms}")
-    twins = hard == "other-storey"
-    building = make_building(kind, seed, max(storeys, 2) if twins else storeys, Difficulty(differ=0.0) if twins else None)
+    same_plan = hard == "other-storey"
+    building = make_building(kind, seed, max(storeys, 2) if same_plan else storeys, Difficulty(differ=0.0) if same_plan else None)
     rng = np.random.default_rng([seed, 1])
     if len(sensors) == 2:
         pair = make_pair(building, PairSettings(overlap, sensors, ROOMS_A_MAP if rooms is None else rooms, scale, hard), rng)
@@ -103,12 +103,12 @@ def truth(building: Building, made: Pair | PointCloud, frame: Sim3) -> dict[str,
     """
     from topomerge.io.listing import plain
 
-    found: dict[str, Any] = {"format": FORMAT, "building": building.name, "seed": building.seed}
+    listing: dict[str, Any] = {"format": TRUTH_FORMAT, "building": building.name, "seed": building.seed}
     if isinstance(made, PointCloud):
-        return plain({**found, "maps": [_map(building, made, frame, "a.ply", ())]})
+        return plain({**listing, "maps": [_map(building, made, frame, "a.ply", ())]})
     pair, transform = made, made.truth
     assert pair.frames is not None
-    found |= {
+    listing |= {
         "kind": pair.kind,
         "overlap": pair.overlap,
         "T_ab": None if transform is None else transform.matrix,
@@ -122,7 +122,7 @@ def truth(building: Building, made: Pair | PointCloud, frame: Sim3) -> dict[str,
         _map(building, pair.a, pair.frames[0], "a.ply", pair.visited[0]),
         _map(b, pair.b, pair.frames[1], "b.ply", pair.visited[1]),
     ]
-    return plain({**found, "maps": maps})
+    return plain({**listing, "maps": maps})
 
 
 def _map(building: Building | None, cloud: PointCloud, frame: Sim3, name: str, visited: tuple[int, ...]) -> dict[str, Any]:
@@ -139,8 +139,8 @@ def _map(building: Building | None, cloud: PointCloud, frame: Sim3, name: str, v
 
 
 def _room(i: int, room: TrueRoom) -> dict[str, Any]:
-    known = {"id": i, "name": room.name, "kind": room.kind, "storey": room.storey}
-    return known | {"floor": round(room.floor, 4), "ceiling": round(room.ceiling, 4), "polygon": room.polygon.round(4)}
+    entry = {"id": i, "name": room.name, "kind": room.kind, "storey": room.storey}
+    return entry | {"floor": round(room.floor, 4), "ceiling": round(room.ceiling, 4), "polygon": room.polygon.round(4)}
 
 
 def _door(door: Array, frame: Sim3) -> dict[str, Any]:

@@ -18,8 +18,8 @@ TRUTH_DTYPE = np.dtype(
     ]
 )
 LEAST_IOU = 0.1  # below, an extracted room is no true room
-BESIDE = 0.15  # m: points of a wall lie outside of the room's outline
-FLAT = 0.5  # of the height of the map: points that span less are a slice, which was made into walls and a floor
+WALL_BESIDE = 0.15  # m: points of a wall lie outside of the room's outline
+SLICE_SHARE = 0.5  # of the height of the map: points that span less are a slice, which was made into walls and a floor
 
 
 def room_truth(map: TopometricMap, cloud: PointCloud) -> Array:
@@ -55,10 +55,10 @@ def cell_labels(map: TopometricMap, cloud: PointCloud) -> Array:
     """
     if cloud.labels is None:
         return _by_outline(map, cloud)
-    known = np.flatnonzero(cloud.labels >= 0)
-    label = cloud.labels[known].astype(np.int64)
-    places = map.grid.locate(cloud.points[known].astype(np.float64) + cloud.shift)
-    if not len(known) or _height(places) >= FLAT * _height(map.grid.cells):
+    labelled = np.flatnonzero(cloud.labels >= 0)
+    label = cloud.labels[labelled].astype(np.int64)
+    places = map.grid.locate(cloud.points[labelled].astype(np.float64) + cloud.shift)
+    if not len(labelled) or _height(places) >= SLICE_SHARE * _height(map.grid.cells):
         return _most(map.grid.rows(places), label, len(map.grid), len(cloud.rooms))
     columns, column = np.unique(map.grid.cells[:, :2], axis=0, return_inverse=True)
     number = np.full(map.grid.shape[:2], -1)
@@ -88,8 +88,8 @@ def _by_outline(map: TopometricMap, cloud: PointCloud) -> Array:
     places = map.grid.centroids()
     out = np.full(len(places), -1, np.int32)
     for i, room in enumerate(cloud.rooms):
-        level = (places[:, 2] > room.floor - 2 * BESIDE) & (places[:, 2] < room.ceiling + 2 * BESIDE)
-        shape = shapely.Polygon(room.polygon).buffer(BESIDE, join_style="mitre")
+        level = (places[:, 2] > room.floor - 2 * WALL_BESIDE) & (places[:, 2] < room.ceiling + 2 * WALL_BESIDE)
+        shape = shapely.Polygon(room.polygon).buffer(WALL_BESIDE, join_style="mitre")
         rows = np.flatnonzero(level & (out < 0))
         out[rows[shapely.contains_xy(shape, places[rows, :2])]] = i
     return out

@@ -1,6 +1,7 @@
 """Line maps of UT-AMRL (``*.vectormap.json``): segments in metres that show both faces of the walls; doors are gaps.
 
-There are no rooms in the file: the walls are drawn into a raster, gaps up to `GAP` are closed, and what stays apart is rooms.
+There are no rooms in the file: the walls are drawn into a raster, gaps up to `DOOR_GAP` are closed, and what stays apart
+is rooms.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from topomerge.datasets.plans.sketch import Sketch, read_limited
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-CELL = 0.05  # m
-GAP = 1.6  # m; wider gaps do not part rooms
-FRONT = 5.0  # m; wider gaps in the outer walls make what lies behind them outside
-MARGIN = FRONT  # m of outside around the map
-SMALLEST = 1.5  # m2 of a room
-CAVITY = 0.5  # m; narrower space lies within the walls
+LINE_MAP_CELL = 0.05  # m
+DOOR_GAP = 1.6  # m; wider gaps do not part rooms
+FRONT_GAP = 5.0  # m; wider gaps in the outer walls make what lies behind them outside
+LINE_MAP_MARGIN = FRONT_GAP  # m of outside around the map
+SMALLEST_LINE_ROOM = 1.5  # m2 of a room
+LINE_MAP_CAVITY = 0.5  # m; narrower space lies within the walls
 LINE_MAP_BYTES, LINE_MAP_CELLS = 50 << 20, 50_000_000
 
 
@@ -40,18 +41,20 @@ def sketch(text: bytes) -> Sketch:
     """
     lines = _segments(text)
     wall, origin = _drawn(lines)
-    distance = ndimage.distance_transform_edt(~wall) * CELL
+    distance = ndimage.distance_transform_edt(~wall) * LINE_MAP_CELL
     free = ~wall & _inside(distance)
-    seeds = ndimage.label(free & (distance > GAP / 2))[0].astype(np.int32)
-    labels = flood(seeds, free, np.round(distance / CELL))
+    seeds = ndimage.label(free & (distance > DOOR_GAP / 2))[0].astype(np.int32)
+    labels = flood(seeds, free, np.round(distance / LINE_MAP_CELL))
     labels[np.isin(labels, _outdoor(labels, free, wall))] = 0
     result = Sketch(height=3.6, ceiling=2.8, inset=0.02)
-    index = add_rooms(result, labels, {}, CELL, origin, SMALLEST, CAVITY / 2)
+    index = add_rooms(result, labels, {}, LINE_MAP_CELL, origin, SMALLEST_LINE_ROOM, LINE_MAP_CAVITY / 2)
     if not index:
         raise InputError("not closed: the walls enclose no room")
-    for a, b, ends in contacts(labels, CELL, origin):
+    for a, b, ends in contacts(labels, LINE_MAP_CELL, origin):
         along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
-        add_contacts(result, [(a, b, ends + np.stack([-along, along]) * CELL)], index, "door")  # walls were drawn thicker
+        add_contacts(
+            result, [(a, b, ends + np.stack([-along, along]) * LINE_MAP_CELL)], index, "door"
+        )  # walls were drawn thicker
     guess_kinds(result, "office")
     return result
 
@@ -72,9 +75,9 @@ def _segments(text: bytes) -> Array:
 
 
 def _inside(distance: Array) -> Array:
-    """(h, w) bool: the building, after closing gaps of up to `FRONT` in its outer walls (glass is often not in the map)."""
-    closed = ndimage.binary_fill_holes(distance <= FRONT / 2)
-    inside: Array = ndimage.distance_transform_edt(closed) * CELL > FRONT / 2
+    """(h, w) bool: the building, after closing gaps of up to `FRONT_GAP` in its outer walls (glass is often not in the map)."""
+    closed = ndimage.binary_fill_holes(distance <= FRONT_GAP / 2)
+    inside: Array = ndimage.distance_transform_edt(closed) * LINE_MAP_CELL > FRONT_GAP / 2
     return inside
 
 
@@ -87,15 +90,15 @@ def _outdoor(labels: Array, free: Array, wall: Array) -> Array:
 
 def _drawn(lines: Array) -> tuple[Array, Array]:
     """(h, w) bool raster of the walls, and its origin, m."""
-    low, high = lines.min(axis=(0, 1)) - MARGIN, lines.max(axis=(0, 1)) + MARGIN
-    shape = np.ceil((high - low) / CELL).astype(int)
+    low, high = lines.min(axis=(0, 1)) - LINE_MAP_MARGIN, lines.max(axis=(0, 1)) + LINE_MAP_MARGIN
+    shape = np.ceil((high - low) / LINE_MAP_CELL).astype(int)
     if shape.astype(float).prod() > LINE_MAP_CELLS:
         raise InputError(f"absurd scale: a map of {high[0] - low[0]:.0f} by {high[1] - low[1]:.0f} m")
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
-    count = (length / CELL * 2).astype(int) + 2
+    count = (length / LINE_MAP_CELL * 2).astype(int) + 2
     t = np.concatenate([np.linspace(0, 1, n) for n in count])[:, None]
     points = np.repeat(lines[:, 0], count, axis=0) * (1 - t) + np.repeat(lines[:, 1], count, axis=0) * t
-    cells = np.floor((points - low) / CELL).astype(int)
+    cells = np.floor((points - low) / LINE_MAP_CELL).astype(int)
     wall = np.zeros((shape[1] + 1, shape[0] + 1), bool)
     wall[cells[:, 1], cells[:, 0]] = True
     return ndimage.binary_dilation(wall), low  # fills the cavity between the two faces of thin walls

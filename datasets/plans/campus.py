@@ -3,7 +3,7 @@
 Every ``space`` has a label, a ``bounding_polygon`` in pixels, y down, and portals that name the two spaces they join. Portals
 have no length: doors get a usual width where the two outlines face each other. ``scale`` gives centimetres for some pixels,
 measured on one small door: it is compared with usual sizes of the labelled rooms, and replaced where it can't be right.
-Outlines run along the walls' faces or centre lines, as each draughtsman liked: all are set in by `INSET`.
+Outlines run along the walls' faces or centre lines, as each draughtsman liked: all are set in by `CAMPUS_INSET`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from topomerge.datasets.plans.sketch import Sketch, overlaps, read_limited
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-KINDS = {  # words in labels, the first that fits: our word and a usual area, m2 (0: differs too much)
+CAMPUS_KINDS = {  # words in labels, the first that fits: our word and a usual area, m2 (0: differs too much)
     "CLASSROOM": ("classroom", 60),
     "CORRIDOR": ("corridor", 0),
     "CLOSET": ("storage", 6),
@@ -51,11 +51,11 @@ KINDS = {  # words in labels, the first that fits: our word and a usual area, m2
     "RECEPTION": ("lobby", 0),
     "STORE": ("storage", 0),
 }
-DOOR, DOUBLE, PASSAGE = 0.9, 1.6, 2.5  # m, widths of single and double doors and of openings without one
-INSET = 0.075  # m
-REACH = 0.9  # m, how far apart the outlines of two rooms with a door may be
+SINGLE_DOOR, DOUBLE_DOOR, CAMPUS_PASSAGE = 0.9, 1.6, 2.5  # m, widths of single and double doors and of openings without one
+CAMPUS_INSET = 0.075  # m
+PORTAL_REACH = 0.9  # m, how far apart the outlines of two rooms with a door may be
 ASTRAY = 2.0  # m, how far a door may be from where the portal is drawn
-SAME = 1.2  # m; two marks of a portal between the same rooms, one drawn from each side, are one door
+SAME_PORTAL = 1.2  # m; two marks of a portal between the same rooms, one drawn from each side, are one door
 TRUSTED, HOPELESS = 1.6, 3.0  # factors between the scale of the file and that of usual rooms
 PARTLY, WITHIN = 0.25, 0.95  # share of a room in another one up to which, or from which on, the other one gives way
 CAMPUS_BYTES = 20 << 20
@@ -87,7 +87,7 @@ def sketch(text: bytes) -> Sketch:
     spaces = root.findall("floor/spaces/space")
     if root.tag != "building" or not spaces:
         raise InputError("not a campus plan: expected building/floor/spaces/space")
-    result = Sketch(inset=INSET, height=3.6, ceiling=3.0)
+    result = Sketch(inset=CAMPUS_INSET, height=3.6, ceiling=3.0)
     shapes = {space.get("id", ""): _shape(space, result) for space in spaces}
     scale = _scale(root, spaces, shapes, result)
     indices: dict[str, int] = {}
@@ -104,12 +104,12 @@ def sketch(text: bytes) -> Sketch:
 
 def _kind(space: ElementTree.Element) -> tuple[str, float]:
     label = space.findtext("labels/label") or ""
-    return next((found for word, found in KINDS.items() if word in label), ("office" if label else "", 0))
+    return next((entry for word, entry in CAMPUS_KINDS.items() if word in label), ("office" if label else "", 0))
 
 
 def _points(element: ElementTree.Element, path: str) -> Array:
-    found = [(float(p.get("x", "nan")), -float(p.get("y", "nan"))) for p in element.findall(path)]  # y up
-    return np.array(found, float).reshape(-1, 2)
+    corners = [(float(p.get("x", "nan")), -float(p.get("y", "nan"))) for p in element.findall(path)]  # y up
+    return np.array(corners, float).reshape(-1, 2)
 
 
 def _shape(space: ElementTree.Element, result: Sketch) -> shapely.Polygon | None:
@@ -192,9 +192,9 @@ def _doors(result: Sketch, spaces: list[ElementTree.Element], indices: dict[str,
                 pair = (min(ends), max(ends))
                 marks.setdefault(pair, []).append((line.mean(axis=0) * scale, *_door_type(portal)))
     lost = 0
-    for (a, b), found in marks.items():
-        for point, kind, width in _once(found):
-            opening = place_door(result.shapes[a], result.shapes[b], width, REACH, point, kind)
+    for (a, b), portals in marks.items():
+        for point, kind, width in _once(portals):
+            opening = place_door(result.shapes[a], result.shapes[b], width, PORTAL_REACH, point, kind)
             if opening is None or np.hypot(*(np.add(opening.start, opening.end) / 2 - point)) > ASTRAY:
                 lost += 1
                 continue
@@ -205,13 +205,13 @@ def _doors(result: Sketch, spaces: list[ElementTree.Element], indices: dict[str,
 
 def _door_type(portal: ElementTree.Element) -> tuple[str, float]:
     if portal.findtext("type") == "IMPLICIT":
-        return "opening", PASSAGE
-    return "door", DOUBLE if portal.findtext("features") == "DOUBLE" else DOOR
+        return "opening", CAMPUS_PASSAGE
+    return "door", DOUBLE_DOOR if portal.findtext("features") == "DOUBLE" else SINGLE_DOOR
 
 
 def _once(marks: list[tuple[Array, str, float]]) -> list[tuple[Array, str, float]]:
-    kept: list[tuple[Array, str, float]] = []
+    doors: list[tuple[Array, str, float]] = []
     for mark in marks:
-        if all(np.hypot(*(mark[0] - other[0])) > SAME for other in kept):
-            kept.append(mark)
-    return kept
+        if all(np.hypot(*(mark[0] - other[0])) > SAME_PORTAL for other in doors):
+            doors.append(mark)
+    return doors

@@ -46,7 +46,7 @@ READERS = (  # what a file's name matches, and the module that reads it
 )
 NOT_PLANS = re.compile(r"(^|/)(NOTE|README|LICENSE[^/]*)\.txt$|\.vectormap\.txt$|\.navigation\.txt$|(^|/)package\.xml$")
 
-LEVELS = ("rmf", "ifc")  # formats with several storeys a file
+FORMATS_WITH_LEVELS = ("rmf", "ifc")  # formats with several storeys a file
 SURVEYED = ("mall",)  # formats whose storeys, one a folder, are in one frame
 WORDS = {"basement": -1.0, "lower": 0.0, "ground": 0.0, "main": 1.0, "first": 1.0, "upper": 2.0, "second": 2.0, "third": 3.0}
 ALIASES = {"romainrolland": "romainroland"}  # misspelt by the owner
@@ -88,8 +88,8 @@ def landed(plans: list[Plan]) -> list[Plan]:
     out = []
     for k, plan in enumerate(plans):
         above = plans[k + 1].rooms if k + 1 < len(plans) else ()
-        kept = [f for f in plan.flights if all(_in_room(f, rooms) for rooms in (plan.rooms, above))]
-        out.append(replace(plan, flights=tuple(kept)))
+        flights = [f for f in plan.flights if all(_in_room(f, rooms) for rooms in (plan.rooms, above))]
+        out.append(replace(plan, flights=tuple(flights)))
     return out
 
 
@@ -145,7 +145,7 @@ def siblings(folder: str | Path) -> list[list[str]]:
     groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
     for file, root in _files(Path(folder)):
         names = [_full(file, root, name) for name in _names(file)]
-        if len(names) > 1 and _reader(file) in LEVELS:
+        if len(names) > 1 and _reader(file) in FORMATS_WITH_LEVELS:
             groups[("", names[0])] = [(k, name) for k, name in enumerate(names)]
         elif len(names) == 1:
             above, _, last = names[0].rpartition("/")
@@ -161,7 +161,13 @@ def frame_of(folder: str | Path) -> dict[str, str]:
     for file, root in _files(Path(folder)):
         for name in (_full(file, root, name) for name in _names(file)):
             reader = _reader(file)
-            out[name] = file.as_posix() if reader in LEVELS else file.parent.parent.as_posix() if reader in SURVEYED else name
+            out[name] = (
+                file.as_posix()
+                if reader in FORMATS_WITH_LEVELS
+                else file.parent.parent.as_posix()
+                if reader in SURVEYED
+                else name
+            )
     return out
 
 

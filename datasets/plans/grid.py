@@ -18,20 +18,20 @@ import yaml
 from PIL import Image, ImageDraw
 from scipy import ndimage
 from topomerge.datasets.plans.doors import doorway, place_door
-from topomerge.datasets.plans.raster import SPARE, add_contacts, add_rooms, contacts, flood, guess_kinds
+from topomerge.datasets.plans.raster import DOORWAY_THICKNESS, add_contacts, add_rooms, contacts, flood, guess_kinds
 from topomerge.datasets.plans.sketch import Sketch
 
 from topomerge.errors import InputError
 from topomerge.types import Array
 
 IPA_CELL = 0.05  # m, nominal
-FREE, WHITE = 250, 250  # grey levels of free space, of the inside of a true room
-SMALLEST = 1.0  # m2 of a room
-CAVITY = 0.3  # m; narrower strips of a room are left out
+FREE_GREY, WHITE = 250, 250  # grey levels of free space, of the inside of a true room
+SMALLEST_GRID_ROOM = 1.0  # m2 of a room
+GRID_CAVITY = 0.3  # m; narrower strips of a room are left out
 BRIDGE = 6  # cells between two rooms that an opening may cross
-BODY = 0.3  # m that a way from room to room keeps from what is not free: speckled walls have holes
-PASSAGE = 1.5  # m, of openings whose place is not known
-APART = 1.0  # m between an opening of the map and a door of the list
+ROBOT_BODY = 0.3  # m that a way from room to room keeps from what is not free: speckled walls have holes
+GRID_PASSAGE = 1.5  # m, of openings whose place is not known
+DOORS_APART = 1.0  # m between an opening of the map and a door of the list
 MAX_PIXELS = 100_000_000
 
 
@@ -55,17 +55,17 @@ def ipa(path: Path) -> Sketch:
     scan = next((s for s in scans if s.is_file()), None)
     if scan is None:
         raise InputError(f"missing file: {stem}.png")
-    free = _image(scan) >= FREE
+    free = _image(scan) >= FREE_GREY
     if free.shape != truth.shape:
         raise InputError(f"wrong version: {scan.name} is {free.shape[::-1]} pixels, its rooms are {truth.shape[::-1]}")
     labels = ndimage.label(truth >= WHITE)[0].astype(np.int32)
     sizes = np.bincount(labels.ravel())
-    labels[np.isin(labels, np.flatnonzero(sizes < SMALLEST / IPA_CELL**2))] = 0
+    labels[np.isin(labels, np.flatnonzero(sizes < SMALLEST_GRID_ROOM / IPA_CELL**2))] = 0
     labels = _without_outside(labels, free)
     labels = flood(labels, free | (labels > 0))
     result = Sketch(height=3.2, ceiling=2.7, inset=0.02)
     origin = np.zeros(2)
-    index = add_rooms(result, labels, {}, IPA_CELL, origin, SMALLEST, CAVITY / 2)
+    index = add_rooms(result, labels, {}, IPA_CELL, origin, SMALLEST_GRID_ROOM, GRID_CAVITY / 2)
     add_contacts(result, contacts(labels, IPA_CELL, origin), index, "door")
     guess_kinds(result, "office")
     return result
@@ -88,18 +88,20 @@ def bwi(path: Path) -> Sketch:
     grid, resolution, origin = _map(path.parent)
     labels = _painted(polygons, grid.shape)
     result = Sketch(height=3.6, ceiling=2.8, inset=0.05)
-    index = add_rooms(result, labels, dict(enumerate(map(str, names), 1)), resolution, origin, SMALLEST, CAVITY / 2)
-    known = {str(name): index.get(k, -1) for k, name in enumerate(names, 1)}
-    _listed_doors(result, _yaml(path.with_name("doors.yaml")), known)
+    index = add_rooms(
+        result, labels, dict(enumerate(map(str, names), 1)), resolution, origin, SMALLEST_GRID_ROOM, GRID_CAVITY / 2
+    )
+    room_of_name = {str(name): index.get(k, -1) for k, name in enumerate(names, 1)}
+    _listed_doors(result, _yaml(path.with_name("doors.yaml")), room_of_name)
     doors = [np.add(o.start, o.end) / 2 for o in result.openings]
-    body = ndimage.distance_transform_edt(grid >= FREE) * resolution > BODY
+    body = ndimage.distance_transform_edt(grid >= FREE_GREY) * resolution > ROBOT_BODY
     near = ndimage.distance_transform_edt(labels == 0) <= BRIDGE / 2
     for a, b, ends in contacts(flood(np.where(body, labels, 0), body & near), resolution, origin):
         along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
-        if all(np.hypot(*(ends.mean(axis=0) - door)) > APART for door in doors):
-            add_contacts(result, [(a, b, ends + np.stack([-along, along]) * BODY)], index, "opening")
+        if all(np.hypot(*(ends.mean(axis=0) - door)) > DOORS_APART for door in doors):
+            add_contacts(result, [(a, b, ends + np.stack([-along, along]) * ROBOT_BODY)], index, "opening")
     if (path.with_name("connectivity.yaml")).is_file():
-        _connected(result, _yaml(path.with_name("connectivity.yaml")), known)
+        _connected(result, _yaml(path.with_name("connectivity.yaml")), room_of_name)
     guess_kinds(result, "office")
     return result
 
@@ -115,30 +117,30 @@ def _painted(polygons: list[list[float]], shape: tuple[int, ...]) -> Array:
     return np.flipud(np.asarray(image, np.int32)).copy()
 
 
-def _listed_doors(result: Sketch, doors: Any, known: dict[str, int]) -> None:
+def _listed_doors(result: Sketch, doors: Any, room_of_name: dict[str, int]) -> None:
     if not isinstance(doors, list):
         raise InputError("not a grid plan: doors.yaml holds no list")
     for door in doors:
-        ends = sorted({known.get(str(a.get("from")), -1) for a in door.get("approach", [])})
+        ends = sorted({room_of_name.get(str(a.get("from")), -1) for a in door.get("approach", [])})
         start, end = (np.array(door[f"door_corner_pt_{k}"], float) for k in (1, 2))
         if len(ends) != 2 or ends[0] < 0:
             continue
         width = float(np.hypot(*(end - start)))
         shapes = [result.shapes[i] for i in ends]
         placed = place_door(shapes[0], shapes[1], width, 1.0, (start + end) / 2) if width else None
-        placed = placed or doorway("door", start, end, SPARE)
+        placed = placed or doorway("door", start, end, DOORWAY_THICKNESS)
         result.add_opening(replace(placed, kind="door"), (ends[0], ends[1]))  # also double ones have leaves here
 
 
-def _connected(result: Sketch, neighbours: Any, known: dict[str, int]) -> None:
+def _connected(result: Sketch, neighbours: Any, room_of_name: dict[str, int]) -> None:
     """Openings for rooms that `connectivity.yaml` calls neighbours and that have none yet."""
     done = {frozenset(ends) for ends in result.ends}
     for name, others in sorted(neighbours.items()) if isinstance(neighbours, dict) else []:
         for other in others:
-            a, b = known.get(str(name), -1), known.get(str(other), -1)
+            a, b = room_of_name.get(str(name), -1), room_of_name.get(str(other), -1)
             if min(a, b) < 0 or frozenset((a, b)) in done:
                 continue
-            opening = place_door(result.shapes[a], result.shapes[b], PASSAGE, 0.5, None, "opening")
+            opening = place_door(result.shapes[a], result.shapes[b], GRID_PASSAGE, 0.5, None, "opening")
             if opening is not None:
                 result.add_opening(opening, (a, b))
                 done.add(frozenset((a, b)))
@@ -155,8 +157,8 @@ def _without_outside(labels: Array, free: Array) -> Array:
 
 def _map(folder: Path) -> tuple[Array, float, Array]:
     """The map of a folder: grey levels, m per cell, and origin, m."""
-    found = sorted(p for p in folder.glob("*.yaml") if p.stem not in ("locations", "doors", "objects", "connectivity"))
-    for path in sorted(found, key=lambda p: p.stem != folder.name):
+    listings = sorted(p for p in folder.glob("*.yaml") if p.stem not in ("locations", "doors", "objects", "connectivity"))
+    for path in sorted(listings, key=lambda p: p.stem != folder.name):
         about = _yaml(path)
         image = path.with_name(f"{Path(str(about.get('image', ''))).stem}.png")
         if "resolution" in about and image.is_file():

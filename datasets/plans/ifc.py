@@ -19,7 +19,7 @@ from topomerge.datasets.plans.sketch import Sketch
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-KINDS = {  # words in the names of spaces
+IFC_KINDS = {  # words in the names of spaces
     "corridor": "corridor",
     "hall": "corridor",
     "foyer": "lobby",
@@ -46,7 +46,7 @@ KINDS = {  # words in the names of spaces
 }
 SILL = 0.3  # m; holes that start higher above the floor are no doorways
 TOUCHING = 0.03  # m
-PASSAGE = 4.0  # m, widest opening between spaces that touch
+IFC_PASSAGE = 4.0  # m, widest opening between spaces that touch
 HEIGHTS = (2.4, 8.0)  # m, of a storey
 
 
@@ -113,7 +113,7 @@ def sketch(rooms: list[tuple[Any, Array]], holes: list[tuple[str, Array, Array]]
     result = Sketch(height=height, ceiling=float(np.clip(np.median(tops), 2.0, height - 0.2)))
     for space, triangles in rooms:
         name = " ".join(str(part) for part in (space.Name, space.LongName) if part)
-        kind = next((kind for word, kind in KINDS.items() if word in name.lower()), "")
+        kind = next((kind for word, kind in IFC_KINDS.items() if word in name.lower()), "")
         shape = _base(triangles)
         if shape.area > 0.5 and kind != "outside":
             result.add_room(name or f"space {len(result.shapes)}", kind, shape)
@@ -193,6 +193,6 @@ def _open_sides(result: Sketch) -> None:
     shapes = np.array(result.shapes, object)
     first, second = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=TOUCHING)
     for i, j in sorted({(i, j) for i, j in zip(first.tolist(), second.tolist(), strict=True) if i < j}):
-        opening = place_door(result.shapes[i], result.shapes[j], PASSAGE, TOUCHING, None, "opening")
+        opening = place_door(result.shapes[i], result.shapes[j], IFC_PASSAGE, TOUCHING, None, "opening")
         if opening is not None and np.hypot(*(np.subtract(opening.end, opening.start))) >= 0.8:
             result.add_opening(opening, (i, j))

@@ -22,7 +22,7 @@ from topomerge.datasets.plans.sketch import Sketch, check_size, overlaps
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-KINDS = {  # words in the (pinyin) names
+MALL_KINDS = {  # words in the (pinyin) names
     "xishoujian": "toilets",
     "weishengjian": "toilets",
     "louti": "stairs",
@@ -34,9 +34,9 @@ STANDING = ("xiuxiqu", "zidongfuti", "churukou")  # seats, escalators and entran
 PARKING = re.compile(r"^[A-Z]{0,2}-?\d+$")
 KIOSK = 8.0  # m2; smaller shops are stands in the hall
 INSET = 0.1  # m
-FRONT, DOOR = 2.4, 0.9  # m, of shops and of the others
-REACH = 1.0  # m between a room and the hall it opens to
-NARROW = 0.6  # m; strips of floor between shops that are narrower are no halls
+FRONT, SHOP_DOOR = 2.4, 0.9  # m, of shops and of the others
+SHOP_REACH = 1.0  # m between a room and the hall it opens to
+NARROW_FRONT = 0.6  # m; strips of floor between shops that are narrower are no halls
 DEGREE = 111_320.0  # m
 MALL_BYTES = 50 << 20
 
@@ -108,7 +108,7 @@ def _check_size(floor: shapely.Geometry, path: Path) -> None:
 
 
 def _kind(name: str) -> str:
-    return next((kind for word, kind in KINDS.items() if word in name), "shop")
+    return next((kind for word, kind in MALL_KINDS.items() if word in name), "shop")
 
 
 def _once(result: Sketch) -> None:
@@ -131,7 +131,7 @@ def _halls(result: Sketch, floor: shapely.Geometry, closed: list[shapely.Polygon
     """Add what is left of the floor, and a door from each room to it."""
     rooms = list(result.shapes)
     rest = floor.difference(shapely.union_all([*rooms, *closed]))
-    rest = rest.buffer(-NARROW / 2, join_style="mitre").buffer(NARROW / 2, join_style="mitre").intersection(rest)
+    rest = rest.buffer(-NARROW_FRONT / 2, join_style="mitre").buffer(NARROW_FRONT / 2, join_style="mitre").intersection(rest)
     halls = [p for p in shapely.get_parts(rest) if p.geom_type == "Polygon" and p.area > 20]
     if not halls:
         raise InputError("no doors: the floor has no hall that rooms could open to")
@@ -141,7 +141,7 @@ def _halls(result: Sketch, floor: shapely.Geometry, closed: list[shapely.Polygon
     for i, room in enumerate(rooms):
         shop = result.kinds[i] == "shop"
         for j in np.argsort(shapely.distance(np.array(halls), room)).tolist()[:3]:
-            opening = place_door(room, halls[j], FRONT if shop else DOOR, REACH, None, "door")
+            opening = place_door(room, halls[j], FRONT if shop else SHOP_DOOR, SHOP_REACH, None, "door")
             if opening is not None:
                 result.add_opening(opening, (i, first + j))
                 break

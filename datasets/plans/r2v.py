@@ -23,7 +23,7 @@ from topomerge.datasets.plans.sketch import Sketch, read_limited
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-KINDS = {  # in order of precedence where a face has several labels; our word for each
+APARTMENT_KINDS = {  # in order of precedence where a face has several labels; our word for each
     "living_room": "living",
     "bedroom": "bedroom",
     "kitchen": "kitchen",
@@ -37,13 +37,13 @@ KINDS = {  # in order of precedence where a face has several labels; our word fo
     "balcony": "balcony",
     "PS": "shaft",
 }
-OUTSIDE = ("balcony", "shaft")  # open air and pipe spaces are no rooms
+OUTSIDE_LABELS = ("balcony", "shaft")  # open air and pipe spaces are no rooms
 LIVED_IN = ("bedroom", "living_room", "kitchen")
 HINGED = ("1", "2", "4", "5", "7", "9")  # kinds of opening with an ordinary leaf
-DOOR, BATHTUB, TOILET = 0.75, 1.2, 0.74  # m, usual lengths
+APARTMENT_DOOR, BATHTUB, TOILET = 0.75, 1.2, 0.74  # m, usual lengths
 DOOR_RANGE = (0.7, 0.9)  # m, of the median narrow door
-SNAP = 6.0  # px; walls whose ends miss each other by less are joined
-THICKNESS = 0.12  # m
+PIXEL_SNAP = 6.0  # px; walls whose ends miss each other by less are joined
+APARTMENT_WALL = 0.12  # m
 ARCHIVE_MEMBERS, ARCHIVE_BYTES, PLAN_BYTES = 100_000, 1 << 30, 1 << 20  # of an archive, and of one plan
 
 Rows = list[tuple[Array, str, str]]  # (2, 2) px, category, type
@@ -93,15 +93,15 @@ def sketch(text: bytes) -> Sketch:
         raise InputError("no walls: not a Raster-to-Vector plan")
     scale = _scale(rows)
     walls = walls * scale
-    faces = _faces(walls, SNAP * scale)
+    faces = _faces(walls, PIXEL_SNAP * scale)
     kinds = _kinds(faces, rows, scale)
     _check_seeds(faces, rows, scale)
     result = Sketch(height=2.9, ceiling=2.4)
     rooms = np.full(len(faces) + 1, -1)  # the last one is the answer to index -1: outside
     for i, (face, kind) in enumerate(zip(faces, kinds, strict=True)):
-        if kind not in OUTSIDE:
+        if kind not in OUTSIDE_LABELS:
             rooms[i] = result.add_room(f"{kind or 'room'} {len(result.shapes)}", kind, face)
-    result.walls = [Wall((w[0][0], w[0][1]), (w[1][0], w[1][1]), THICKNESS) for w in walls.tolist()]
+    result.walls = [Wall((w[0][0], w[0][1]), (w[1][0], w[1][1]), APARTMENT_WALL) for w in walls.tolist()]
     _openings(result, rows, scale, faces, rooms, walls)
     return result
 
@@ -134,10 +134,10 @@ def _scale(rows: Rows) -> float:
     if not len(doors):
         raise InputError("zero-width doors: none is longer than 5 px" if any(r[1] == "door" for r in rows) else "no doors")
     narrow = float(np.median(doors))
-    guesses = [DOOR / narrow]
+    guesses = [APARTMENT_DOOR / narrow]
     for category, length in (("bathtub", BATHTUB), ("toilet", TOILET)):
-        found = lengths(category)
-        guesses += [length / float(np.median(found))] if len(found) else []
+        drawn_lengths = lengths(category)
+        guesses += [length / float(np.median(drawn_lengths))] if len(drawn_lengths) else []
     low, high = np.array(DOOR_RANGE) / narrow
     return float(np.clip(np.median(guesses), low, high))
 
@@ -157,13 +157,13 @@ def _faces(walls: Array, snap: float) -> list[shapely.Polygon]:
 
 def _kinds(faces: list[shapely.Polygon], rows: Rows, scale: float) -> list[str]:
     """Kind of each face: that of the seed in it, the most telling one where there are several."""
-    tree, order = shapely.STRtree(faces), list(KINDS)
+    tree, order = shapely.STRtree(faces), list(APARTMENT_KINDS)
     best = np.full(len(faces), len(order))
     for ends, category, _ in rows:
-        if category in KINDS:
+        if category in APARTMENT_KINDS:
             for i in tree.query(shapely.Point(ends.mean(axis=0) * scale), predicate="within"):
                 best[i] = min(best[i], order.index(category))
-    return [KINDS[order[k]] if k < len(order) else "" for k in best]
+    return [APARTMENT_KINDS[order[k]] if k < len(order) else "" for k in best]
 
 
 def _check_seeds(faces: list[shapely.Polygon], rows: Rows, scale: float) -> None:
@@ -181,9 +181,9 @@ def _openings(result: Sketch, rows: Rows, scale: float, faces: list[shapely.Poly
         return
     lines = shapely.linestrings(walls)
     ends = np.array([_on_wall(pair, walls, lines) for pair in ends])
-    faced = sides(ends[:, 0], ends[:, 1], faces, THICKNESS / 2 + 0.3)
+    faced = sides(ends[:, 0], ends[:, 1], faces, APARTMENT_WALL / 2 + 0.3)
     for (start, end), (left, right) in zip(ends, rooms[faced].tolist(), strict=True):
-        opening = doorway("door", start, end, THICKNESS + 0.1)
+        opening = doorway("door", start, end, APARTMENT_WALL + 0.1)
         inner = max(left, right)
         if min(left, right) < 0 <= inner and result.kinds[inner] != "entrance":
             wide = np.hypot(*(end - start)) > 1.5

@@ -12,8 +12,8 @@ from topomerge.types import Array
 
 ROUGH = 1.2  # cells, tolerance of outlines
 BENT = 0.35  # m, that the points of a doorway may lie aside of its line
-NARROW = 0.65  # m; narrower contacts of two rooms are no doors
-SPARE = 0.4  # m, thickness given to a doorway found in a raster
+NARROW_CONTACT = 0.65  # m; narrower contacts of two rooms are no doors
+DOORWAY_THICKNESS = 0.4  # m, thickness given to a doorway found in a raster
 BUSY = 5  # doors from which on a room is a corridor
 
 
@@ -64,7 +64,7 @@ def outline(mask: Array, resolution: float, origin: Array, thin: float = 0.0) ->
 
 def contacts(labels: Array, resolution: float, origin: Array) -> list[tuple[int, int, Array]]:
     """Where regions touch: two labels and the ends (2, 2), m, of the line along the contact; bent contacts are no doorways."""
-    found = []
+    touching = []
     pairs: dict[tuple[int, int], list[Array]] = {}
     for axis in (0, 1):
         a, b = (labels[:-1], labels[1:]) if axis == 0 else (labels[:, :-1], labels[:, 1:])
@@ -79,8 +79,8 @@ def contacts(labels: Array, resolution: float, origin: Array) -> list[tuple[int,
             line = _line(cluster)
             along = (line[1] - line[0]) / max(float(np.hypot(*(line[1] - line[0]))), 1e-9)
             if np.ptp(cluster @ np.array([-along[1], along[0]])) * resolution <= BENT:
-                found.append((first, second, line * resolution + origin))
-    return found
+                touching.append((first, second, line * resolution + origin))
+    return touching
 
 
 def _clusters(points: Array) -> list[Array]:
@@ -128,11 +128,11 @@ def add_rooms(
     return index
 
 
-def add_contacts(result: Sketch, found: list[tuple[int, int, Array]], index: dict[int, int], kind: str) -> None:
+def add_contacts(result: Sketch, doorways: list[tuple[int, int, Array]], index: dict[int, int], kind: str) -> None:
     """Add a doorway for each contact of two rooms."""
-    for a, b, ends in found:
-        if a in index and b in index and np.hypot(*(ends[1] - ends[0])) >= NARROW:
-            result.add_opening(doorway(kind, ends[0], ends[1], SPARE), (index[a], index[b]))
+    for a, b, ends in doorways:
+        if a in index and b in index and np.hypot(*(ends[1] - ends[0])) >= NARROW_CONTACT:
+            result.add_opening(doorway(kind, ends[0], ends[1], DOORWAY_THICKNESS), (index[a], index[b]))
 
 
 def guess_kinds(result: Sketch, usual: str) -> None:

@@ -1,7 +1,7 @@
 """Buildings of the Open-RMF traffic editor (``*.building.yaml``): levels, walls, doors, floors and lifts.
 
 Vertices are pixels of a drawing, y down; ``measurements`` give metres for pairs of them; ``fiducials`` of the same name tie the
-levels together. Rooms are the faces of the walls and doors on the floors; a gap of `GAPS` in a wall is an opening.
+levels together. Rooms are the faces of the walls and doors on the floors; a gap of `OPENING_WIDTHS` in a wall is an opening.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from topomerge.datasets.plans.sketch import Sketch, read_limited
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-THICKNESS = 0.12  # m
-SNAP = 0.12  # m; walls whose ends miss each other by less are joined
-GAPS = (0.5, 3.0)  # m
+RMF_WALL = 0.12  # m
+LINE_SNAP = 0.12  # m; walls whose ends miss each other by less are joined
+OPENING_WIDTHS = (0.5, 3.0)  # m
 ASIDE = 0.15  # m, by which the two sides of a gap may miss each other
 SHAFT = 0.8  # m, from the cabin of a lift through the shaft's wall
 MIN_FACE = 0.8  # m2
 BUSY = 5  # openings from which on a room is a corridor
-STOREY, STOREYS = 3.6, (2.6, 6.0)  # m; elevations further apart are for show
+RMF_STOREY, STOREYS = 3.6, (2.6, 6.0)  # m; elevations further apart are for show
 CEILING = 2.8  # m
-KINDS = {  # words in the names of waypoints
+WAYPOINT_KINDS = {  # words in the names of waypoints
     "kitchen": "kitchen",
     "lobby": "lobby",
     "restaurant": "canteen",
@@ -98,13 +98,13 @@ def sketch(site: dict[str, Any], order: list[str], k: int, stem: str = "") -> Sk
     walls = np.concatenate([walls, *(np.stack([c, np.roll(c, -1, axis=0)], axis=1) for c in shafts)])
     gaps = _gaps(np.concatenate([walls, doors]), walls)
     faces = _faces(np.concatenate([walls, doors, gaps]), level, points, shafts)
-    result = Sketch(inset=THICKNESS / 2, height=_height(site, order, k), ceiling=CEILING)
+    result = Sketch(inset=RMF_WALL / 2, height=_height(site, order, k), ceiling=CEILING)
     for face in faces:
         result.add_room(f"room {len(result.shapes)}", "", face)
-    result.walls = [Wall((a[0], a[1]), (b[0], b[1]), THICKNESS) for a, b in walls.tolist()]
+    result.walls = [Wall((a[0], a[1]), (b[0], b[1]), RMF_WALL) for a, b in walls.tolist()]
     for kind, segments, thickness in (
-        ("door", doors, THICKNESS + 0.1),
-        ("opening", gaps, THICKNESS + 0.1),
+        ("door", doors, RMF_WALL + 0.1),
+        ("opening", gaps, RMF_WALL + 0.1),
         ("door", _lift_doors(site, order, k), SHAFT),
     ):
         ends = sides(segments[:, 0], segments[:, 1], faces, thickness / 2 + 0.3)
@@ -185,31 +185,31 @@ def _lift_doors(site: dict[str, Any], order: list[str], k: int) -> Array:
 
 
 def _gaps(lines: Array, walls: Array) -> Array:
-    """(n, 2, 2) openings without doors: where a wall's loose end looks along the wall at other lines, `GAPS` away."""
+    """(n, 2, 2) openings without doors: where a wall's loose end looks along the wall at other lines, `OPENING_WIDTHS` away."""
     every = shapely.linestrings(lines)
     tree = shapely.STRtree(every)
-    found: list[Array] = []
+    gaps: list[Array] = []
     for i, (start, end) in enumerate(walls):
         along = (end - start) / np.hypot(*(end - start))
         for tip, way in ((end, along), (start, -along)):
-            touching = tree.query(shapely.Point(tip), predicate="dwithin", distance=SNAP)
+            touching = tree.query(shapely.Point(tip), predicate="dwithin", distance=LINE_SNAP)
             if any(j != i for j in touching.tolist()):
                 continue
-            ahead = shapely.LineString([tip + way * 0.02, tip + way * GAPS[1]]).buffer(ASIDE, cap_style="flat")
+            ahead = shapely.LineString([tip + way * 0.02, tip + way * OPENING_WIDTHS[1]]).buffer(ASIDE, cap_style="flat")
             hits = shapely.intersection(every[[j for j in tree.query(ahead, predicate="intersects") if j != i]], ahead)
             lines_to = [np.asarray(shapely.shortest_line(shapely.Point(tip), hit).coords) for hit in hits]
             nearest = min(lines_to, key=lambda line: float(np.hypot(*(line[1] - line[0]))), default=None)
-            if nearest is not None and GAPS[0] <= np.hypot(*(nearest[1] - nearest[0])) <= GAPS[1]:
-                found.append(nearest)
-    middles = [f.mean(axis=0) for f in found]
-    first = [i for i in range(len(found)) if all(np.hypot(*(middles[i] - middles[j])) > SNAP for j in range(i))]
-    return np.array([found[i] for i in first]).reshape(-1, 2, 2)
+            if nearest is not None and OPENING_WIDTHS[0] <= np.hypot(*(nearest[1] - nearest[0])) <= OPENING_WIDTHS[1]:
+                gaps.append(nearest)
+    middles = [f.mean(axis=0) for f in gaps]
+    first = [i for i in range(len(gaps)) if all(np.hypot(*(middles[i] - middles[j])) > LINE_SNAP for j in range(i))]
+    return np.array([gaps[i] for i in first]).reshape(-1, 2, 2)
 
 
 def _faces(lines: Array, level: Level, points: Array, shafts: list[Array]) -> list[shapely.Polygon]:
     """Faces of the lines that lie on the level's floors or are cabins of lifts."""
     along = lines[:, 1] - lines[:, 0]
-    along = along / np.linalg.norm(along, axis=1, keepdims=True) * SNAP
+    along = along / np.linalg.norm(along, axis=1, keepdims=True) * LINE_SNAP
     longer = np.stack([lines[:, 0] - along, lines[:, 1] + along], axis=1)
     noded = shapely.node(shapely.multilinestrings(shapely.linestrings(longer)))
     faces = [f for f in shapely.get_parts(shapely.polygonize([noded])) if not f.buffer(-0.3).is_empty and f.area > MIN_FACE]
@@ -225,9 +225,9 @@ def _faces(lines: Array, level: Level, points: Array, shafts: list[Array]) -> li
 
 def _height(site: dict[str, Any], order: list[str], k: int) -> float:
     if k + 1 == len(order):
-        return STOREY
+        return RMF_STOREY
     here, above = (float(site["levels"][order[i]].get("elevation", 0)) for i in (k, k + 1))
-    return above - here if STOREYS[0] <= above - here <= STOREYS[1] else STOREY
+    return above - here if STOREYS[0] <= above - here <= STOREYS[1] else RMF_STOREY
 
 
 def _name(result: Sketch, level: Level, points: Array, shafts: list[Array], stem: str) -> None:
@@ -239,10 +239,10 @@ def _name(result: Sketch, level: Level, points: Array, shafts: list[Array], stem
                 result.names[i] = str(vertex[3])
     openings = np.bincount(np.array([e for ends in result.ends for e in ends if e >= 0], int), minlength=len(result.shapes))
     for i, shape in enumerate(result.shapes):
-        word = next((w for w in KINDS if w in result.names[i].lower()), "")
+        word = next((w for w in WAYPOINT_KINDS if w in result.names[i].lower()), "")
         usual = "corridor" if openings[i] >= BUSY else USUAL.get(stem, "")
         lift = any(shape.contains(shapely.Point(corners.mean(axis=0))) and shape.area < 20 for corners in shafts)
-        result.kinds[i] = "lift" if lift else KINDS.get(word, usual)
+        result.kinds[i] = "lift" if lift else WAYPOINT_KINDS.get(word, usual)
 
 
 def _flight(corners: Array) -> Flight:

@@ -22,9 +22,9 @@ from topomerge.datasets.plans.doors import sides
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-MAX_OVERLAP = 0.02  # share of the smaller room
+SKETCH_OVERLAP = 0.02  # share of the smaller room
 MIN_TOTAL, MAX_TOTAL = 8.0, 60_000.0  # m2 of a storey's rooms
-NARROW, WIDE = 0.5, 3.5  # m, plausible median width of a storey's doors
+NARROWEST_DOORS, WIDEST_DOORS = 0.5, 3.5  # m, plausible median width of a storey's doors
 SLIT = 2e-4  # m, width of the cut from a hole to the outline: below the grid of `solids`, which closes it again
 TOLERANCE = 0.02  # m, of simplified outlines
 MIN_SHARE = 0.5  # of the floor that the largest connected part must hold
@@ -101,18 +101,18 @@ def finish(sketch: Sketch) -> tuple[Plan, list[str]]:
     shapes = [_largest(shape.difference(solid).simplify(TOLERANCE)) for shape in shapes]
     _check_overlap(shapes, sketch.names)
     passable = _check_doors(sketch) & _verified(sketch, shapes)
-    kept = _connected(sketch, shapes, passable)
-    stays = np.array([_stays(ends, kept) for ends in sketch.ends], bool)
+    connected = _connected(sketch, shapes, passable)
+    stays = np.array([_stays(ends, connected) for ends in sketch.ends], bool)
     walked = np.array([opening.kind != "window" for opening in sketch.openings], bool)
     lost = int((stays & walked & ~passable).sum())
     if lost:
         notes.append(f"left out {lost} doors that are too narrow or too wide or do not lead where they should")
-    if int(kept.sum()) < len(shapes):
-        notes.append(f"kept {int(kept.sum())} of {len(shapes)} rooms: the largest part that doors connect")
-    _check_scale([shape for shape, keep in zip(shapes, kept, strict=True) if keep])
+    if int(connected.sum()) < len(shapes):
+        notes.append(f"kept {int(connected.sum())} of {len(shapes)} rooms: the largest part that doors connect")
+    _check_scale([shape for shape, keep in zip(shapes, connected, strict=True) if keep])
     rooms = tuple(
         PlanRoom(name, outline(shape), kind)
-        for name, kind, shape, keep in zip(sketch.names, sketch.kinds, shapes, kept, strict=True)
+        for name, kind, shape, keep in zip(sketch.names, sketch.kinds, shapes, connected, strict=True)
         if keep
     )
     openings = tuple(o for o, good in zip(sketch.openings, stays & (passable | ~walked), strict=True) if good)
@@ -172,13 +172,13 @@ def overlaps(shapes: Sequence[shapely.Polygon]) -> list[tuple[int, int, float]]:
     """Pairs i < j of shapes and the share of the smaller one that lies in the other, where that is above 2 %."""
     tree = shapely.STRtree(shapes)
     first, second = tree.query(shapes, predicate="intersects")
-    found = []
+    overlapping = []
     for i, j in zip(first.tolist(), second.tolist(), strict=True):
         if i < j:
             share = shapes[i].intersection(shapes[j]).area / max(min(shapes[i].area, shapes[j].area), 1e-9)
-            if share > MAX_OVERLAP:
-                found.append((i, j, float(share)))
-    return found
+            if share > SKETCH_OVERLAP:
+                overlapping.append((i, j, float(share)))
+    return overlapping
 
 
 def _check_overlap(shapes: Sequence[shapely.Polygon], names: Sequence[str]) -> None:
@@ -195,7 +195,7 @@ def _check_doors(sketch: Sketch) -> Array:
     if (width[walked] < 0.01).all():
         raise InputError("zero-width doors: every door's ends coincide")
     median = float(np.median(width[walked & (width >= 0.01)]))
-    if not NARROW <= median <= WIDE:
+    if not NARROWEST_DOORS <= median <= WIDEST_DOORS:
         raise InputError(f"absurd scale: half of the doors are narrower than {median:.2f} m")
     return walked & (width >= MIN_DOOR) & (width <= MAX_DOOR)
 
@@ -219,28 +219,28 @@ def _connected(sketch: Sketch, shapes: Sequence[shapely.Polygon], passable: Arra
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
     part = connected_components(graph, directed=False)[1]
     best = np.lexsort((np.bincount(part, areas), np.bincount(part, large)))[-1]
-    kept: Array = (part == best) & large
-    if kept.sum() < 2:
+    connected: Array = (part == best) & large
+    if connected.sum() < 2:
         raise InputError(f"disconnected: no door joins two of the {count} rooms")
-    share = areas[kept].sum() / areas.sum()
+    share = areas[connected].sum() / areas.sum()
     if share < MIN_SHARE:
         raise InputError(f"disconnected: the largest part that doors join holds {share:.0%} of the floor")
-    return kept
+    return connected
 
 
 def _verified(sketch: Sketch, shapes: Sequence[shapely.Polygon]) -> Array:
     """(n,) bool: does one find the two rooms of an opening on its two sides?"""
-    found = sides(
+    joined_rooms = sides(
         np.array([o.start for o in sketch.openings]),
         np.array([o.end for o in sketch.openings]),
         shapes,
         np.array([o.thickness / 2 + 0.3 for o in sketch.openings]),
     )
     wanted = np.array(sketch.ends, np.int64).reshape(-1, 2)
-    good: Array = (np.sort(found, axis=1) == np.sort(wanted, axis=1)).all(axis=1)
+    good: Array = (np.sort(joined_rooms, axis=1) == np.sort(wanted, axis=1)).all(axis=1)
     return good
 
 
-def _stays(ends: tuple[int, int], kept: Array) -> bool:
+def _stays(ends: tuple[int, int], connected: Array) -> bool:
     """Openings stay between kept rooms, and from a kept room to outside."""
-    return all(e < 0 or kept[e] for e in ends) and any(e >= 0 for e in ends)
+    return all(e < 0 or connected[e] for e in ends) and any(e >= 0 for e in ends)

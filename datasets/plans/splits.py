@@ -41,7 +41,7 @@ TEST_ONLY = {
     "ipad": ("ipad_lidar_rooms",),
     "libpointmatcher": ("pair_libpointmatcher_apartment",),
 }
-SEEDS = {"train": (0, 799_999), "validation": (800_000, 899_999), "test": (900_000, 999_999)}
+SPLIT_SEEDS = {"train": (0, 799_999), "validation": (800_000, 899_999), "test": (900_000, 999_999)}
 SHARES = {"validation": 0.1, "test": 0.1}  # of the plans of a source; the rest is for training
 
 
@@ -128,7 +128,7 @@ def write_lists(data: Path, folder: Path) -> None:
 
     from topomerge.io.atomic import replacing
 
-    lines: dict[str, list[str]] = {split: [f"procedural/{a}..{b}"] for split, (a, b) in SEEDS.items()}
+    lines: dict[str, list[str]] = {split: [f"procedural/{a}..{b}"] for split, (a, b) in SPLIT_SEEDS.items()}
     lines["test"] += [f"{source}/*" for source in TEST_ONLY]
     for source, name in FOLDERS.items():
         taken = {n: plan for n, plan in iter_plans(data / name) if not isinstance(plan, Refusal)}

@@ -21,15 +21,15 @@ from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.public.sources import SPACING, framed_pair
+from topomerge.datasets.public.sources import POINT_SPACING, framed_pair
 
 from topomerge.errors import InputError
 from topomerge.io.points import read_points
 from topomerge.types import Array, Sim3
 
-UP = "-y"
+MAP_UP = "-y"
 SUFFIXES = (".ply", ".obj", ".stl")
-LARGEST = 1 << 20  # bytes of the list of poses
+LARGEST_POSES = 1 << 20  # bytes of the list of poses
 NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 POSE = re.compile(r"(\S+)\s+\[" + r"\s*,\s*".join([rf"\(({NUMBER})\s*,\s*({NUMBER})\)"] * 4) + r"\]\s*")
 
@@ -58,16 +58,16 @@ def _refuse(error: InputError) -> Pair:
 
 
 def _pair(building: Path, a: str, b: str) -> Pair:
-    one, other = (read_points(_mesh(building, name), up=UP, spacing=SPACING) for name in (a, b))
+    one, other = (read_points(_mesh(building, name), up=MAP_UP, spacing=POINT_SPACING) for name in (a, b))
     name = f"{building.name}/{a}-{b}"
     return framed_pair(one, other, Sim3(), name, "cslamd", building.name, "phone", zlib.crc32(name.encode()))
 
 
 def _mesh(building: Path, name: str) -> Path:
-    found = sorted(p for p in building.glob(f"meshes/**/{name}*") if p.suffix.lower() in SUFFIXES)
-    if not found:
+    meshes = sorted(p for p in building.glob(f"meshes/**/{name}*") if p.suffix.lower() in SUFFIXES)
+    if not meshes:
         raise InputError(f"{building / 'meshes'}: has no mesh of {name}; fetch {building.name}-meshes.zip")
-    return found[0]
+    return meshes[0]
 
 
 def read_poses(path: Path) -> dict[str, Array]:
@@ -76,20 +76,20 @@ def read_poses(path: Path) -> dict[str, Array]:
     Raises:
         InputError: too large, a damaged line, or no rotation.
     """
-    if path.stat().st_size > LARGEST:
+    if path.stat().st_size > LARGEST_POSES:
         raise InputError(f"{path}: is too large for a list of poses")
     out = {}
     for number, line in enumerate(path.read_text(encoding="latin-1").splitlines(), 1):
         if not line.strip():
             continue
-        found = POSE.fullmatch(line)
+        pose = POSE.fullmatch(line)
         try:
-            values = np.array([float(v) for v in found.groups()[1:]]) if found else np.zeros(8)
+            values = np.array([float(v) for v in pose.groups()[1:]]) if pose else np.zeros(8)
         except ValueError:
             values = np.zeros(8)
-        if found is None or abs(float(np.linalg.norm(values[::2])) - 1) > 0.01:
+        if pose is None or abs(float(np.linalg.norm(values[::2])) - 1) > 0.01:
             raise InputError(f"{path}: line {number} is no name with a pose [(w,w'),(x,x'),(y,y'),(z,z')]; copy it again")
-        out[found[1]] = dual_quaternion(values[::2], values[1::2])
+        out[pose[1]] = dual_quaternion(values[::2], values[1::2])
     return out
 
 

@@ -15,20 +15,20 @@ from pathlib import Path
 import numpy as np
 from topomerge.datasets.pairs.flat import rooms_at
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.public.sources import SPACING, join_rooms, part_pairs
+from topomerge.datasets.public.sources import POINT_SPACING, join_rooms, part_pairs
 
 from topomerge.errors import InputError
 from topomerge.io.points import read_points
 from topomerge.types import Array, PointCloud, TrueRoom
 
-KINDS = {
+REGION_KINDS = {
     "a": "bath", "b": "bedroom", "c": "closet", "d": "dining", "e": "lobby", "f": "living", "g": "garage", "h": "corridor",
     "i": "library", "j": "laundry", "k": "kitchen", "l": "living", "m": "meeting", "n": "lounge", "o": "office", "p": "outside",
     "r": "games", "s": "stairs", "t": "toilets", "u": "storage", "v": "tv", "w": "gym", "x": "outside", "y": "outside",
     "B": "bar", "C": "classroom", "D": "dining", "S": "spa",
 }  # fmt: skip
 JUNK = ("Z",)  # reflections and stray points
-LARGEST = 100 << 20  # bytes of a .house file
+LARGEST_HOUSE = 100 << 20  # bytes of a .house file
 
 
 def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
@@ -70,7 +70,7 @@ def read_regions(path: Path) -> dict[int, TrueRoom]:
     Raises:
         InputError: missing, damaged, or with fewer regions than its first line says.
     """
-    if not path.is_file() or path.stat().st_size > LARGEST:
+    if not path.is_file() or path.stat().st_size > LARGEST_HOUSE:
         raise InputError(f"{path}: no such file, or far too large; copy it again")
     lines = [line.split() for line in path.read_text(encoding="latin-1").splitlines()]
     try:
@@ -94,13 +94,13 @@ def read_regions(path: Path) -> dict[int, TrueRoom]:
 def _room(words: list[str], outline: list[list[float]] | None) -> TrueRoom:
     x0, y0, z0, x1, y1, z1 = (float(v) for v in words[9:15])
     polygon = np.array(outline or [[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-    return TrueRoom(f"region{words[1]}", polygon, z0, z1, int(words[2]), KINDS.get(words[5], ""))
+    return TrueRoom(f"region{words[1]}", polygon, z0, z1, int(words[2]), REGION_KINDS.get(words[5], ""))
 
 
 def _points(path: Path) -> Array:
     if not path.is_file():
         raise InputError(f"{path}: no such file; copy the house again")
-    cloud = read_points(path, spacing=SPACING)
+    cloud = read_points(path, spacing=POINT_SPACING)
     return cloud.points.astype(np.float64) + cloud.shift
 
 
@@ -111,6 +111,6 @@ def _within(points: Array, rooms: list[TrueRoom]) -> Array:
         here = [k for k, room in enumerate(rooms) if room.storey == storey]
         low, high = min(rooms[k].floor for k in here) - 0.1, max(rooms[k].ceiling for k in here) + 0.1
         rows = np.flatnonzero((points[:, 2] >= low) & (points[:, 2] <= high) & (out < 0))
-        found = rooms_at(points[rows, :2], [rooms[k] for k in here])
-        out[rows] = np.where(found >= 0, np.array(here)[found], -1)
+        nearest = rooms_at(points[rows, :2], [rooms[k] for k in here])
+        out[rows] = np.where(nearest >= 0, np.array(here)[nearest], -1)
     return out

@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.public.sources import SPACING, framed_pair, read_json
+from topomerge.datasets.public.sources import POINT_SPACING, framed_pair, read_json
 
 from topomerge.errors import InputError
 from topomerge.io.points import read_points
 from topomerge.types import Array, PointCloud, Sim3
 
 MESHES = ("mesh.refined.v2.obj", "mesh.refined.obj", "labels.instances.annotated.v2.ply", "labels.instances.annotated.ply")
-FARTHEST = 50.0  # m between the frames of two scans of a room; numbers beyond are mm
+FARTHEST_LEAN = 50.0  # m between the frames of two scans of a room; numbers beyond are mm
 TILT = 10.0  # degrees; a transform that leans more is wrong
 
 
@@ -50,12 +50,12 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
 def _pair(folder: Path, a: str, b: str, transform: Any) -> Pair:
     if transform is None:
         raise InputError(f"{b}: no transform is published (hidden test set)")
-    known, lean = upright(read_transform(transform, b))
+    published, lean = upright(read_transform(transform, b))
     first, second = _read(folder / a), _read(folder / b)
     points = (second.points.astype(np.float64) + second.shift) @ lean.T
     second = PointCloud(points.astype(np.float32), source=second.source)
     name = f"{a[:8]}-{b[:8]}"
-    return framed_pair(first, second, known, name, "rscan", a, "depth", zlib.crc32(name.encode()))
+    return framed_pair(first, second, published, name, "rscan", a, "depth", zlib.crc32(name.encode()))
 
 
 def read_transform(numbers: Any, name: str) -> Array:
@@ -68,7 +68,7 @@ def read_transform(numbers: Any, name: str) -> Array:
         matrix = np.array(numbers, float).reshape(4, 4).T.copy()
     except (ValueError, TypeError) as error:
         raise InputError(f"{name}: its transform is no list of 16 numbers; copy 3RScan.json again") from error
-    if np.abs(matrix[:3, 3]).max() > FARTHEST:
+    if np.abs(matrix[:3, 3]).max() > FARTHEST_LEAN:
         matrix[:3, 3] /= 1000
     turn = matrix[:3, :3]
     if not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-4) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-2):
@@ -84,16 +84,16 @@ def upright(matrix: Array) -> tuple[Sim3, Array]:
     """
     turn = matrix[:3, :3]
     yaw = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
-    known = Sim3(yaw, tuple(matrix[:3, 3].tolist()))
+    published = Sim3(yaw, tuple(matrix[:3, 3].tolist()))
     lean = Sim3(-yaw).matrix[:3, :3] @ turn
     degrees = np.degrees(np.arccos(np.clip(lean[2, 2], -1, 1)))
     if degrees > TILT:
         raise InputError(f"its transform leans by {degrees:.0f}°; maps of one gravity don't")
-    return known, lean
+    return published, lean
 
 
 def _read(folder: Path) -> PointCloud:
     mesh = next((folder / name for name in MESHES if (folder / name).is_file()), None)
     if mesh is None:
         raise InputError(f"{folder}: has none of {', '.join(MESHES[:2])}; copy the scan again")
-    return read_points(mesh, spacing=SPACING)
+    return read_points(mesh, spacing=POINT_SPACING)

@@ -23,8 +23,14 @@ from topomerge.datasets.public.sources import hull, join_rooms, part_pairs
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, TrueRoom
 
-KINDS = {"conferenceRoom": "meeting", "hallway": "corridor", "WC": "toilets", "copyRoom": "storage", "openspace": "openplan"}
-LARGEST = 1 << 30  # bytes of a table
+S3DIS_KINDS = {
+    "conferenceRoom": "meeting",
+    "hallway": "corridor",
+    "WC": "toilets",
+    "copyRoom": "storage",
+    "openspace": "openplan",
+}
+LARGEST_TABLE = 1 << 30  # bytes of a table
 CONTROL = bytes(set(range(32)) - set(b"\t\n\r"))
 
 
@@ -51,7 +57,7 @@ def read_area(area: Path) -> PointCloud:
         try:
             points = read_room(folder)
             name = folder.name
-            kind = KINDS.get(name.rpartition("_")[0], name.rpartition("_")[0])
+            kind = S3DIS_KINDS.get(name.rpartition("_")[0], name.rpartition("_")[0])
             floor, ceiling = np.percentile(points[:, 2], [1, 99]).tolist()
             parts.append((TrueRoom(name, hull(points), floor, ceiling, 0, kind), points))
         except InputError as error:
@@ -75,8 +81,8 @@ def read_room(folder: Path) -> Array:
 
 
 def _table(path: Path) -> Array:
-    if not 0 < path.stat().st_size <= LARGEST:
-        raise InputError(f"{path}: has {path.stat().st_size} bytes; a table of points has 1 to {LARGEST}")
+    if not 0 < path.stat().st_size <= LARGEST_TABLE:
+        raise InputError(f"{path}: has {path.stat().st_size} bytes; a table of points has 1 to {LARGEST_TABLE}")
     text = path.read_bytes().translate(None, delete=CONTROL)
     try:
         rows = np.loadtxt(io.BytesIO(text), np.float64, usecols=(0, 1, 2, 5), ndmin=2)[:, :3]

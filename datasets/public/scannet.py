@@ -27,7 +27,7 @@ from topomerge.io.points import read_points
 from topomerge.types import Array, PointCloud, TrueRoom
 
 NAME = re.compile(r"scene\d{4}_\d\d")
-LARGEST = 1 << 20  # bytes of the table of values
+LARGEST_VALUES = 1 << 20  # bytes of the table of values
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ def read_scene(folder: Path) -> Scene:
 
 def _values(path: Path) -> tuple[Array, str]:
     """Alignment (4, 4) and kind of a scan; the identity and nothing where they are not published."""
-    if not path.is_file() or path.stat().st_size > LARGEST:
+    if not path.is_file() or path.stat().st_size > LARGEST_VALUES:
         return np.eye(4), ""
     lines = [line.partition("=") for line in path.read_text(encoding="latin-1").splitlines()]
     values = {key.strip(): value.strip() for key, _, value in lines}

@@ -8,7 +8,8 @@
 | `cslamd` | `Flat`, `House`, `Lab`, `Priory` | two sequences of a building |
 | `scannet` | a folder a scan | none: no truth is published; `scannet.places` groups the scans of a place |
 
-`cslamd` maps an assumption or two; see there.
+Each is a module `topomerge.datasets.public.<source>` with a function ``pairs(folder)``, which gives the name and the maker of
+each pair, as the sources of `datasets.real` do. `cslamd` maps an assumption or two; see there.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ from topomerge.datasets.simulation.scanner import moved
 from topomerge.errors import InputError
 from topomerge.types import Array, PointCloud, Sim3, TrueRoom
 
-SOURCES = ("s3dis", "matterport", "rscan", "cslamd")
-SPACING = 0.05  # m between the points that are kept
+PUBLIC_SOURCES = ("s3dis", "matterport", "rscan", "cslamd")
+POINT_SPACING = 0.05  # m between the points that are kept
 LARGEST_JSON = 500 << 20  # bytes
-BESIDE = 0.35  # m; rooms with points that near each other are neighbours
-TOUCH = 5  # points that must be that near
-PART = 0.6  # share of the rooms that each of two parts has at most
-LEAST = 4  # rooms that can be cut into two parts
+NEIGHBOUR_DISTANCE = 0.35  # m; rooms with points that near each other are neighbours
+TOUCHING_POINTS = 5  # points that must be that near
+PART_SHARE = 0.6  # share of the rooms that each of two parts has at most
+LEAST_ROOMS_TO_CUT = 4  # rooms that can be cut into two parts
 
 
 def iter_public_pairs(folder: str | Path, source: str) -> Iterator[tuple[str, Pair | Refusal]]:
@@ -50,8 +51,8 @@ def iter_public_pairs(folder: str | Path, source: str) -> Iterator[tuple[str, Pa
     Raises:
         InputError: no such folder or source.
     """
-    if source not in SOURCES:
-        raise InputError(f"source {source!r}: {', '.join(SOURCES)} are possible")
+    if source not in PUBLIC_SOURCES:
+        raise InputError(f"source {source!r}: {', '.join(PUBLIC_SOURCES)} are possible")
     if not Path(folder).is_dir():
         raise InputError(f"{folder}: no such folder; give the one that holds the data set")
     return collect(source, import_module(f"topomerge.datasets.public.{source}").pairs(Path(folder)))
@@ -74,11 +75,11 @@ def read_json(path: Path) -> Any:
 
 
 def join_rooms(parts: Sequence[tuple[TrueRoom, Array]], source: str) -> PointCloud:
-    """One cloud of rooms and their points (n, 3), thinned to `SPACING`."""
-    kept = [thin(points, SPACING) for _, points in parts]
-    points = np.concatenate(kept)
+    """One cloud of rooms and their points (n, 3), thinned to `POINT_SPACING`."""
+    thinned = [thin(points, POINT_SPACING) for _, points in parts]
+    points = np.concatenate(thinned)
     shift = np.round(points.mean(axis=0), 0) if np.abs(points).max() > 1000 else np.zeros(3)
-    labels = np.repeat(np.arange(len(parts)), [len(p) for p in kept]).astype(np.int32)
+    labels = np.repeat(np.arange(len(parts)), [len(p) for p in thinned]).astype(np.int32)
     rooms = tuple(room for room, _ in parts)
     return PointCloud((points - shift).astype(np.float32), shift, labels=labels, rooms=rooms, source=source)
 
@@ -121,8 +122,8 @@ def cut_pair(cloud: PointCloud, name: str, source: str, sensor: str, seed: int) 
 
 def _only(cloud: PointCloud, rooms: Sequence[int]) -> PointCloud:
     assert cloud.labels is not None
-    kept = np.isin(cloud.labels, rooms)
-    return replace(cloud, points=cloud.points[kept], labels=cloud.labels[kept])
+    in_rooms = np.isin(cloud.labels, rooms)
+    return replace(cloud, points=cloud.points[in_rooms], labels=cloud.labels[in_rooms])
 
 
 def room_neighbours(cloud: PointCloud) -> dict[int, set[int]]:
@@ -132,9 +133,13 @@ def room_neighbours(cloud: PointCloud) -> dict[int, set[int]]:
     out: dict[int, set[int]] = {i: set() for i in trees}
     for i, tree in trees.items():
         for j, other in trees.items():
-            if i < j and (tree.maxes + BESIDE >= other.mins).all() and (other.maxes + BESIDE >= tree.mins).all():
-                near = np.isfinite(other.query(tree.data, distance_upper_bound=BESIDE)[0])
-                if near.sum() >= TOUCH:
+            if (
+                i < j
+                and (tree.maxes + NEIGHBOUR_DISTANCE >= other.mins).all()
+                and (other.maxes + NEIGHBOUR_DISTANCE >= tree.mins).all()
+            ):
+                near = np.isfinite(other.query(tree.data, distance_upper_bound=NEIGHBOUR_DISTANCE)[0])
+                if near.sum() >= TOUCHING_POINTS:
                     out[i].add(j)
                     out[j].add(i)
     return out
@@ -144,12 +149,12 @@ def two_parts(neighbours: dict[int, set[int]], rng: np.random.Generator) -> tupl
     """Two connected sets of rooms that share a connected core.
 
     Raises:
-        InputError: fewer than `LEAST` rooms hang together.
+        InputError: fewer than `LEAST_ROOMS_TO_CUT` rooms hang together.
     """
     whole = max((grow(neighbours, [i], len(neighbours), rng) for i in sorted(neighbours)), key=len, default=[])
-    if len(whole) < LEAST:
-        raise InputError(f"only {len(whole)} rooms hang together; {LEAST} are needed to cut two parts")
-    count = max(int(PART * len(whole)), 2)
+    if len(whole) < LEAST_ROOMS_TO_CUT:
+        raise InputError(f"only {len(whole)} rooms hang together; {LEAST_ROOMS_TO_CUT} are needed to cut two parts")
+    count = max(int(PART_SHARE * len(whole)), 2)
     for _ in range(50):
         a = grow(neighbours, [int(rng.choice(whole))], count, rng)
         edge = [i for i in a if neighbours[i] - set(a)]
@@ -173,11 +178,13 @@ def grow(neighbours: dict[int, set[int]], start: list[int], count: int, rng: np.
     return out
 
 
-def framed_pair(a: PointCloud, b: PointCloud, known: Sim3, name: str, source: str, building: str, sensor: str, seed: int) -> Pair:
-    """Two clouds whose relation `known` (b into a) is published, moved into random frames."""
+def framed_pair(
+    a: PointCloud, b: PointCloud, published: Sim3, name: str, source: str, building: str, sensor: str, seed: int
+) -> Pair:
+    """Two clouds whose relation (b into a) is `published`, moved into random frames."""
     frames = draw_frames(2, False, np.random.default_rng(seed))
-    truth = frames[0] @ known @ frames[1].inverse()
+    truth = frames[0] @ published @ frames[1].inverse()
     flat = [c.points[:, :2].astype(np.float64) + c.shift[:2] for c in (a, b)]
-    there = known.apply(np.column_stack([flat[1], np.zeros(len(flat[1]))]))[:, :2]
+    there = published.apply(np.column_stack([flat[1], np.zeros(len(flat[1]))]))[:, :2]
     clouds = moved(a, frames[0]), moved(b, frames[1])
     return Pair(name, *clouds, truth, (), floor_overlap(flat[0], there), (sensor, sensor), source, building)

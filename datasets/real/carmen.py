@@ -20,17 +20,16 @@ from topomerge.datasets.pairs.pairs import Pair, draw_frames
 from topomerge.errors import InputError
 from topomerge.types import Array, Sim3
 
-FOLDER = "carmen_logs"
 SPANS = {"first": (0.0, 0.5), "middle": (0.25, 0.75), "last": (0.5, 1.0)}  # shares of the log
 PAIRS = (("first", "middle"), ("middle", "last"), ("first", "last"))
-CELL = 0.05  # m
-REACH = 15.0  # m; farther returns of a sweep of 1° lie too far apart to draw a wall
+LOG_CELL = 0.05  # m
+LASER_REACH = 15.0  # m; farther returns of a sweep of 1° lie too far apart to draw a wall
 NEAREST, FAILED = 0.1, 40.0  # m; ranges beyond are what a laser says when nothing comes back: nothing is known then
-BLOCK = 64  # scans at a time
+SCAN_BLOCK = 64  # scans at a time
 SOLID = 0.25  # share of the rays into a cell that must end there for it to be a wall
-LARGEST = 200 << 20  # bytes of an unpacked log
-FEWEST = 20  # scans of a part
-CELLS = 200_000_000  # of a raster
+LARGEST_LOG = 200 << 20  # bytes of an unpacked log
+FEWEST_SCANS = 20  # scans of a part
+LOG_CELLS = 200_000_000  # of a raster
 
 
 def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
@@ -70,8 +69,8 @@ def split(count: int, a: str, b: str) -> tuple[Array, Array]:
     first, second = (np.arange(*(round(end * count) for end in SPANS[part])) for part in (a, b))
     both = np.intersect1d(first, second)
     rows = np.setdiff1d(first, both[1::2]), np.setdiff1d(second, both[::2])
-    if min(map(len, rows)) < FEWEST:
-        raise InputError(f"a log of {count} scans is too short: {FEWEST} a part are needed")
+    if min(map(len, rows)) < FEWEST_SCANS:
+        raise InputError(f"a log of {count} scans is too short: {FEWEST_SCANS} a part are needed")
     return rows
 
 
@@ -83,11 +82,11 @@ def read_log(path: Path) -> tuple[Array, Array]:
     """
     try:
         with gzip.open(path) as stream:
-            text = stream.read(LARGEST + 1)
+            text = stream.read(LARGEST_LOG + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: can't be unpacked ({error}); copy it again") from error
-    if len(text) > LARGEST:
-        raise InputError(f"{path}: unpacks to more than {LARGEST >> 20} MB; is it a log?")
+    if len(text) > LARGEST_LOG:
+        raise InputError(f"{path}: unpacks to more than {LARGEST_LOG >> 20} MB; is it a log?")
     poses: list[Array] = []
     ranges: list[Array] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -127,29 +126,31 @@ def draw(poses: Array, ranges: Array, frame: Sim3, source: str = "") -> Flat:
     angles = np.radians(np.arange(beams) * (180.0 / (beams - beams % 2)) - 90.0)
     x, y = frame.apply(np.column_stack([poses[:, :2], np.zeros(len(poses))]))[:, :2].T
     yaw = poses[:, 2] + frame.yaw
-    low = np.array([x.min(), y.min()]) - REACH - 1.0
-    wide, high = np.ceil((np.array([x.max(), y.max()]) + REACH + 1.0 - low) / CELL).astype(int)
-    if not float(wide) * float(high) < CELLS:
-        raise InputError(f"{source}: its poses span {wide * CELL:.0f} by {high * CELL:.0f} m; is it a log of one building?")
+    low = np.array([x.min(), y.min()]) - LASER_REACH - 1.0
+    wide, high = np.ceil((np.array([x.max(), y.max()]) + LASER_REACH + 1.0 - low) / LOG_CELL).astype(int)
+    if not float(wide) * float(high) < LOG_CELLS:
+        raise InputError(
+            f"{source}: its poses span {wide * LOG_CELL:.0f} by {high * LOG_CELL:.0f} m; is it a log of one building?"
+        )
     ended, crossed = (np.zeros(wide * high, np.int32) for _ in range(2))
-    for start in range(0, len(poses), BLOCK):
-        block = slice(start, start + BLOCK)
+    for start in range(0, len(poses), SCAN_BLOCK):
+        block = slice(start, start + SCAN_BLOCK)
         origins = np.stack([x[block], y[block]], axis=1) - low
         for counts, points in zip((ended, crossed), _rays(origins, yaw[block, None] + angles, ranges[block]), strict=True):
-            cells = np.floor(points / CELL).astype(np.int64)
+            cells = np.floor(points / LOG_CELL).astype(np.int64)
             counts += np.bincount(cells[:, 1] * wide + cells[:, 0], minlength=wide * high).astype(np.int32)
     wall = (ended > 0) & (ended >= SOLID * (ended + crossed))
     at = [np.stack(np.divmod(np.flatnonzero(m), wide)[::-1], axis=1) for m in (wall, (crossed > 0) & ~wall)]
-    walls, free = ((cells + 0.5) * CELL + low for cells in at)
-    return Flat(walls, free, CELL, poses=np.column_stack([x, y, yaw]), source=source)
+    walls, free = ((cells + 0.5) * LOG_CELL + low for cells in at)
+    return Flat(walls, free, LOG_CELL, poses=np.column_stack([x, y, yaw]), source=source)
 
 
 def _rays(origins: Array, headings: Array, ranges: Array) -> tuple[Array, Array]:
-    """Where the rays (n, k) of n scans ended within `REACH`, and points on the way there, one a cell: (m, 2) each."""
+    """Where the rays (n, k) of n scans ended within `LASER_REACH`, and points on the way there, one a cell: (m, 2) each."""
     good = (ranges > NEAREST) & (ranges < FAILED)
     scan = np.nonzero(good)[0]
     far, ray = ranges[good], np.stack([np.cos(headings[good]), np.sin(headings[good])], axis=1)
-    hit = far < REACH
-    steps = np.arange(0.0, REACH, CELL)
-    row, step = np.nonzero(steps < np.minimum(far, REACH)[:, None] - 1.5 * CELL)
+    hit = far < LASER_REACH
+    steps = np.arange(0.0, LASER_REACH, LOG_CELL)
+    row, step = np.nonzero(steps < np.minimum(far, LASER_REACH)[:, None] - 1.5 * LOG_CELL)
     return origins[scan[hit]] + ray[hit] * far[hit, None], origins[scan[row]] + ray[row] * steps[step, None]

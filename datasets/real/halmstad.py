@@ -19,9 +19,8 @@ from topomerge.datasets.pairs.pairs import Pair
 from topomerge.errors import InputError
 from topomerge.types import Array, Sim3
 
-FOLDER = "halmstad_robot_maps"
 PIXEL = 0.02  # m
-LARGEST = 10 << 20  # bytes of the list of pairs
+LARGEST_LISTING = 10 << 20  # bytes of the list of pairs
 
 
 def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
@@ -31,16 +30,16 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
         InputError: the list of pairs is missing or damaged.
     """
     path = folder / "ground_truth_pairs.json"
-    if not path.is_file() or path.stat().st_size > LARGEST:
+    if not path.is_file() or path.stat().st_size > LARGEST_LISTING:
         raise InputError(f"{path}: no such file, or far too large; copy the data set again")
     try:
         listed = json.loads(path.read_bytes())
         points = {name: np.array(p, float).reshape(-1, 2) for name, p in listed["keypoints_px"].items()}
-        found = [(str(p["a"]), str(p["b"]), np.array(p["idx"], int).reshape(-1, 2)) for p in listed["pairs"]]
+        truths = [(str(p["a"]), str(p["b"]), np.array(p["idx"], int).reshape(-1, 2)) for p in listed["pairs"]]
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: is not a list of key points and pairs ({error}); copy it again") from error
     read, done = cache(partial(_read, folder)), set()
-    for a, b, same in found:
+    for a, b, same in truths:
         if frozenset((a, b)) not in done:
             done.add(frozenset((a, b)))
             yield f"{a}-{b}", partial(_pair, read, points, a, b, same)

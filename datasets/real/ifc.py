@@ -27,12 +27,11 @@ from topomerge.errors import InputError
 from topomerge.io.points import read_points
 from topomerge.types import Array, PointCloud
 
-FOLDER = "ifc_buildings"
 MODELS = {"duplex": ("depth", 0.6), "Office_A_20110811": ("tls", 0.4)}  # sensor, and share of the rooms that it visits
-LABELS = {"IfcSlab": "floor", "IfcCovering": "ceiling", "IfcStair": "stair", "IfcStairFlight": "stair", "IfcColumn": "column"}
+IFC_LABELS = {"IfcSlab": "floor", "IfcCovering": "ceiling", "IfcStair": "stair", "IfcStairFlight": "stair", "IfcColumn": "column"}
 LEFT_OUT = ("IfcDoor", "IfcFeatureElement", "IfcVirtualElement")  # doors stand open
-SPACING = 0.08  # m between the points sampled on the model
-BELOW = 0.15  # m under its floor that a point may lie
+IFC_SPACING = 0.08  # m between the points sampled on the model
+UNDER_CEILING = 0.15  # m under its floor that a point may lie
 
 
 def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
@@ -101,7 +100,7 @@ def _triangles(path: Path) -> tuple[Array, Array]:
     for element in model.by_type("IfcElement"):
         triangles = None if any(element.is_a(kind) for kind in LEFT_OUT) else solids.corners(element)
         if triangles is not None:
-            kind = next((label for name, label in LABELS.items() if element.is_a(name)), "wall")
+            kind = next((label for name, label in IFC_LABELS.items() if element.is_a(name)), "wall")
             corners.append(triangles)
             labels.append(np.full(len(triangles), SURFACES.index(kind), np.uint8))
     if not corners:
@@ -112,15 +111,15 @@ def _triangles(path: Path) -> tuple[Array, Array]:
 def _ground(path: Path, building: Building) -> float:
     """Height of the building's lowest floor in the model, m."""
     floors = {room.name: room.floor for room in _model(path).rooms}
-    found = [floors[r.name.split()[0]] - r.floor for r in building.rooms if r.name.split()[0] in floors]
-    if not found or np.ptp(found) > 0.3:
+    shifts = [floors[r.name.split()[0]] - r.floor for r in building.rooms if r.name.split()[0] in floors]
+    if not shifts or np.ptp(shifts) > 0.3:
         raise InputError(f"{path}: its spaces lie at other heights than its storeys; no walk can be planned in it")
-    return float(np.median(found))
+    return float(np.median(shifts))
 
 
 @lru_cache(maxsize=1)  # asked for thrice a pair
 def _model(path: Path) -> PointCloud:
-    return read_points(path, spacing=SPACING)
+    return read_points(path, spacing=IFC_SPACING)
 
 
 def _model_points(path: Path, building: Building) -> PointCloud:
@@ -128,10 +127,10 @@ def _model_points(path: Path, building: Building) -> PointCloud:
     cloud = _model(path)
     points = cloud.points.astype(np.float64) + cloud.shift - [0.0, 0.0, _ground(path, building)]
     labels = np.full(len(points), -1, np.int32)
-    bounds = np.append(building.storeys["floor"] - BELOW, np.inf)
+    bounds = np.append(building.storeys["floor"] - UNDER_CEILING, np.inf)
     for k in range(len(building.storeys)):
         here = np.array([i for i, r in enumerate(building.rooms) if r.storey == k])
         rows = np.flatnonzero((points[:, 2] >= bounds[k]) & (points[:, 2] < bounds[k + 1]))
-        found = rooms_at(points[rows, :2], [building.rooms[i] for i in here])
-        labels[rows] = np.where(found >= 0, here[found], -1)
+        nearest = rooms_at(points[rows, :2], [building.rooms[i] for i in here])
+        labels[rows] = np.where(nearest >= 0, here[nearest], -1)
     return PointCloud(points.astype(np.float32), labels=labels, rooms=building.rooms, source=path.name)

@@ -1,30 +1,29 @@
-"""Real pairs, extracted once and kept like simulated ones (`kept`): one file a pair, named by a hash of its inputs."""
+"""Real pairs, extracted once and written like simulated ones (`pairs.evaluation_pair`): a file a pair, named by its inputs."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 
 from topomerge.datasets.core.builder import time_limit
-from topomerge.datasets.pairs.evaluation_pair import kept_arrays, save_maps, told_of_maps
+from topomerge.datasets.pairs.evaluation_pair import evaluation_arrays, pair_statistics, save_maps
 from topomerge.datasets.pairs.example import pair_arrays
 from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.plans.floorplans import Refusal
-from topomerge.datasets.real.sources import collect
+from topomerge.datasets.real.sources import REAL_FOLDERS, collect, pair_makers
 
 from topomerge.code_digest import code_digest
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io import archive
 
-LONGEST = 600.0  # s a pair
-POINTS = 512  # a room
+LONGEST_PAIR = 600.0  # s a pair
+POINTS_A_ROOM = 512  # a room
 
 
-def keep_real(
+def real_evaluation_pairs(
     data: str | Path, cache: Path, sources: Sequence[str], voxel_size: float = 0.1, say: Callable[[str], None] = lambda text: None
 ) -> list[Path]:
     """Files of all real pairs of some sources, made where they are missing; what is refused is said and left out.
@@ -48,12 +47,12 @@ def _source(data: Path, folder: Path, source: str, voxel_size: float, say: Calla
     listed = folder / f"{whole}.json"
     if listed.exists():
         return [folder / name for name in json.loads(listed.read_text(encoding="utf-8"))]
-    module, names = import_module(f"topomerge.datasets.real.{source}"), []
-    for title, make in _makers(module, data, source):
+    names = []
+    for title, make in _makers(data, source):
         path = folder / f"{hashlib.sha256(f'{whole}/{title}'.encode()).hexdigest()[:24]}.npz"
         if not path.exists():
             _, pair = next(iter(collect(source, iter([(title, make)]))))
-            reason = pair.reason if isinstance(pair, Refusal) else _keep(pair, path, voxel_size)
+            reason = pair.reason if isinstance(pair, Refusal) else _extract_and_write(pair, path, voxel_size)
             say(f"{source}/{title}: {reason or 'extracted'}")
             if reason:
                 continue
@@ -62,30 +61,29 @@ def _source(data: Path, folder: Path, source: str, voxel_size: float, say: Calla
     return [folder / name for name in names]
 
 
-def _makers(module: object, data: Path, source: str) -> list[tuple[str, Callable[[], Pair]]]:
+def _makers(data: Path, source: str) -> list[tuple[str, Callable[[], Pair]]]:
     try:
-        return list(module.pairs(data / module.FOLDER))  # type: ignore[attr-defined]
+        return list(pair_makers(source, data))
     except Exception as error:
         raise InputError(f"{source}: can't be read ({' '.join(str(error).split())[:150]})") from error
 
 
 def digest(data: Path, source: str, voxel_size: float) -> str:
     """Hash of a source's files, of the voxel size, and of the code and weights that make pairs and maps of them."""
-    module = import_module(f"topomerge.datasets.real.{source}")
     whole = hashlib.sha256(f"{code_digest(__name__)} {voxel_size}".encode())
-    for file in sorted(p for p in (data / module.FOLDER).rglob("*") if p.is_file()):
+    for file in sorted(p for p in (data / REAL_FOLDERS[source]).rglob("*") if p.is_file()):
         whole.update(file.relative_to(data).as_posix().encode() + hashlib.sha256(file.read_bytes()).digest())
     return whole.hexdigest()[:16]
 
 
-def _keep(pair: Pair, path: Path, voxel_size: float) -> str:
+def _extract_and_write(pair: Pair, path: Path, voxel_size: float) -> str:
     """Extract a pair and write its files; why it can't be done, or nothing."""
     try:
-        with time_limit(LONGEST):
+        with time_limit(LONGEST_PAIR):
             a, b = (extract(cloud, voxel_size=voxel_size) for cloud in (pair.a, pair.b))
-            told = {"file": path.name, "points_per_room": POINTS, "title": pair.name, **told_of_maps(pair, (a, b))}
-            arrays = pair_arrays(pair, (a, b), told)
-            arrays |= kept_arrays(pair, (a, b), (arrays["a.true_room"], arrays["b.true_room"]))
+            entries = {"file": path.name, "points_per_room": POINTS_A_ROOM, "title": pair.name, **pair_statistics(pair, (a, b))}
+            arrays = pair_arrays(pair, (a, b), entries)
+            arrays |= evaluation_arrays(pair, (a, b), (arrays["a.true_room"], arrays["b.true_room"]))
             save_maps((a, b), path.parent, path.stem)
             archive.write(arrays, path)
     except Exception as error:  # one bad pair never ends a run

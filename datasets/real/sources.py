@@ -1,8 +1,9 @@
 """Real map pairs with published or measured truth, one module a source: Halmstad, UTexas, CARMEN, STRANDS, IFC.
 
-They are for evaluation: none of their buildings may train. `python -m topomerge.datasets.real.sources --table FOLDER` measures
-how far
-the walls of each pair lie apart under its truth.
+Every source is a module `topomerge.datasets.real.<source>` with a function ``pairs(folder)``, which gives name and maker of each
+pair, as the sets of `datasets.public` do; `REAL_FOLDERS` says where its files are. All are for evaluation: none of their
+buildings may train. `python -m topomerge.datasets.real.sources --table FOLDER` measures how far the walls of each pair lie apart
+under its truth.
 """
 
 from __future__ import annotations
@@ -21,8 +22,15 @@ from topomerge.datasets.real.wall_fit import residual
 
 from topomerge.errors import InputError
 
-SOURCES = ("halmstad", "utexas", "strands", "carmen", "ifc")
-HEAD = (
+REAL_FOLDERS = {  # source -> folder of its files within that of the real data
+    "halmstad": "halmstad_robot_maps",
+    "utexas": "utexas_gdc_floors",
+    "strands": "grids_rose2_homes_strands",
+    "carmen": "carmen_logs",
+    "ifc": "ifc_buildings",
+}
+REAL_SOURCES = tuple(REAL_FOLDERS)
+TABLE_HEAD = (
     "pair",
     "sensors",
     "points",
@@ -43,16 +51,16 @@ def iter_real_pairs(folder: str | Path, sources: Sequence[str] | None = None) ->
     A pair whose files are missing or damaged is a `Refusal`, and the rest goes on.
 
     Args:
-        folder: with one folder a source, named as in its module's `FOLDER`.
-        sources: some of `SOURCES`; None: all.
+        folder: with one folder a source, named as in `REAL_FOLDERS`.
+        sources: some of `REAL_SOURCES`; None: all.
 
     Raises:
         InputError: no such folder or source.
     """
-    folder, sources = Path(folder), SOURCES if sources is None else tuple(sources)
-    unknown = sorted(set(sources) - set(SOURCES))
+    folder, sources = Path(folder), REAL_SOURCES if sources is None else tuple(sources)
+    unknown = sorted(set(sources) - set(REAL_SOURCES))
     if unknown:
-        raise InputError(f"source {unknown[0]!r}: {', '.join(SOURCES)} are possible")
+        raise InputError(f"source {unknown[0]!r}: {', '.join(REAL_SOURCES)} are possible")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the one that holds the data sets")
     return _iterate(folder, sources)
@@ -60,8 +68,19 @@ def iter_real_pairs(folder: str | Path, sources: Sequence[str] | None = None) ->
 
 def _iterate(folder: Path, sources: Sequence[str]) -> Iterator[tuple[str, Pair | Refusal]]:
     for source in sources:
-        module = import_module(f"topomerge.datasets.real.{source}")
-        yield from collect(source, module.pairs(folder / module.FOLDER))
+        yield from collect(source, pair_makers(source, folder))
+
+
+def pair_makers(source: str, folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
+    """Name and maker of each pair of a source.
+
+    Args:
+        folder: of all real data.
+    """
+    makers: Iterator[tuple[str, Callable[[], Pair]]] = import_module(f"topomerge.datasets.real.{source}").pairs(
+        folder / REAL_FOLDERS[source]
+    )
+    return makers
 
 
 def collect(source: str, makers: Iterator[tuple[str, Callable[[], Pair]]]) -> Iterator[tuple[str, Pair | Refusal]]:
@@ -88,19 +107,19 @@ def reason(error: Exception) -> str:
 
 
 def row(pair: Pair) -> tuple[str, ...]:
-    """Cells of a pair under `HEAD`."""
+    """Cells of a pair under `TABLE_HEAD`."""
     assert pair.truth is not None
-    found, truth = residual(pair), pair.truth
+    fit, truth = residual(pair), pair.truth
     million = " / ".join(f"{len(c) / 1e6:.2f} M" for c in (pair.a, pair.b))
     numbers = f"{np.degrees(truth.yaw):.1f}", f"{truth.scale:.3f}", f"{pair.overlap:.2f}", str(len(pair.shared) or "-")
-    sizes = f"{found.median:.3f}", f"{found.near:.0%}", f"{found.seen:.0%}", f"{found.moved:.2f} m, {found.turned:.2f}°"
+    sizes = f"{fit.median:.3f}", f"{fit.near:.0%}", f"{fit.seen:.0%}", f"{fit.moved:.2f} m, {fit.turned:.2f}°"
     return (f"{pair.source}/{pair.name}", " / ".join(pair.sensors), million, *numbers, *sizes)
 
 
 def table(results: Iterator[tuple[str, Pair | Refusal]]) -> Iterator[str]:
     """Lines of a table of the pairs in Markdown; refusals, with their count, follow it."""
-    yield "| " + " | ".join(HEAD) + " |"
-    yield "|" + "---|" * len(HEAD)
+    yield "| " + " | ".join(TABLE_HEAD) + " |"
+    yield "|" + "---|" * len(TABLE_HEAD)
     refused = []
     for _, result in results:
         if isinstance(result, Refusal):
@@ -117,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m topomerge.datasets.real.sources", description=__doc__)
     parser.add_argument("--table", metavar="FOLDER", type=Path, required=True, help="the folder with the data sets")
-    parser.add_argument("--sources", nargs="*", choices=SOURCES, help="only these")
+    parser.add_argument("--sources", nargs="*", choices=REAL_SOURCES, help="only these")
     options = parser.parse_args(arguments)
     return print_lines(_table(options.table, options.sources))
 

@@ -18,7 +18,6 @@ from topomerge.datasets.pairs.pairs import Pair
 
 from topomerge.types import Sim3
 
-FOLDER = "grids_rose2_homes_strands"
 SESSIONS = {
     "2015": "strands_morse/tsc/maps/tsc.yaml",
     "2016": "strands_maps/strands_maps/tsc_y3/maps/tsc20160523.yaml",

@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 import yaml
 from scipy import ndimage
-from topomerge.datasets.pairs.flat import HEIGHT, Flat, flat_pair, from_masks, moved_room, read_flat
+from topomerge.datasets.pairs.flat import WALL_HEIGHT, Flat, flat_pair, from_masks, moved_room, read_flat
 from topomerge.datasets.pairs.pairs import Pair
 
 from topomerge.errors import InputError
 from topomerge.io import grid
 from topomerge.types import Array, Sim3, TrueRoom
 
-FOLDER, LINES = "utexas_gdc_floors", "utexas_amrl_vectormaps"
+LINES_FOLDER = "utexas_amrl_vectormaps"  # beside the folder of the grids
 INTO_LINES = {  # BWI grid -> AMRL line map
     "1": Sim3(np.radians(179.818), (-14.694, 3.939, 0.0)),
     "2": Sim3(np.radians(-179.909), (-14.118, 2.608, 0.0)),
@@ -38,18 +38,18 @@ INTO_WHOLE = {  # partial grid -> grid of the floor
     "1s": ("1", Sim3(0.0, (-10.25, 62.25, 0.0))),
     "3ne": ("3", Sim3(0.0, (0.1, 0.1, 0.0))),
 }
-CELL = 0.05  # m, of the raster that line maps are drawn into
-GAP = 5.0  # m; narrower gaps in the outer walls don't lead outside (glass is not in the line maps)
-MARGIN = 2 * GAP  # m around a line map
-CAVITY = 0.2  # m; what is narrower lies within a wall
-LARGEST, CELLS = 50 << 20, 50_000_000
+UTEXAS_CELL = 0.05  # m, of the raster that line maps are drawn into
+FRONT_GAP = 5.0  # m; narrower gaps in the outer walls don't lead outside (glass is not in the line maps)
+LINES_MARGIN = 2 * FRONT_GAP  # m around a line map
+WALL_CAVITY = 0.2  # m; what is narrower lies within a wall
+LARGEST_LINE_MAP, UTEXAS_CELLS = 50 << 20, 50_000_000
 
 
 def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
     """Name and maker of four pairs of a grid and a line map, and three of a grid and a part of it."""
     read = cache(partial(_grid, folder))
     for seed, floor in enumerate(INTO_LINES):
-        yield f"gdc{floor}-lines", partial(_with_lines, read, folder.parent / LINES, floor, seed)
+        yield f"gdc{floor}-lines", partial(_with_lines, read, folder.parent / LINES_FOLDER, floor, seed)
     for seed, part in enumerate(INTO_WHOLE, len(INTO_LINES)):
         yield f"gdc{INTO_WHOLE[part][0]}-{part}", partial(_with_part, read, part, seed)
 
@@ -93,7 +93,7 @@ def _rooms(path: Path, plan: Path) -> tuple[TrueRoom, ...]:
         raise InputError(f"{path}: has no list of locations with their polygons ({error}); copy it again") from error
     corner = np.array(about.origin[:2])
     metres = [(n, np.column_stack([p[:, 0], height - p[:, 1]]) * about.resolution + corner) for n, p in named if len(p) > 2]
-    return tuple(TrueRoom(str(name), polygon[::-1], 0.0, HEIGHT) for name, polygon in metres)
+    return tuple(TrueRoom(str(name), polygon[::-1], 0.0, WALL_HEIGHT) for name, polygon in metres)
 
 
 def read_lines(path: Path) -> Flat:
@@ -102,27 +102,27 @@ def read_lines(path: Path) -> Flat:
     Raises:
         InputError: missing, damaged, or of an absurd size.
     """
-    if not path.is_file() or path.stat().st_size > LARGEST:
+    if not path.is_file() or path.stat().st_size > LARGEST_LINE_MAP:
         raise InputError(f"{path}: no such file, or far too large; check the folder")
     try:
         listed = json.loads(path.read_bytes())
         lines = np.array([[[s[p]["x"], s[p]["y"]] for p in ("p0", "p1")] for s in listed], float).reshape(-1, 2, 2)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: is not a line map, a list of {{p0: {{x, y}}, p1: {{x, y}}}} ({error})") from error
-    low, high = lines.min(axis=(0, 1), initial=np.inf) - MARGIN, lines.max(axis=(0, 1), initial=-np.inf) + MARGIN
-    if not len(lines) or not np.prod((high - low) / CELL) < CELLS:
+    low, high = lines.min(axis=(0, 1), initial=np.inf) - LINES_MARGIN, lines.max(axis=(0, 1), initial=-np.inf) + LINES_MARGIN
+    if not len(lines) or not np.prod((high - low) / UTEXAS_CELL) < UTEXAS_CELLS:
         raise InputError(f"{path}: has no lines, or spans more than a building; copy it again")
     walls = _drawn(lines, low, high)
-    return from_masks(walls[::-1], _floor(walls)[::-1], CELL, (*low.tolist(), 0.0), rays=False, source=path.name)
+    return from_masks(walls[::-1], _floor(walls)[::-1], UTEXAS_CELL, (*low.tolist(), 0.0), rays=False, source=path.name)
 
 
 def _drawn(lines: Array, low: Array, high: Array) -> Array:
     """(h, w) bool, lowest row first: cells on a line."""
-    columns, rows = np.ceil((high - low) / CELL).astype(int) + 1
-    count = (np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) / CELL * 2).astype(int) + 2
+    columns, rows = np.ceil((high - low) / UTEXAS_CELL).astype(int) + 1
+    count = (np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) / UTEXAS_CELL * 2).astype(int) + 2
     t = np.concatenate([np.linspace(0, 1, n) for n in count])[:, None]
     points = np.repeat(lines[:, 0], count, axis=0) * (1 - t) + np.repeat(lines[:, 1], count, axis=0) * t
-    cells = np.floor((points - low) / CELL).astype(int)
+    cells = np.floor((points - low) / UTEXAS_CELL).astype(int)
     walls = np.zeros((int(rows), int(columns)), bool)
     walls[cells[:, 1], cells[:, 0]] = True
     return walls
@@ -130,9 +130,11 @@ def _drawn(lines: Array, low: Array, high: Array) -> Array:
 
 def _floor(walls: Array) -> Array:
     """(h, w) bool: what lies between walls, without the cavities in them."""
-    far = ndimage.distance_transform_edt(~walls) * CELL
-    closed = ndimage.binary_fill_holes(far <= GAP / 2)
-    inside = ndimage.distance_transform_edt(closed) * CELL > GAP / 2
-    wide = ndimage.distance_transform_edt(far <= CAVITY) * CELL <= CAVITY  # an opening: narrow gaps vanish, corners stay
-    floor: Array = inside & ~walls & wide & ndimage.binary_propagation(inside & (far > CAVITY), mask=~walls)
+    far = ndimage.distance_transform_edt(~walls) * UTEXAS_CELL
+    closed = ndimage.binary_fill_holes(far <= FRONT_GAP / 2)
+    inside = ndimage.distance_transform_edt(closed) * UTEXAS_CELL > FRONT_GAP / 2
+    wide = (
+        ndimage.distance_transform_edt(far <= WALL_CAVITY) * UTEXAS_CELL <= WALL_CAVITY
+    )  # an opening: narrow gaps vanish, corners stay
+    floor: Array = inside & ~walls & wide & ndimage.binary_propagation(inside & (far > WALL_CAVITY), mask=~walls)
     return floor

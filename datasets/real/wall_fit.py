@@ -12,11 +12,11 @@ from topomerge.datasets.pairs.pairs import Pair
 from topomerge.errors import InputError
 from topomerge.types import Array, Sim3
 
-CELL = 0.05  # m, of the columns in which walls are looked for
+FIT_CELL = 0.05  # m, of the columns in which walls are looked for
 BAND = (0.4, 2.0)  # m above the floor
-STEP = 0.1  # m of height
-FILLED = 0.5  # share of the steps in that band that a wall fills
-SEEN = 0.3  # m; a wall of b is in a's sight when a knows something that near
+FIT_STEP = 0.1  # m of height
+FILLED_SHARE = 0.5  # share of the steps in that band that a wall fills
+SEEN_REACH = 0.3  # m; a wall of b is in a's sight when a knows something that near
 REACHES = (1.0, 0.5, 0.3, 0.2)  # m; partners are looked for ever closer
 
 
@@ -45,10 +45,10 @@ def wall_points(points: Array, floor: float) -> Array:
     points = points[(points[:, 2] > floor + BAND[0]) & (points[:, 2] < floor + BAND[1])]
     if not len(points):
         return np.empty((0, 2))
-    cells = squares(points, np.array([CELL, CELL, STEP]))
+    cells = squares(points, np.array([FIT_CELL, FIT_CELL, FIT_STEP]))
     _, first, column = np.unique(keys(cells[:, :2])[0], return_index=True, return_inverse=True)
     steps = np.unique(keys(np.column_stack([column, cells[:, 2]]))[0], return_index=True)[1]
-    filled = np.bincount(column[steps], minlength=len(first)) >= FILLED * (BAND[1] - BAND[0]) / STEP
+    filled = np.bincount(column[steps], minlength=len(first)) >= FILLED_SHARE * (BAND[1] - BAND[0]) / FIT_STEP
     many = np.bincount(column)
     return np.column_stack([np.bincount(column, points[:, k]) / many for k in range(2)])[filled]
 
@@ -70,8 +70,8 @@ def residual(pair: Pair) -> Residual:
     if pair.truth is None:
         raise InputError(f"{pair.name}: maps of two places have no walls in common")
     a, b = walls(pair, pair.truth)
-    known = cKDTree(thin(pair.a.points[:, :2].astype(np.float64) + pair.a.shift[:2], 2 * CELL))
-    seen = known.query(b, distance_upper_bound=SEEN)[0] <= SEEN
+    walls_of_a = cKDTree(thin(pair.a.points[:, :2].astype(np.float64) + pair.a.shift[:2], 2 * FIT_CELL))
+    seen = walls_of_a.query(b, distance_upper_bound=SEEN_REACH)[0] <= SEEN_REACH
     if not seen.any() or not len(a):
         return Residual(float("inf"), 0.0, 0.0)
     b = b[seen]

@@ -23,15 +23,22 @@ from topomerge.io.palette import PALETTE
 from topomerge.types import Array, TopometricMap
 from topomerge.viz.plan import frame_of, storey_plans
 
-BUILDINGS = (("office", 7, 2), ("hotel", 3, 1), ("hospital", 4, 1), ("school", 5, 1), ("apartment", 2, 1), ("house", 6, 2))
-PAIRS: tuple[tuple[str, int, int, float, tuple[str, str], str | None], ...] = (
+GALLERY_BUILDINGS = (
+    ("office", 7, 2),
+    ("hotel", 3, 1),
+    ("hospital", 4, 1),
+    ("school", 5, 1),
+    ("apartment", 2, 1),
+    ("house", 6, 2),
+)
+GALLERY_PAIRS: tuple[tuple[str, int, int, float, tuple[str, str], str | None], ...] = (
     ("office", 7, 1, 0.5, ("tls", "depth"), None),
     ("hospital", 4, 1, 0.25, ("lidar", "tls"), None),
     ("school", 9, 2, 0.5, ("depth", "lidar"), None),
     ("hotel", 3, 2, 0.5, ("tls", "depth"), "other-storey"),
 )
 FILLS = {"corridor": "#e8e4da", "stairs": "#e3d3ea", "lift": "#e3d3ea", "bath": "#cfe6f2", "toilets": "#cfe6f2"}
-INK, FURNITURE, DOOR = "#444444", "#b9a98c", "#c2410c"
+PLAN_INK, FURNITURE, DOOR_COLOUR = "#444444", "#b9a98c", "#c2410c"
 
 
 def building_picture(building: Building) -> Figure:
@@ -63,7 +70,7 @@ def _sheet(count: int, size: Array) -> tuple[Figure, list[Axes]]:
 def _draw_storey(ax: Axes, building: Building, storey: int) -> None:
     floor = float(building.storeys["floor"][storey])
     for room in (r for r in building.rooms if r.storey == storey):
-        ax.add_patch(Polygon(room.polygon, facecolor=FILLS.get(room.kind, "#f6f6f2"), edgecolor=INK, linewidth=0.7))
+        ax.add_patch(Polygon(room.polygon, facecolor=FILLS.get(room.kind, "#f6f6f2"), edgecolor=PLAN_INK, linewidth=0.7))
     things = building.things
     bottom = things["centre"][:, 2] - things["size"][:, 2] / 2
     standing = (bottom > floor - 0.1) & (bottom < floor + 1.0) & (things["kind"] != "leaf")
@@ -75,7 +82,7 @@ def _draw_storey(ax: Axes, building: Building, storey: int) -> None:
     for door in building.doors[np.abs(building.doors["centre"][:, 2] - floor) < 0.5]:
         along = np.array([-np.sin(door["direction"]), np.cos(door["direction"])]) * door["width"] / 2
         ends = door["centre"][:2] + np.array([-along, along])
-        ax.plot(*ends.T, color=DOOR, linewidth=2.0, solid_capstyle="butt")
+        ax.plot(*ends.T, color=DOOR_COLOUR, linewidth=2.0, solid_capstyle="butt")
 
 
 def match_picture(pair: Pair, maps: tuple[TopometricMap, TopometricMap]) -> Figure:
@@ -136,9 +143,9 @@ def save(figure: Figure, path: Path, dpi: int = 80) -> None:
 
 def main(folder: str) -> None:
     """Write all pictures."""
-    for kind, seed, storeys in BUILDINGS:
+    for kind, seed, storeys in GALLERY_BUILDINGS:
         save(building_picture(make_building(kind, seed, storeys)), Path(folder) / f"building_{kind}.png")
-    for number, (kind, seed, storeys, overlap, sensors, hard) in enumerate(PAIRS):
+    for number, (kind, seed, storeys, overlap, sensors, hard) in enumerate(GALLERY_PAIRS):
         building = make_building(kind, seed, storeys)
         pair = make_pair(building, PairSettings(overlap, sensors, 12, hard=hard), seed)
         assert pair.frames is not None

@@ -12,14 +12,14 @@ from topomerge.datasets.simulation.floors import fill
 
 from topomerge.types import Array, TrueRoom
 
-CELL = 0.1  # m, of all rasters
-NEAR = 2  # cells; a wall is seen, and a cell belongs to it, within so many of the outline
-FLAT = 0.15  # m that a point of a floor may lie off it
-CEILED = 0.3  # m, likewise of a ceiling: they hang lower here and there
-LEAST = 0.2  # share of a room's columns with a point, from which on the map is one of this room
-BANDS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0))  # m above the floor
-RADIUS, PATCHES = 0.3, 400  # m, number of the patches that planes are fitted to
-OUTSIDE = 3  # cells around a room that are looked at, too
+SURFACE_CELL = 0.1  # m, of all rasters
+OUTLINE_NEAR = 2  # cells; a wall is seen, and a cell belongs to it, within so many of the outline
+FLOOR_OFF = 0.15  # m that a point of a floor may lie off it
+CEILING_OFF = 0.3  # m, likewise of a ceiling: they hang lower here and there
+LEAST_SEEN = 0.2  # share of a room's columns with a point, from which on the map is one of this room
+HEIGHT_BANDS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0))  # m above the floor
+PATCH_RADIUS, PATCHES = 0.3, 400  # m, number of the patches that planes are fitted to
+CELLS_AROUND = 3  # cells around a room that are looked at, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +34,10 @@ class Space:
 
 def space_of(room: TrueRoom) -> Space:
     """A true room as cells."""
-    origin = room.polygon.min(axis=0) - OUTSIDE * CELL
-    columns, rows = np.ceil((room.polygon.max(axis=0) - origin) / CELL).astype(int) + OUTSIDE
+    origin = room.polygon.min(axis=0) - CELLS_AROUND * SURFACE_CELL
+    columns, rows = np.ceil((room.polygon.max(axis=0) - origin) / SURFACE_CELL).astype(int) + CELLS_AROUND
     mask = np.zeros((int(rows), int(columns)), bool)
-    fill(mask, (room.polygon - origin) / CELL, 1)
+    fill(mask, (room.polygon - origin) / SURFACE_CELL, 1)
     return Space(mask, origin, room.floor, room.ceiling)
 
 
@@ -48,12 +48,12 @@ def outline_of(points: Array, floor: float, ceiling: float, gap: float = 0.5) ->
         points: (n, 3) m.
         gap: m; wider ones between columns with points are not closed.
     """
-    wide = OUTSIDE + int(gap / CELL)
-    origin = points[:, :2].min(axis=0) - wide * CELL
-    ij = np.floor((points[:, 1::-1] - origin[::-1]) / CELL).astype(int)
+    wide = CELLS_AROUND + int(gap / SURFACE_CELL)
+    origin = points[:, :2].min(axis=0) - wide * SURFACE_CELL
+    ij = np.floor((points[:, 1::-1] - origin[::-1]) / SURFACE_CELL).astype(int)
     count = np.zeros(ij.max(axis=0) + 1 + wide, int)
     np.add.at(count, tuple(ij.T), 1)
-    mask = ndimage.binary_fill_holes(ndimage.binary_closing(count > 1, iterations=int(gap / CELL)))
+    mask = ndimage.binary_fill_holes(ndimage.binary_closing(count > 1, iterations=int(gap / SURFACE_CELL)))
     parts, number = ndimage.label(mask)
     if number:
         mask = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
@@ -61,7 +61,7 @@ def outline_of(points: Array, floor: float, ceiling: float, gap: float = 0.5) ->
 
 
 def surfaces(points: Array, space: Space) -> dict[str, float] | None:
-    """What of a room a map shows; None where the map is not one of this room (fewer than `LEAST` of its columns).
+    """What of a room a map shows; None where the map is not one of this room (fewer than `LEAST_SEEN` of its columns).
 
     Args:
         points: (n, 3) m, of this room or of more than it.
@@ -74,25 +74,25 @@ def surfaces(points: Array, space: Space) -> dict[str, float] | None:
     """
     mask = space.mask
     height = max(space.ceiling - space.floor, 0.3)
-    ij = np.floor((points[:, 1::-1] - space.origin[::-1]) / CELL).astype(int)
+    ij = np.floor((points[:, 1::-1] - space.origin[::-1]) / SURFACE_CELL).astype(int)
     z = points[:, 2] - space.floor
-    kept = (ij >= 0).all(axis=1) & (ij < mask.shape).all(axis=1) & (z > -CEILED) & (z < height + CEILED)
-    ij, z = ij[kept], z[kept]
-    around = ndimage.binary_dilation(mask, iterations=NEAR)
-    kept = around[ij[:, 0], ij[:, 1]]
-    ij, z = ij[kept], z[kept]
+    inside = (ij >= 0).all(axis=1) & (ij < mask.shape).all(axis=1) & (z > -CEILING_OFF) & (z < height + CEILING_OFF)
+    ij, z = ij[inside], z[inside]
+    around = ndimage.binary_dilation(mask, iterations=OUTLINE_NEAR)
+    inside = around[ij[:, 0], ij[:, 1]]
+    ij, z = ij[inside], z[inside]
     columns = _hit(ij, mask.shape)
-    if not mask.any() or columns[mask].mean() < LEAST:
+    if not mask.any() or columns[mask].mean() < LEAST_SEEN:
         return None
-    out = {"area": float(mask.sum()) * CELL**2, "points": len(z) / (float(mask.sum()) * CELL**2)}
-    out["floor"] = 1 - float(_hit(ij[np.abs(z) < FLAT], mask.shape)[mask].mean())
-    out["ceiling"] = 1 - float(_hit(ij[np.abs(z - height) < CEILED], mask.shape)[mask].mean())
-    level = np.floor(z / CELL).astype(int) + 3  # of the cells, from 0.3 m below the floor
+    out = {"area": float(mask.sum()) * SURFACE_CELL**2, "points": len(z) / (float(mask.sum()) * SURFACE_CELL**2)}
+    out["floor"] = 1 - float(_hit(ij[np.abs(z) < FLOOR_OFF], mask.shape)[mask].mean())
+    out["ceiling"] = 1 - float(_hit(ij[np.abs(z - height) < CEILING_OFF], mask.shape)[mask].mean())
+    level = np.floor(z / SURFACE_CELL).astype(int) + 3  # of the cells, from 0.3 m below the floor
     full = np.zeros((*mask.shape, int(level.max(initial=0)) + 1), bool)
     full[ij[:, 0], ij[:, 1], level] = True
-    out["density"] = len(z) / max(float(full.sum()) * CELL**2, CELL**2)
-    inner = ndimage.binary_erosion(mask, iterations=NEAR)
-    between = full[:, :, 3 + round(FLAT / CELL) : max(int((height - CEILED) / CELL) + 3, 4)]
+    out["density"] = len(z) / max(float(full.sum()) * SURFACE_CELL**2, SURFACE_CELL**2)
+    inner = ndimage.binary_erosion(mask, iterations=OUTLINE_NEAR)
+    between = full[:, :, 3 + round(FLOOR_OFF / SURFACE_CELL) : max(int((height - CEILING_OFF) / SURFACE_CELL) + 3, 4)]
     out["clutter"] = float(between[inner].sum() / max(full.sum(), 1))
     return out | _walls(full, mask, height)
 
@@ -106,10 +106,10 @@ def _hit(ij: Array, shape: tuple[int, ...]) -> Array:
 def _walls(full: Array, mask: Array, height: float) -> dict[str, float]:
     """Share of the outline that is not seen, by band of height."""
     edge = mask & ~ndimage.binary_erosion(mask)
-    near = ndimage.binary_dilation(full, np.ones((2 * NEAR + 1, 2 * NEAR + 1, 1)))
+    near = ndimage.binary_dilation(full, np.ones((2 * OUTLINE_NEAR + 1, 2 * OUTLINE_NEAR + 1, 1)))
     out = {}
-    for k, (low, high) in enumerate(BANDS):
-        first, last = round(low / CELL) + 3, round(min(high, height - CELL) / CELL) + 3
+    for k, (low, high) in enumerate(HEIGHT_BANDS):
+        first, last = round(low / SURFACE_CELL) + 3, round(min(high, height - SURFACE_CELL) / SURFACE_CELL) + 3
         seen = near[edge][:, first:last].sum()
         whole = edge.sum() * max(last - first, 0)
         out[f"wall {k}"] = 1 - float(seen / whole) if whole else np.nan
@@ -119,8 +119,8 @@ def _walls(full: Array, mask: Array, height: float) -> dict[str, float]:
 def thickness(points: Array, seed: int = 0) -> dict[str, float]:
     """How far points lie off the planes that they are part of.
 
-    Planes are fitted to patches of `RADIUS` about points that are drawn; a patch counts as plane where it is three times as wide
-    as thick. No truth is needed: edges, furniture and clutter make the patches that are none.
+    Planes are fitted to patches of `PATCH_RADIUS` about points that are drawn; a patch counts as plane where it is three times
+    as wide as thick. No truth is needed: edges, furniture and clutter make the patches that are none.
 
     Returns:
         `flat` and `upright`: median standard deviation across the planes that lie and stand, mm; `rough`: of the upright ones,
@@ -130,7 +130,7 @@ def thickness(points: Array, seed: int = 0) -> dict[str, float]:
     centres = points[rng.choice(len(points), min(PATCHES, len(points)), replace=False)]
     tree = cKDTree(points)
     off, up = [], []
-    for patch in tree.query_ball_point(centres, RADIUS):
+    for patch in tree.query_ball_point(centres, PATCH_RADIUS):
         if len(patch) < 20:
             continue
         some = points[rng.choice(patch, min(len(patch), 400), replace=False)].astype(float)
@@ -177,6 +177,6 @@ def together(rows: Iterable[Mapping[str, float] | None]) -> dict[str, float]:
     out = {"seen": float(len(seen))}
     for key in seen[0] if seen else ():
         values, weight = np.array([r[key] for r in seen]), np.array([r["area"] for r in seen])
-        known = np.isfinite(values)
-        out[key] = float(np.average(values[known], weights=weight[known])) if known.any() else np.nan
+        measured = np.isfinite(values)
+        out[key] = float(np.average(values[measured], weights=weight[measured])) if measured.any() else np.nan
     return out

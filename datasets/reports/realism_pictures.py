@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.script import print_lines
-from topomerge.datasets.reports.realism_sources import DRAWN, real_clouds
+from topomerge.datasets.reports.realism_sources import DRAWN_ROOMS, real_clouds
 from topomerge.datasets.simulation.scanner import scan
 from topomerge.datasets.simulation.session import session
 
@@ -32,7 +32,7 @@ PICTURES: dict[str, tuple[tuple[float, float], list[Column]]] = {  # file -> sli
     ),
     "realism_laser": ((0.3, 2.0), ["apartment cloud_0", "apartment cloud_1", ("apartment", 104, "bedroom", "tls")]),
 }  # fmt: skip
-AROUND = 1.2  # m about a simulated room
+PICTURE_MARGIN = 1.2  # m about a simulated room
 
 View = tuple[str, Array, float]  # title, points (n, 3) m, height of the floor
 
@@ -44,9 +44,9 @@ def real(folder: Path) -> dict[str, View]:
     for title, cloud, floor, _ in real_clouds(folder):
         if title in wanted:
             points = cloud.points.astype(float)
-            drawn = DRAWN.get(title.split()[-1])
+            drawn = DRAWN_ROOMS.get(title.split()[-1])
             if drawn is not None:
-                low, high = np.min(drawn, axis=0) - AROUND, np.max(drawn, axis=0) + AROUND
+                low, high = np.min(drawn, axis=0) - PICTURE_MARGIN, np.max(drawn, axis=0) + PICTURE_MARGIN
                 points = points[((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)]
             out[title] = (f"real: {title}", turned(points), floor)
     return out
@@ -63,11 +63,11 @@ def turned(points: Array) -> Array:
 def simulated(kind: str, seed: int, room: str, sensor: str) -> View:
     """The largest room of a kind in a procedural building, scanned on its own."""
     building = make_building(kind, seed, 1)
-    found = [i for i, r in enumerate(building.rooms) if r.kind == room]
-    largest = max(found, key=lambda i: float(np.prod(np.ptp(building.rooms[i].polygon, axis=0))))
+    of_kind = [i for i, r in enumerate(building.rooms) if r.kind == room]
+    largest = max(of_kind, key=lambda i: float(np.prod(np.ptp(building.rooms[i].polygon, axis=0))))
     cloud = scan(session(building, rng=seed), sensor, [largest], seed)
     corners = building.rooms[largest].polygon
-    low, high = corners.min(axis=0) - AROUND, corners.max(axis=0) + AROUND
+    low, high = corners.min(axis=0) - PICTURE_MARGIN, corners.max(axis=0) + PICTURE_MARGIN
     points = cloud.points.astype(float)
     points = points[((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)]
     return f"simulated: {sensor}, {room} in {kind} {seed}", turned(points), 0.0

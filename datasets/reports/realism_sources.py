@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import shapely
 from topomerge.datasets.buildings.erect import erect
-from topomerge.datasets.buildings.procedural import KINDS, make_building
+from topomerge.datasets.buildings.procedural import BUILDING_KINDS, make_building
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.plans import splits
 from topomerge.datasets.plans.floorplans import Refusal, iter_plans
+from topomerge.datasets.real.sources import REAL_FOLDERS, pair_makers
 from topomerge.datasets.reports import realism_measures
 from topomerge.datasets.simulation.scanner import scan
 from topomerge.datasets.simulation.sensors import SENSORS
@@ -25,27 +26,27 @@ from topomerge.io.points import read_points
 from topomerge.types import Array, PointCloud, TrueRoom
 
 SENSED = ("tls", "lidar", "depth", "tablet")
-SEEDS = 10  # buildings of a kind whose rooms are counted
-MAPS = 1  # buildings of a kind that each sensor scans
+BUILDINGS_A_KIND = 10  # buildings of a kind whose rooms are counted
+MAPS_A_KIND = 1  # buildings of a kind that each sensor scans
 VISITED = 8  # rooms a map
 SKIPPED = ("void", "lift")
 REAL_PLANS = {"GDC floors 1–4": "utexas_gdc_floors", "IFC models": "ifc_buildings", "IPA grids": "grids_ipa_room_segmentation"}
 IPAD, OCTOMAP = "ipad_lidar_rooms", "octomap_freiburg078/fr_078_tidyup.bt"
 APARTMENT = "pair_libpointmatcher_apartment/libpointmatcher/icp_tutorial"
-DRAWN = {  # rooms of clouds that show more than one: corners taken from a picture of the walls, to a decimetre
+DRAWN_ROOMS = {  # rooms of clouds that show more than one: corners taken from a picture of the walls, to a decimetre
     "fr078": [(-8.3, -5.0), (1.7, -5.0), (1.7, 4.5), (-4.0, 4.2), (-8.8, 3.6)],
     "cloud_0": [(-0.5, -0.7), (2.4, -0.7), (2.4, 0.7), (1.3, 0.7), (1.3, 1.3), (-0.5, 1.3)],
     "cloud_1": [(-1.2, -0.6), (1.6, -1.2), (1.9, 0.3), (0.9, 0.6), (0.8, 1.25), (-0.9, 1.4)],
 }
-BELOW = 3.0  # m from the ceiling to the floor of the iPad's rooms: no cloud shows both well, 470 does a little of its floor
+IPAD_HEIGHT = 3.0  # m from the ceiling to the floor of the iPad's rooms: no cloud shows both well, 470 does a little of its floor
 
 Row = tuple[str, Mapping[str, float]]
 
 
 def plan_rows(folder: Path, fast: bool = False) -> Iterator[Row]:
     """Rooms and doors: of procedural buildings, of the plans that train, and of real buildings."""
-    for kind in KINDS[:3] if fast else KINDS:
-        yield kind, _of_buildings([make_building(kind, seed, 2) for seed in range(3 if fast else SEEDS)])
+    for kind in BUILDING_KINDS[:3] if fast else BUILDING_KINDS:
+        yield kind, _of_buildings([make_building(kind, seed, 2) for seed in range(3 if fast else BUILDINGS_A_KIND)])
     for source, name in splits.FOLDERS.items():
         if (folder / name).is_dir():
             taken = set(splits.members("train", source)[: 20 if fast else None])
@@ -89,13 +90,13 @@ def map_rows(folder: Path, fast: bool = False) -> Iterator[Row]:
 
 
 def _buildings(folder: Path, fast: bool) -> Iterator[tuple[str, Building]]:
-    for kind in KINDS[:3] if fast else KINDS:
-        yield from ((kind, make_building(kind, 100 + seed, 1)) for seed in range(1 if fast else MAPS))
+    for kind in BUILDING_KINDS[:3] if fast else BUILDING_KINDS:
+        yield from ((kind, make_building(kind, 100 + seed, 1)) for seed in range(1 if fast else MAPS_A_KIND))
     for source, name in {} if fast else splits.FOLDERS.items():
         names = splits.members("train", source)
         if (folder / name).is_dir():
             taken = {n: p for n, p in iter_plans(folder / name) if isinstance(p, Plan) and n in names and _usual(p)}
-            for n in sorted(taken)[:: max(len(taken) // MAPS, 1)][:MAPS]:
+            for n in sorted(taken)[:: max(len(taken) // MAPS_A_KIND, 1)][:MAPS_A_KIND]:
                 yield f"plan {source}", erect([taken[n]], rng=0, name=n)
 
 
@@ -133,7 +134,7 @@ def real_maps(folder: Path, fast: bool = False) -> Iterator[Row]:
     """Surfaces of the real maps; a folder that is missing is left out."""
     for title, cloud, floor, ceiling in real_clouds(folder):
         points = cloud.points.astype(float)
-        drawn = DRAWN.get(title.split()[-1])
+        drawn = DRAWN_ROOMS.get(title.split()[-1])
         space = realism_measures.outline_of(points, floor, ceiling)
         if drawn is not None:
             space = realism_measures.space_of(TrueRoom(title, np.array(drawn), floor, ceiling))
@@ -151,7 +152,7 @@ def real_clouds(folder: Path) -> Iterator[tuple[str, PointCloud, float, float]]:
     for path in sorted((folder / IPAD).glob("*/*.ply")):
         cloud = read_points(path, up="y" if path.parent.name == "user" else None)
         ceiling = level(cloud.points, top=True)
-        yield f"iPad {path.parent.name} {path.stem}", cloud, ceiling - BELOW, ceiling
+        yield f"iPad {path.parent.name} {path.stem}", cloud, ceiling - IPAD_HEIGHT, ceiling
     if (folder / OCTOMAP).is_file():
         cloud = read_points(folder / OCTOMAP)
         floor = level(cloud.points, top=False)
@@ -188,9 +189,7 @@ def read_vtk(path: Path) -> PointCloud:
 
 def _grids(folder: Path) -> Iterator[Row]:
     """Robot grids: what is free or occupied within the true rooms is seen; there are no heights."""
-    from topomerge.datasets.real import utexas
-
-    for name, make in utexas.pairs(folder / utexas.FOLDER) if (folder / utexas.FOLDER).is_dir() else ():
+    for name, make in pair_makers("utexas", folder) if (folder / REAL_FOLDERS["utexas"]).is_dir() else ():
         if not name.endswith("-lines"):
             continue
         cloud = make().a
@@ -200,9 +199,7 @@ def _grids(folder: Path) -> Iterator[Row]:
 
 def _models(folder: Path) -> Iterator[Row]:
     """Building models, scanned from inside."""
-    from topomerge.datasets.real import ifc
-
-    for name, make in ifc.pairs(folder / ifc.FOLDER) if (folder / ifc.FOLDER).is_dir() else ():
+    for name, make in pair_makers("ifc", folder) if (folder / REAL_FOLDERS["ifc"]).is_dir() else ():
         pair = make()
         row = of_rooms(pair.b, list(pair.visited[1]))
         yield f"IFC {name}, {pair.sensors[1]}", row | realism_measures.thickness(pair.b.points)

@@ -27,15 +27,15 @@ from topomerge.io import archive
 from topomerge.io.atomic import replacing
 from topomerge.types import Array
 
-BEGIN, END = "<!-- statistics:begin -->", "<!-- statistics:end -->"
-BINS = (  # from, to, in words
+TABLES_BEGIN, TABLES_END = "<!-- statistics:begin -->", "<!-- statistics:end -->"
+OVERLAP_BINS = (  # from, to, in words
     (0.0, 1e-9, "none"),
     (1e-9, 0.15, "below 15 %"),
     (0.15, 0.35, "15 to 35 %"),
     (0.35, 0.6, "35 to 60 %"),
     (0.6, 2.0, "above 60 %"),
 )
-CLEAN = 0.6  # IoU with the true room, from which on the middle of an extracted room can be compared
+CLEAN_IOU = 0.6  # IoU with the true room, from which on the middle of an extracted room can be compared
 Row = Mapping[str, Any]
 Lines = Iterator[str]
 
@@ -45,7 +45,7 @@ class Counted:
     """A set as it was read.
 
     Args:
-        rows: what is told of each pair (`example.make_arrays`).
+        rows: what its file says of each pair (`example.make_arrays`).
         bytes: of each file.
         apart: m, of all pairs: see `middles_apart`.
         outdated: pairs in the folder that are of another version of the data (`items.PAIR_FORMAT`); none of them is counted.
@@ -111,10 +111,10 @@ def item_of(row: Row) -> Item:
     Raises:
         KeyError: something of it is missing.
     """
-    told = {**row, "overlap": row["asked_overlap"]}
+    entries = {**row, "overlap": row["asked_overlap"]}
     later = {field.name for field in fields(Item) if field.default is not MISSING}  # older rows don't tell them
-    known = {field.name for field in fields(Item)} - (later - set(told))
-    return Item(**{name: _fixed(told[name]) for name in known})
+    names = {field.name for field in fields(Item)} - (later - set(entries))
+    return Item(**{name: _fixed(entries[name]) for name in names})
 
 
 def _fixed(value: Any) -> Any:
@@ -130,12 +130,12 @@ def kind_of(reason: str) -> str:
 def middles_apart(arrays: Mapping[str, Array]) -> Array:
     """(k,) m, seen from above, between the middles of matched rooms, b's moved by the true transform.
 
-    Rooms count that are the one-to-one partner of their true room with an IoU above `CLEAN` in both maps. The IoU is that of what
-    the map saw of the room: each may have seen another end of a corridor. Heights are left out: the middle's depends on what was
-    seen of the ceiling.
+    Rooms count that are the one-to-one partner of their true room with an IoU above `CLEAN_IOU` in both maps. The IoU is that
+    of what the map saw of the room: each may have seen another end of a corridor. Heights are left out: the middle's depends on
+    what was seen of the ceiling.
     """
     i, j = arrays["matches"].T
-    clean = [(arrays[f"{s}.true_iou"] > CLEAN) & arrays[f"{s}.true_one"] for s in "ab"]
+    clean = [(arrays[f"{s}.true_iou"] > CLEAN_IOU) & arrays[f"{s}.true_one"] for s in "ab"]
     good = clean[0][i] & clean[1][j]
     moved = arrays["b.pos"][j[good]] @ arrays["transform"][:3, :3].T + arrays["transform"][:3, 3]
     return np.linalg.norm((moved - arrays["a.pos"][i[good]])[:, :2], axis=1)
@@ -172,7 +172,7 @@ def by_overlap(rows: Sequence[Row]) -> Lines:
     alike = [row for row in rows if not row["hard"]]
     hard = [row for row in rows if row["hard"]]
     kinds = ", ".join(f"{count} {kind.replace('-', ' ')}" for kind, count in Counter(row["hard"] for row in hard).most_common())
-    groups = [(name, [row for row in alike if low <= row["overlap"] < high]) for low, high, name in BINS]
+    groups = [(name, [row for row in alike if low <= row["overlap"] < high]) for low, high, name in OVERLAP_BINS]
     groups += [("all that overlap", [row for row in alike if row["overlap"] > 0]), (f"hard negatives: {kinds or 'none'}", hard)]
     body = []
     for name, held in groups:
@@ -220,7 +220,7 @@ def report(counted: Counted) -> Lines:
     if counted.apart:
         middle, most = np.percentile(counted.apart, [50, 90])
         over = len(counted.apart)
-        yield f"Matched rooms that came out of both maps with an IoU above {CLEAN:g}, one-to-one, have their middles"
+        yield f"Matched rooms that came out of both maps with an IoU above {CLEAN_IOU:g}, one-to-one, have their middles"
         yield f"{middle:.2f} m apart under the true transform, seen from above (median of {over}; 90 %: {most:.1f} m;"
         yield "each map may have seen another part of a room, which moves its middle)."
         yield ""
@@ -238,13 +238,13 @@ def insert(path: Path, lines: Iterable[str]) -> None:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: can't be read ({error.strerror})") from error
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
+    before, begin, rest = text.partition(TABLES_BEGIN)
+    _, end, after = rest.partition(TABLES_END)
     if not begin or not end:
-        raise InputError(f"{path}: lacks {BEGIN} and {END} after it; put them where the tables belong")
+        raise InputError(f"{path}: lacks {TABLES_BEGIN} and {TABLES_END} after it; put them where the tables belong")
     with replacing(path) as beside:
         body = "\n".join(line.rstrip() for line in lines).strip()
-        beside.write_text(f"{before}{BEGIN}\n{body}\n{END}{after}", encoding="utf-8")
+        beside.write_text(f"{before}{TABLES_BEGIN}\n{body}\n{TABLES_END}{after}", encoding="utf-8")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -252,7 +252,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m topomerge.datasets.reports.statistics", description=__doc__)
     parser.add_argument("manifest", nargs="?", type=Path, help="manifest of a set, such as cache/train_small.jsonl")
     parser.add_argument("--pairs", type=Path, metavar="FOLDER", help="folder of pairs, instead of a manifest")
-    parser.add_argument("--write", type=Path, metavar="FILE", help=f"replace what is between {BEGIN} and {END} in this file")
+    parser.add_argument(
+        "--write", type=Path, metavar="FILE", help=f"replace what is between {TABLES_BEGIN} and {TABLES_END} in this file"
+    )
     given = parser.parse_args(arguments)
     if (given.manifest is None) == (given.pairs is None):
         parser.error("name a manifest, or a folder with --pairs")

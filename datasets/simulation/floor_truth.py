@@ -1,12 +1,12 @@
 """What is true about the floor of a scan, what a map says about it, and how well the two agree.
 
 Places are the columns of a raster, one a storey, of the true rooms' floors: those columns of true rooms that the scan saw
-(within `NEAR` of a point of that storey), and columns outside of all true rooms and their walls that the map says are of a room.
-The map's word for a column is the room of the navigable cell there, or of the nearest one within `SPREAD`, so that neither the
-strip along a wall, where no body fits, nor a turned raster counts against anyone; further from where one can stand, the room of
-most of the occupied cells between floor and ceiling (furniture belongs to a room), or of the nearest such within `SPREAD`. In
-rooms that were not visited, and outside, only the navigable cells themselves speak.
-Drift that the simulator put into a scan is taken out of the map first: a map can't be better than its points.
+(within `SCAN_NEAR` of a point of that storey), and columns outside of all true rooms and their walls that the map says are of a
+room. The map's word for a column is the room of the navigable cell there, or of the nearest one within `WORD_SPREAD`, so that
+neither the strip along a wall, where no body fits, nor a turned raster counts against anyone; further from where one can stand,
+the room of most of the occupied cells between floor and ceiling (furniture belongs to a room), or of the nearest such within
+`WORD_SPREAD`. In rooms that were not visited, and outside, only the navigable cells themselves speak. Drift that the simulator
+put into a scan is taken out of the map first: a map can't be better than its points.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from topomerge.datasets.simulation.floors import fill
 from topomerge.metrics import SAME, RoomScores, Scores, score_doors, score_edges, score_rooms, storeys_right
 from topomerge.types import Array, Sim3, TopometricMap, TrueRoom
 
-CELL = 0.1  # m, of the raster
-SPREAD = 0.3  # m
-NEAR = 0.2  # m
-WALLS = 0.4  # m about true rooms where the map may say anything: walls, and the doorways in them
-BELOW, ABOVE = 0.6, 1.6  # m about a floor at which one stands on it
-LEAST = 0.5  # m2 that a scan must have seen of a room for it to be expected
-MARGIN = 2.0  # m around the rooms
-OUTSIDE, NOWHERE = -1, -2  # true labels: of no true room but judged; not judged
+TRUTH_CELL = 0.1  # m, of the raster
+WORD_SPREAD = 0.3  # m
+SCAN_NEAR = 0.2  # m
+WALL_ZONE = 0.4  # m about true rooms where the map may say anything: walls, and the doorways in them
+FLOOR_BELOW, FLOOR_ABOVE = 0.6, 1.6  # m about a floor at which one stands on it
+LEAST_SEEN_AREA = 0.5  # m2 that a scan must have seen of a room for it to be expected
+TRUTH_MARGIN = 2.0  # m around the rooms
+OUTSIDE_ROOMS, NOT_JUDGED = -1, -2  # true labels: of no true room but judged; not judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Truth:
     """What is true about a scan, in the frame of its building.
 
     Args:
-        raster: (L, rows, columns) int32 true room of each judged column, `OUTSIDE` or `NOWHERE`.
+        raster: (L, rows, columns) int32 true room of each judged column, `OUTSIDE_ROOMS` or `NOT_JUDGED`.
         origin: (2,) m.
         visited: (T,) bool, rooms that the surveyor was in.
         floors: (L,) m.
@@ -71,7 +71,7 @@ class Truth:
 
     def columns(self, places: Array) -> tuple[Array, Array]:
         """(n, 2) rows and columns of places in the building's frame, and which of them are on the raster."""
-        ij = np.floor((places[:, 1::-1] - self.origin[::-1]) / CELL).astype(np.int64)
+        ij = np.floor((places[:, 1::-1] - self.origin[::-1]) / TRUTH_CELL).astype(np.int64)
         inside: Array = np.all((ij >= 0) & (ij < self.raster.shape[1:]), axis=1)
         return ij, inside
 
@@ -119,12 +119,12 @@ def in_frame(truth: Truth, frame: Sim3) -> Truth:
 def draw_rooms(rooms: tuple[TrueRoom, ...], floors: Array) -> tuple[Array, Array]:
     """(L, rows, columns) int32 raster of the rooms' floors, -1 elsewhere, and its origin (m)."""
     corners = np.concatenate([r.polygon for r in rooms])
-    origin = corners.min(axis=0) - MARGIN
-    columns, rows = np.ceil((corners.max(axis=0) + MARGIN - origin) / CELL).astype(int).tolist()
-    raster = np.full((len(floors), rows, columns), OUTSIDE, np.int32)
+    origin = corners.min(axis=0) - TRUTH_MARGIN
+    columns, rows = np.ceil((corners.max(axis=0) + TRUTH_MARGIN - origin) / TRUTH_CELL).astype(int).tolist()
+    raster = np.full((len(floors), rows, columns), OUTSIDE_ROOMS, np.int32)
     for i, room in enumerate(rooms):
         storey = int(np.argmin(np.abs(floors - room.floor)))
-        fill(raster[storey], (room.polygon - origin) / CELL, i)
+        fill(raster[storey], (room.polygon - origin) / TRUTH_CELL, i)
     return raster, origin
 
 
@@ -140,10 +140,10 @@ def _judged(truth: Truth, places: Array) -> Array:
         level = inside & (places[:, 2] > floor - 0.3) & (places[:, 2] < floor + truth.height[k] + 0.3)
         seen = np.zeros(out.shape[1:], bool)
         seen[ij[level, 0], ij[level, 1]] = True
-        near = ndimage.distance_transform_edt(~seen) * CELL <= NEAR if seen.any() else seen
-        known = out[k] >= 0
-        walls = ~known & (ndimage.distance_transform_edt(~known) * CELL <= WALLS)
-        out[k][walls | (known & ~near) | (~known & ~truth.complete)] = NOWHERE
+        near = ndimage.distance_transform_edt(~seen) * TRUTH_CELL <= SCAN_NEAR if seen.any() else seen
+        of_room = out[k] >= 0
+        walls = ~of_room & (ndimage.distance_transform_edt(~of_room) * TRUTH_CELL <= WALL_ZONE)
+        out[k][walls | (of_room & ~near) | (~of_room & ~truth.complete)] = NOT_JUDGED
     return out
 
 
@@ -155,7 +155,7 @@ def said(map: TopometricMap, truth: Truth) -> Array:
     filled = truth.place(map.grid.centroids()[solid]), map.room[solid]
     for k, floor in enumerate(truth.floors):
         z = walked[0][:, 2] - floor
-        level = (z > -BELOW) & (z < min(ABOVE, truth.height[k]))
+        level = (z > -FLOOR_BELOW) & (z < min(FLOOR_ABOVE, truth.height[k]))
         where, room = walked[0][level], walked[1][level]
         order = np.argsort(-np.abs(where[:, 2] - floor), kind="stable")  # the nearest to the floor is written last
         ij, inside = truth.columns(where[order])
@@ -165,9 +165,9 @@ def said(map: TopometricMap, truth: Truth) -> Array:
         level = (z > -0.3) & (z < truth.height[k] + 0.3)
         over = _most(truth, filled[0][level], filled[1][level])
         floor_of = np.append(truth.visited, False)[truth.raster[k]] & (truth.raster[k] >= 0)
-        wide = np.where(floor_of, _spread(stood, SPREAD), _spread(stood, CELL))  # a turned raster has holes
+        wide = np.where(floor_of, _spread(stood, WORD_SPREAD), _spread(stood, TRUTH_CELL))  # a turned raster has holes
         wide = np.where(wide >= 0, wide, np.where(floor_of, over, -1))
-        out[k] = np.where(floor_of, _spread(wide, SPREAD), wide)
+        out[k] = np.where(floor_of, _spread(wide, WORD_SPREAD), wide)
     return out
 
 
@@ -176,7 +176,7 @@ def _spread(labels: Array, reach: float) -> Array:
     if not (labels >= 0).any():
         return labels
     far, (i, j) = ndimage.distance_transform_edt(labels < 0, return_indices=True)
-    return np.where(far * CELL <= reach, labels[i, j], -1)
+    return np.where(far * TRUTH_CELL <= reach, labels[i, j], -1)
 
 
 def _most(truth: Truth, places: Array, room: Array) -> Array:
@@ -209,24 +209,24 @@ class Verdict:
 def judge(map: TopometricMap, truth: Truth, columns: Array | None = None) -> Verdict:
     """Score a map.
 
-    Expected are the visited rooms of which the scan saw `LEAST`. Rooms that the map calls glimpsed and that lie mostly outside of
-    those are not held against it, and no more are doors that lead to one, or that are where a true door leads out of the visited
-    rooms.
+    Expected are the visited rooms of which the scan saw `LEAST_SEEN_AREA`. Rooms that the map calls glimpsed and that lie
+    mostly outside of those are not held against it, and no more are doors that lead to one, or that are where a true door leads
+    out of the visited rooms.
 
     Args:
         columns: `said(map, truth)` where it is known already.
     """
-    found = said(map, truth) if columns is None else columns
-    place = (truth.raster >= 0) | ((truth.raster == OUTSIDE) & (found >= 0))
-    true, labels = truth.raster[place], found[place]
+    columns = said(map, truth) if columns is None else columns
+    place = (truth.raster >= 0) | ((truth.raster == OUTSIDE_ROOMS) & (columns >= 0))
+    true, labels = truth.raster[place], columns[place]
     true_count = len(truth.visited)
-    seen = np.bincount(true[true >= 0], minlength=true_count) * CELL**2
-    expected = truth.visited & (seen >= LEAST)
+    seen = np.bincount(true[true >= 0], minlength=true_count) * TRUTH_CELL**2
+    expected = truth.visited & (seen >= LEAST_SEEN_AREA)
     own = np.bincount(labels[(labels >= 0) & np.append(expected, False)[true]], minlength=len(map.rooms))
     all_of = np.bincount(labels[labels >= 0], minlength=len(map.rooms))
     counted = ~map.rooms["glimpsed"] | (2 * own > all_of)
     if not truth.complete:
-        counted &= all_of * CELL**2 >= LEAST
+        counted &= all_of * TRUTH_CELL**2 >= LEAST_SEEN_AREA
     rooms = score_rooms(np.where(true >= 0, true, -1), labels, true_count, counted, expected)
     ends = truth.doors[:, :2].astype(np.int64)
     wanted = ((ends >= 0) & np.append(expected, False)[ends]).all(axis=1)

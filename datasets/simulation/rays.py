@@ -98,9 +98,9 @@ def cast(building: Building, sensor: Sensor, poses: Array, number: int, rng: np.
             ranges[ghost], triangle[ghost], cosine[ghost] = ranges[ghost] + beyond[0], beyond[1], beyond[2]
         image = ranges.reshape(-1, rows, columns)
         ranges = _mix(image, sensor.mixed, rng).ravel()
-        kept = np.flatnonzero((triangle >= 0) & (ranges > sensor.reach[0]) & (ranges < reach))
-        pose = first + kept // len(rays)
-        out.append((pose, spun[kept % len(rays)], ranges[kept], near[triangle[kept]], cosine[kept], ghost[kept]))
+        seen = np.flatnonzero((triangle >= 0) & (ranges > sensor.reach[0]) & (ranges < reach))
+        pose = first + seen // len(rays)
+        out.append((pose, spun[seen % len(rays)], ranges[seen], near[triangle[seen]], cosine[seen], ghost[seen]))
     return Hits(*(np.concatenate(column) for column in zip(*out, strict=True)))
 
 

@@ -65,8 +65,8 @@ def scan(
     estimated = drifted(poses, walk, along, kind, rng)
     points = placed(estimated, hits, hits.ranges)
     if not budget:
-        kept = _thin(points, spacing)
-        points, hits = points[kept], hits.take(kept)
+        rows = _thin(points, spacing)
+        points, hits = points[rows], hits.take(rows)
     cloud = PointCloud(
         points.astype(np.float32),
         labels=_rooms_of(building, poses, hits),
@@ -116,12 +116,12 @@ def _degrade(building: Building, poses: Array, hits: Hits, sensor: Sensor, rng: 
     chance[faint[thing] & (thing >= 0)] *= 0.15
     chance[hits.cosine < np.sin(np.radians(sensor.grazing))] *= 0.1
     chance[np.isin(building.labels[hits.triangle], PLAIN)] *= sensor.plain
-    kept = rng.random(count) < chance
+    returned = rng.random(count) < chance
     if sensor.lowest > 0:
-        kept &= placed(poses, hits, hits.ranges)[:, 2] - poses[hits.pose, 2, 3] + sensor.height > sensor.lowest
+        returned &= placed(poses, hits, hits.ranges)[:, 2] - poses[hits.pose, 2, 3] + sensor.height > sensor.lowest
     sigma = sensor.noise[0] + sensor.noise[1] * hits.ranges + sensor.quadratic * hits.ranges**2
     ranges = np.clip(hits.ranges + rng.normal(size=count) * sigma, 0.01, sensor.reach[1])
-    return replace(hits, ranges=ranges.astype(np.float32)).take(kept)
+    return replace(hits, ranges=ranges.astype(np.float32)).take(returned)
 
 
 def _rooms_of(building: Building, poses: Array, hits: Hits) -> Array:

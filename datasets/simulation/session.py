@@ -16,8 +16,8 @@ from topomerge.datasets.core.solids import boxes, rotation
 
 from topomerge.types import Array
 
-TRIES = 6
-NUDGE = 0.15  # m, standard deviation of a small move
+MOVES_TRIED = 6
+SMALL_MOVE = 0.15  # m, standard deviation of a small move
 
 
 def session(building: Building, difficulty: Difficulty | None = None, rng: np.random.Generator | int = 0) -> Building:
@@ -46,8 +46,8 @@ def session(building: Building, difficulty: Difficulty | None = None, rng: np.ra
     _swing(things, doors, difficulty, rng)
     for i in np.flatnonzero(things["movable"] & ~gone).tolist():
         _carry(vertices, order[starts[i] : starts[i + 1]], building.things[i], things[i])
-    kept = (building.thing_of < 0) | ~gone[building.thing_of]
-    mesh = [vertices, building.triangles[kept], building.labels[kept], building.thing_of[kept]]
+    stays = (building.thing_of < 0) | ~gone[building.thing_of]
+    mesh = [vertices, building.triangles[stays], building.labels[stays], building.thing_of[stays]]
     things = _people(building, mesh, things, outlines[~gone], difficulty, rng)
     vertices, triangles, labels, thing_of = mesh
     return replace(
@@ -71,9 +71,9 @@ def _move(building: Building, things: Array, outlines: Array, gone: Array, i: in
     low, high = np.array(room.bounds).reshape(2, 2)
     clear = [] if near else keep_clear(int(things["room"][i]), building.doors, building.stairs)
     others = outlines[(things["room"] == things["room"][i]) & ~gone & (np.arange(len(things)) != i)]
-    for _ in range(TRIES):
+    for _ in range(MOVES_TRIED):
         new = things[i : i + 1].copy()[0]
-        new["centre"][:2] = new["centre"][:2] + rng.normal(0, NUDGE, 2) if near else rng.uniform(low, high)
+        new["centre"][:2] = new["centre"][:2] + rng.normal(0, SMALL_MOVE, 2) if near else rng.uniform(low, high)
         new["yaw"] += rng.normal(0, 0.1) if near else rng.integers(4) * np.pi / 2
         outline = _outline(new)
         if room.contains(outline) and not shapely.intersects([*others, *clear], outline).any():
@@ -112,7 +112,7 @@ def _people(
         low, high = np.array(shape.bounds).reshape(2, 2)
         for _ in range(int(rng.poisson(difficulty.people)) if room.kind != "lift" else 0):
             item, yaw = make_item("person", rng), float(rng.uniform(0, 2 * np.pi))
-            bodies = shapely.points(rng.uniform(low, high, (TRIES, 2)))
+            bodies = shapely.points(rng.uniform(low, high, (MOVES_TRIED, 2)))
             bodies = bodies[shapely.contains(shape, bodies) & (shapely.distance(shape.exterior, bodies) > 0.3)]
             bodies = [b for b in bodies if not len(tree.query(b, "dwithin", 0.3)) and all(b.distance(s) > 0.3 for s in stairs)]
             if not bodies:

@@ -10,9 +10,9 @@ from topomerge.datasets.core.building import Building
 
 from topomerge.types import Array
 
-END = (0.15, 0.35)  # share of the building's length that an end takes
-STRETCH = (0.1, 0.3)  # by which an end is longer, or shorter
-BEND = 1e-3  # m, step of the slope of the map
+END_SHARE = (0.15, 0.35)  # share of the building's length that an end takes
+END_STRETCH = (0.1, 0.3)  # by which an end is longer, or shorter
+SLOPE_STEP = 1e-3  # m, step of the slope of the map
 
 Place = Callable[[Array], Array]
 
@@ -20,8 +20,8 @@ Place = Callable[[Array], Array]
 def twin_wing(building: Building, rng: np.random.Generator | int = 0) -> Building:
     """A wing that is hard to tell from the building: the same rooms, in the same order, in nearly the same places.
 
-    Along its longer side, one of its ends or both are stretched or shrunk by `STRETCH`, with all that stands in them: end walls
-    move by metres, doors with them. Half of the twins are mirrored, too.
+    Along its longer side, one of its ends or both are stretched or shrunk by `END_STRETCH`, with all that stands in them: end
+    walls move by metres, doors with them. Half of the twins are mirrored, too.
 
     Args:
         rng: generator or seed.
@@ -30,8 +30,10 @@ def twin_wing(building: Building, rng: np.random.Generator | int = 0) -> Buildin
     corners = np.concatenate([room.polygon for room in building.rooms])
     low, high = corners.min(axis=0), corners.max(axis=0)
     axis = int(np.argmax(high - low))
-    knots = np.array([low[axis], *(rng.uniform(*END, 2) * (1, -1) * (high - low)[axis] + (low[axis], high[axis])), high[axis]])
-    factors = np.exp(rng.choice([-1, 1], 2) * np.log1p(rng.uniform(*STRETCH, 2)))
+    knots = np.array(
+        [low[axis], *(rng.uniform(*END_SHARE, 2) * (1, -1) * (high - low)[axis] + (low[axis], high[axis])), high[axis]]
+    )
+    factors = np.exp(rng.choice([-1, 1], 2) * np.log1p(rng.uniform(*END_STRETCH, 2)))
     if rng.random() < 0.5:
         factors[int(rng.integers(2))] = 1.0
     mirrored = bool(rng.random() < 0.5)
@@ -60,7 +62,7 @@ def bent(building: Building, axis: int, place: Place, mirrored: bool = False) ->
 
     def slope(points: Array) -> Array:
         x = np.asarray(points, np.float64)[..., axis]
-        return (place(x + BEND) - place(x - BEND)) / (2 * BEND)
+        return (place(x + SLOPE_STEP) - place(x - SLOPE_STEP)) / (2 * SLOPE_STEP)
 
     turn = -1 if mirrored else 1
     doors, stairs, things = building.doors.copy(), building.stairs.copy(), building.things.copy()

@@ -18,8 +18,8 @@ from topomerge.datasets.simulation.floors import Floors, draw_floors, fill
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-CELL = 0.1  # m, of the floor that is walked on
-BODY = 0.2  # m, half a person's width
+WALK_CELL = 0.1  # m, of the floor that is walked on
+HALF_PERSON = 0.2  # m, half a person's width
 BLOCKED = 40.0  # what a step through furniture costs: only taken where there is no other way
 FOREIGN = 8.0  # what a step in a room that was not asked for costs
 SIGHT = (3.5, 5.0)  # m; every part of a room is that close to a stop: thorough surveyors and hasty ones
@@ -66,7 +66,7 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
     wanted = sorted({int(r) for r in rooms})
     if not wanted or wanted[0] < 0 or wanted[-1] >= len(building.rooms):
         raise InputError(f"rooms to visit must be among 0..{len(building.rooms) - 1}, not {list(rooms)[:5]}")
-    floors = draw_floors(building, CELL)
+    floors = draw_floors(building, WALK_CELL)
     cost, clear = _costs(building, floors, wanted)
     graph, places = _graph(building, floors, cost)
     sight = float(rng.uniform(*SIGHT))
@@ -86,7 +86,7 @@ def plan_walk(building: Building, rooms: Sequence[int], rng: np.random.Generator
     room = np.append(floors.room.ravel(), np.full(len(places) - floors.room.size, -1))[way]
     price = np.append(cost.ravel(), np.ones(len(places) - cost.size))[way]
     step = np.linalg.norm(np.diff(places[way], axis=0), axis=1)
-    first = np.concatenate([[0], np.cumsum(np.maximum(np.ceil(step / (1.5 * CELL)), 1))])  # stairs have few nodes
+    first = np.concatenate([[0], np.cumsum(np.maximum(np.ceil(step / (1.5 * WALK_CELL)), 1))])  # stairs have few nodes
     at = np.arange(first[-1] + 1)
     points = np.stack([np.interp(at, first, places[way][:, k]) for k in range(3)], axis=1)
     nearest = np.clip(np.searchsorted(first, at), 0, len(way) - 1)
@@ -109,11 +109,11 @@ def _costs(building: Building, floors: Floors, wanted: list[int]) -> tuple[Array
         upper = [r.polygon for r in building.rooms if r.storey != k and r.floor < floor < r.ceiling - 1.5]
         blocked = [s["footprint"] for s in building.stairs if k in s["storeys"] and s["kind"] != "lift"]
         passable[k] &= ~_outlines([*blocked, *upper], floors)
-        walls = ndimage.distance_transform_edt(passable[k]) * CELL
-        clear[k] = np.minimum(walls, ndimage.distance_transform_edt(~filled) * CELL)
+        walls = ndimage.distance_transform_edt(passable[k]) * WALK_CELL
+        clear[k] = np.minimum(walls, ndimage.distance_transform_edt(~filled) * WALK_CELL)
         cost[k] = 1 + 2 * np.exp(-np.minimum(clear[k], 5) / 0.3)
-        cost[k][clear[k] < BODY] += BLOCKED
-        cost[k][walls < 1.5 * CELL] = np.inf
+        cost[k][clear[k] < HALF_PERSON] += BLOCKED
+        cost[k][walls < 1.5 * WALK_CELL] = np.inf
     cost[foreign] *= FOREIGN
     return cost, clear
 

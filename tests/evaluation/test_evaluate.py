@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from topomerge.datasets.pairs.degrade import degraded
-from topomerge.datasets.pairs.evaluation_pair import load_kept
+from topomerge.datasets.pairs.evaluation_pair import load_evaluation_pair
 from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.pairs.recipe import check as check_recipe
 
@@ -168,7 +168,7 @@ def test_two_simulated_pairs_from_beginning_to_end(tmp_path: Path, monkeypatch: 
     files = {p.name for p in first.folder.iterdir()}
     assert {"report.md", "tables.tex", "scores.csv", "matches.csv", "ranks.csv", "merges.csv", "pr.png"} <= files
     row = first.ranks[0]
-    pair = load_kept(tmp_path / "cache" / "pairs" / f"{row['pair']}.npz")
+    pair = load_evaluation_pair(tmp_path / "cache" / "pairs" / f"{row['pair']}.npz")
     assert row["queries"] == sum(len(np.unique(pair.matches[:, s])) for s in (0, 1))
     assert len(pair.maps()[0].rooms) == len(pair.true[0]) == len(pair.twin[0])
     table = list(csv.DictReader((first.folder / "scores.csv").open()))

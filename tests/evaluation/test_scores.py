@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from topomerge.datasets.pairs.evaluation_pair import KeptPair, twins
+from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, twins
 
 from topomerge.errors import InputError
 from topomerge.evaluation.groups import calibration, draws, gain, value
@@ -25,7 +25,7 @@ from topomerge.evaluation.score import (
 from topomerge.types import Sim3, TrueRoom
 
 
-def kept(**changes: Any) -> KeptPair:
+def kept(**changes: Any) -> EvaluationPair:
     """Map a has five rooms: true 0, 1, 1 (in two pieces), 2, none; map b four: true 1, 0, 2, 3. Room 2 of a has a twin."""
     known = {
         "name": "x",
@@ -39,7 +39,7 @@ def kept(**changes: Any) -> KeptPair:
         "anchor": np.array([5.0, 0.0, 0.0]),
         "about": {"kind": "overlap", "common": 100.0, "sensors": ["tls", "depth"], "rooms": "labelled"},
     }
-    return KeptPair(**(known | changes))
+    return EvaluationPair(**(known | changes))
 
 
 def test_matches_are_counted_by_hand() -> None:

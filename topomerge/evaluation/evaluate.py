@@ -13,7 +13,7 @@ from typing import Any
 from topomerge.code_digest import code_digest
 from topomerge.datasets.pairs.build import Build, build
 from topomerge.datasets.pairs.recipe import Recipe
-from topomerge.datasets.real.maps import keep_real
+from topomerge.datasets.real.maps import real_evaluation_pairs
 from topomerge.errors import InputError
 from topomerge.evaluation.figures import save_figures
 from topomerge.evaluation.predict import CODE, predict_all
@@ -126,7 +126,7 @@ def pairs_of(settings: Evaluation, say: Say) -> list[Path]:
     """Files of the kept pairs, made where they are missing."""
     data = settings.data
     if data.real:
-        found = keep_real(data.folder, Path(settings.cache), data.real, data.voxel_size, say)
+        found = real_evaluation_pairs(data.folder, Path(settings.cache), data.real, data.voxel_size, say)
         return found[: settings.limit or None]
     if not data.maps:
         raise InputError(f"{data.name}: its maps are not kept; set data.maps=true")

@@ -15,7 +15,7 @@ import numpy as np
 
 import topomerge
 from topomerge.code_digest import code_digest
-from topomerge.datasets.pairs.evaluation_pair import KeptPair, load_kept
+from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
 from topomerge.evaluation.describe import Inputs, Maps, described, trained
@@ -37,7 +37,7 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
     Raises:
         InputError: the pair can't be read.
     """
-    kept = load_kept(path)
+    kept = load_evaluation_pair(path)
     maps = kept.maps()
     some = list(variants(settings))
     arrays: dict[str, Array] = {}
@@ -100,7 +100,7 @@ def mutual(learned: Any, maps: Maps) -> tuple[Array, Array]:
     return np.stack([i, j], axis=1), np.sqrt(rows[i, j] * columns[j, i])
 
 
-def merged(maps: Maps, rows: tuple[Array, Array], kept: KeptPair, poses: str) -> dict[str, Any]:
+def merged(maps: Maps, rows: tuple[Array, Array], kept: EvaluationPair, poses: str) -> dict[str, Any]:
     """What the merge of both maps says: as plain values."""
     scale = "free" if kept.about["scale_free"] else "fixed"
     began = time.process_time()

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.datasets.pairs.evaluation_pair import KeptPair, load_kept
+from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair
 from topomerge.evaluation.settings import Evaluation, variants
 from topomerge.io import archive
 from topomerge.types import Array, Sim3
@@ -35,7 +35,7 @@ def score_all(pairs: Sequence[Path], predictions: Sequence[Path], settings: Eval
     merges: list[Row] = []
     some = list(variants(settings))
     for path, file in zip(pairs, predictions, strict=True):
-        kept, data = load_kept(path), archive.read(file, "predictions")
+        kept, data = load_evaluation_pair(path), archive.read(file, "predictions")
         told = json.loads(data["told"].tobytes())
         about = {**group_of(kept, settings), "code": told["code"]}
         known = kept.about["rooms"] != "laid" or bool(len(kept.matches))
@@ -54,7 +54,7 @@ def score_all(pairs: Sequence[Path], predictions: Sequence[Path], settings: Eval
     return matches, ranks, merges
 
 
-def group_of(kept: KeptPair, settings: Evaluation) -> Row:
+def group_of(kept: EvaluationPair, settings: Evaluation) -> Row:
     """What a pair is counted under."""
     about = kept.about
     source, common, kind = about["source"], float(about["common"]), about["kind"]
@@ -83,13 +83,13 @@ def overlap_bin(share: float, kind: str = "overlap") -> str:
     return kind if kind != "overlap" else next(name for limit, name in OVERLAPS if share <= limit)
 
 
-def right_matches(kept: KeptPair, rooms: Array) -> Array:
+def right_matches(kept: EvaluationPair, rooms: Array) -> Array:
     """(M,) bool: are both rooms of each match one true room?"""
     true = {tuple(m) for m in kept.matches.tolist()}
     return np.array([tuple(m) in true for m in rooms.tolist()], bool)
 
 
-def match_counts(kept: KeptPair, rooms: Array) -> Row:
+def match_counts(kept: EvaluationPair, rooms: Array) -> Row:
     """Counts of matches (M, 2).
 
     `predicted`, `right`: matches; `units`, `found`: true rooms that both maps have, and those that a right match found; each also
@@ -111,11 +111,11 @@ def match_counts(kept: KeptPair, rooms: Array) -> Row:
     return out
 
 
-def _unit(kept: KeptPair, i: int, j: int) -> tuple[int, int]:
+def _unit(kept: EvaluationPair, i: int, j: int) -> tuple[int, int]:
     return int(kept.true[0][i]), int(kept.true[1][j])
 
 
-def _units(kept: KeptPair) -> dict[tuple[int, int], list[tuple[int, int]]]:
+def _units(kept: EvaluationPair) -> dict[tuple[int, int], list[tuple[int, int]]]:
     """True rooms that both maps have -> matches of their pieces."""
     out: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j in kept.matches.tolist():
@@ -140,7 +140,7 @@ def ranks_of(cost: Array, matches: Array) -> tuple[Array, Array]:
     return rooms, rank
 
 
-def rank_counts(kept: KeptPair, cost: Array) -> Row:
+def rank_counts(kept: EvaluationPair, cost: Array) -> Row:
     """`queries`: rooms of either map with a true partner in the other; `first`, `five`: whose partner ranks first, within five;
     `reciprocal`: sum of 1 / rank; each also with and without a twin, and (`_whole`) where neither room was looked into only.
     `chance`: first ones to be expected of a draw."""
@@ -162,7 +162,7 @@ def rank_counts(kept: KeptPair, cost: Array) -> Row:
     return out
 
 
-def after_counts(kept: KeptPair, cost: Array, agreed: Array | None) -> Row:
+def after_counts(kept: EvaluationPair, cost: Array, agreed: Array | None) -> Row:
     """`first`, `first_single` and `five` as of `rank_counts`, each with `_after`: of a ranking in which the matches (M, 2) that
     one transform explains come first, and the descriptor ranks what they leave; nan where that was not run."""
     names = ("first", "first_single", "five")
@@ -187,7 +187,7 @@ def within(error: tuple[float, float, float], flat: bool, limits: tuple[float, f
     return far < limits[0] and error[2] < limits[1]
 
 
-def merge_counts(kept: KeptPair, said: Mapping[str, Any]) -> Row:
+def merge_counts(kept: EvaluationPair, said: Mapping[str, Any]) -> Row:
     """`near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed and
     near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common."""
     mergeable = kept.transform is not None and kept.about["kind"] == "overlap" and kept.about["common"] >= 1

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from topomerge.datasets.core.derived import derive, read_derived
-from topomerge.datasets.pairs.evaluation_pair import load_kept
+from topomerge.datasets.pairs.evaluation_pair import load_evaluation_pair
 from topomerge.datasets.pairs.recipe import Recipe
 from topomerge.embedding.engineered import FEATURES, raw_features
 from topomerge.errors import InputError
@@ -76,7 +76,7 @@ def pair_features(recipe: Recipe, settings: FeatureScale, say: Say) -> list[Pair
 
 def features_of(path: Path) -> dict[str, Array]:
     """`PairFeatures` of a pair's file."""
-    pair = load_kept(path)
+    pair = load_evaluation_pair(path)
     maps = pair.maps()
     a, b = (raw_features(m) for m in maps)
     glimpsed = [np.asarray(m.rooms["glimpsed"], bool) for m in maps]

@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from topomerge.datasets.core.derived import derive, read_derived
 from topomerge.datasets.pairs.build import Build, build
-from topomerge.datasets.pairs.evaluation_pair import KeptPair, load_kept
+from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair
 from topomerge.datasets.pairs.recipe import Recipe
 from topomerge.errors import InputError
 from topomerge.fusion.fuse import rooms_in_common
@@ -75,7 +75,7 @@ def fit_odds(settings: MatchOdds, say: Say) -> Fitted:
 
 def pair_evidence(recipe: Recipe, settings: MatchOdds, say: Say) -> list[Evidence]:
     """Of each pair, and of each map with one of another building, cached."""
-    paths = [path for path in map_pairs(recipe, settings, say) if _has_matches(load_kept(path))]
+    paths = [path for path in map_pairs(recipe, settings, say) if _has_matches(load_evaluation_pair(path))]
     sources = [[path] for path in paths]
     sources += [[path, paths[(n + STRANGER) % len(paths)]] for n, path in enumerate(paths)]
     files, _ = derive(f"{recipe.name}_odds", evidence_of, sources, settings, say=say)
@@ -88,16 +88,16 @@ def pair_evidence(recipe: Recipe, settings: MatchOdds, say: Say) -> list[Evidenc
     return evidence
 
 
-def _has_matches(pair: KeptPair) -> bool:
+def _has_matches(pair: EvaluationPair) -> bool:
     return pair.transform is not None and len(pair.matches) > 0
 
 
 def evidence_of(path: Path, other: Path | None = None) -> dict[str, Array]:
     """What hypotheses and rooms of a pair show; with `other` those of its first map and of the second one of another pair."""
-    pair = load_kept(path)
+    pair = load_evaluation_pair(path)
     a, b = pair.maps()
     if other is not None:
-        b = load_kept(other).maps()[1]
+        b = load_evaluation_pair(other).maps()[1]
     hypotheses = match(a, b).alternatives
     right = [other is None and is_right(pair, h.transform) for h in hypotheses]
     evidence = np.array([list(h.features.values()) for h in hypotheses]).reshape(-1, 3)
@@ -111,7 +111,7 @@ def evidence_of(path: Path, other: Path | None = None) -> dict[str, Array]:
     return {"building": building, "hypotheses": features, "right": np.array(right, bool), "rooms": rooms, "one": one}
 
 
-def is_right(pair: KeptPair, pose: Sim3) -> bool:
+def is_right(pair: EvaluationPair, pose: Sim3) -> bool:
     """As merges are judged."""
     truth = pair.transform
     assert truth is not None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 from topomerge.datasets.buildings.layouts import SHAPES
-from topomerge.datasets.buildings.procedural import KINDS, connected, make_building
+from topomerge.datasets.buildings.procedural import BUILDING_KINDS, connected, make_building
 from topomerge.datasets.core.building import SURFACES, Building
 from topomerge.datasets.core.difficulty import Difficulty
 
@@ -23,7 +23,7 @@ def digest(building: Building) -> str:
     return hashlib.sha256(b"".join(a.tobytes() for a in arrays)).hexdigest()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BUILDING_KINDS)
 @pytest.mark.parametrize("storeys", [1, 3])
 def test_buildings_of_every_kind_are_sound(kind: str, storeys: int) -> None:
     building = make_building(kind, 3, storeys, EMPTY)

@@ -10,7 +10,7 @@ import pytest
 import shapely
 from topomerge.datasets.buildings.erect import erect
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.buildings.stack import COMMON, COVER, WALLS, alike, iter_stacks, moved, register, stack
+from topomerge.datasets.buildings.stack import COVER, DRAWN_WALLS, SURVEYED_WALLS, alike, iter_stacks, moved, register, stack
 from topomerge.datasets.buildings.stairwell import fit_flight
 from topomerge.datasets.core.plan import Opening, Plan
 from topomerge.datasets.pairs.parts import twin_rooms, two_parts
@@ -139,11 +139,13 @@ def test_bent_by_hand() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("folder", "stacks", "joined"), [("plans_schools_offices", 12, 8), ("sim_rmf_buildings", 3, 0)])
 def test_real_storeys(data_dir: Path, folder: str, stacks: int, joined: int) -> None:
-    found = dict(iter_stacks(data_dir / folder))
-    fitting = [s for s in found.values() if not hasattr(s, "reason")]
+    stacks = dict(iter_stacks(data_dir / folder))
+    fitting = [s for s in stacks.values() if not hasattr(s, "reason")]
     assert len(fitting) == stacks and sum(s.stairs[0] > 0 for s in fitting) == joined
     for result in fitting:
-        assert result.fits[0].walls >= (COMMON if result.fits[0].common else WALLS) and result.fits[0].cover >= COVER
+        assert (
+            result.fits[0].walls >= (SURVEYED_WALLS if result.fits[0].common else DRAWN_WALLS) and result.fits[0].cover >= COVER
+        )
         building = erect(result.plans, BARE)
         walked = [p for p, r in zip(building.parts(), building.rooms, strict=True) if r.kind != "lift"]
         assert len(set(walked)) == (1 if result.stairs[0] else 2), result.names

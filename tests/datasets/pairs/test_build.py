@@ -172,7 +172,7 @@ def test_real_storeys_are_stacked_where_the_recipe_says_so() -> None:
 
 def test_what_takes_too_long_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(example, "make_arrays", lambda item, plans: time.sleep(5))
-    monkeypatch.setattr(example, "LONGEST", 0.1)
+    monkeypatch.setattr(example, "LONGEST_PAIR", 0.1)
     row = example.make_file(draw_items(SMALL, {})[0], [], str(tmp_path))
     assert row.reason == "takes longer than 0.1 s" and row.seconds < 2 and not list(tmp_path.iterdir())
 

@@ -26,8 +26,8 @@ def test_walls_stand_where_rooms_end_and_doors_are_open() -> None:
     free = shapely.union_all(shapely.points(flat.free)[::7]).buffer(0.1)
     inner = building.doors[(building.doors["rooms"] >= 0).all(axis=1)]
     assert shapely.distance(free, shapely.points(inner["centre"][:, :2])).max() < 0.2
-    found = extract(raise_flat(flat), carve=False)
-    assert abs(len(found.rooms) - len(building.rooms)) <= 2 and len(found.edges) >= 0.7 * len(inner)
+    map = extract(raise_flat(flat), carve=False)
+    assert abs(len(map.rooms) - len(building.rooms)) <= 2 and len(map.edges) >= 0.7 * len(inner)
 
 
 def test_the_plan_lies_where_the_scan_would_be() -> None:

@@ -46,8 +46,8 @@ def test_place_door_where_rooms_face_each_other() -> None:
 
 def test_sides_are_left_and_right() -> None:
     shapes = [shapely.box(0, 0, 4, 4), shapely.box(4, 0, 8, 4)]
-    found = sides(np.array([[4.0, 1], [0, 1]]), np.array([[4.0, 2], [0, 2]]), shapes, 0.3)
-    assert found.tolist() == [[0, 1], [-1, 0]]
+    joined_rooms = sides(np.array([[4.0, 1], [0, 1]]), np.array([[4.0, 2], [0, 2]]), shapes, 0.3)
+    assert joined_rooms.tolist() == [[0, 1], [-1, 0]]
 
 
 def test_flood_meets_in_the_narrowest_place() -> None:

@@ -347,7 +347,7 @@ def test_csd_refuses(tmp_path, poses, said):
 # --- all of them
 
 
-@pytest.mark.parametrize("source", public.SOURCES)
+@pytest.mark.parametrize("source", public.PUBLIC_SOURCES)
 def test_a_folder_of_something_else_is_refused_in_one_line(tmp_path, source):
     (tmp_path / "holiday.jpg").write_bytes(b"\xff\xd8")
     assert len(refusals(public.iter_public_pairs(tmp_path, source))) == 1

@@ -6,14 +6,15 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from topomerge.datasets.real import maps, strands
+from topomerge.datasets.real import maps
+from topomerge.datasets.real.sources import REAL_FOLDERS
 
 from tests.package_copy import edited_kernel
 from topomerge.code_digest import code_digest
 
 
 def test_maps_of_other_code_or_files_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    file = tmp_path / strands.FOLDER / "a.yaml"
+    file = tmp_path / REAL_FOLDERS["strands"] / "a.yaml"
     file.parent.mkdir()
     file.write_text("one")
     before = maps.digest(tmp_path, "strands", 0.1)

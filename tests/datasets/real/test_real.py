@@ -12,11 +12,7 @@ from scipy.spatial import cKDTree
 from topomerge.datasets.pairs import flat
 from topomerge.datasets.pairs.pairs import Pair, is_identity
 from topomerge.datasets.plans.floorplans import Refusal
-from topomerge.datasets.real import carmen as real_carmen
-from topomerge.datasets.real import halmstad as real_halmstad
-from topomerge.datasets.real import sources as real
-from topomerge.datasets.real import utexas as real_utexas
-from topomerge.datasets.real import wall_fit
+from topomerge.datasets.real import carmen, halmstad, sources, utexas, wall_fit
 
 from topomerge.errors import InputError
 from topomerge.types import PointCloud, Sim3
@@ -48,7 +44,7 @@ def check(name: str, pair: Pair | Refusal) -> None:
 
 @pytest.mark.data
 def test_walls_agree_in_halmstad_pairs(data_dir):
-    makers = list(real_halmstad.pairs(data_dir / real_halmstad.FOLDER))
+    makers = list(halmstad.pairs(data_dir / sources.REAL_FOLDERS["halmstad"]))
     assert len(makers) == COUNTS["halmstad"]
     for name, make in makers[3::4]:
         pair = make()
@@ -61,11 +57,9 @@ def test_walls_agree_in_halmstad_pairs(data_dir):
 @pytest.mark.parametrize("wanted", QUICK)
 def test_walls_agree_in_single_pairs(data_dir, wanted):
     source, name = wanted.split("/")
-    module = {"utexas": real_utexas, "carmen": real_carmen}.get(source)
-    if module is None:
+    if source == "ifc":
         pytest.importorskip("ifcopenshell")
-        from topomerge.datasets.real import ifc as module
-    pair = dict(module.pairs(data_dir / module.FOLDER))[name]()
+    pair = dict(sources.pair_makers(source, data_dir))[name]()
     check(wanted, pair)
     if source == "utexas":  # rooms of the robot grid are rooms of the other map
         assert len(pair.shared) == SHARED[name]
@@ -76,10 +70,10 @@ def test_walls_agree_in_single_pairs(data_dir, wanted):
 
 @pytest.mark.data
 @pytest.mark.slow
-@pytest.mark.parametrize("source", real.SOURCES)
+@pytest.mark.parametrize("source", sources.REAL_SOURCES)
 def test_walls_agree_in_every_pair(data_dir, source):
     count = 0
-    for name, pair in real.iter_real_pairs(data_dir, [source]):
+    for name, pair in sources.iter_real_pairs(data_dir, [source]):
         check(name, pair)
         count += 1
     assert count == COUNTS[source]
@@ -89,15 +83,15 @@ def test_walls_agree_in_every_pair(data_dir, source):
 
 
 def test_a_missing_source_is_refused_and_the_rest_goes_on(tmp_path):
-    results = list(real.iter_real_pairs(tmp_path))
+    results = list(sources.iter_real_pairs(tmp_path))
     assert all(isinstance(r, Refusal) and "\n" not in r.reason for _, r in results)
-    assert {name.split("/")[0] for name, _ in results} == set(real.SOURCES)
-    assert list(real.table(iter(results)))[3] == f"Refused: {len(results)}"
+    assert {name.split("/")[0] for name, _ in results} == set(sources.REAL_SOURCES)
+    assert list(sources.table(iter(results)))[3] == f"Refused: {len(results)}"
     with pytest.raises(InputError, match="halmstad"):
-        real.iter_real_pairs(tmp_path, ["kitti"])
+        sources.iter_real_pairs(tmp_path, ["kitti"])
     with pytest.raises(InputError, match="no such folder"):
-        real.iter_real_pairs(tmp_path / "none")
-    assert real.main(["--table", str(tmp_path / "none")]) == 1
+        sources.iter_real_pairs(tmp_path / "none")
+    assert sources.main(["--table", str(tmp_path / "none")]) == 1
 
 
 def scans(count: int = 60) -> tuple[np.ndarray, np.ndarray]:
@@ -122,8 +116,8 @@ def write_log(path, poses, ranges, tail=""):
 def test_carmen_log_is_cut_into_parts_that_fit(tmp_path):
     poses, ranges = scans()
     write_log(tmp_path / "corridor-corrected.log.gz", poses, ranges)
-    results = list(real.collect("carmen", real_carmen.pairs(tmp_path)))
-    assert [name for name, _ in results] == [f"carmen/corridor-{a}-{b}" for a, b in real_carmen.PAIRS]
+    results = list(sources.collect("carmen", carmen.pairs(tmp_path)))
+    assert [name for name, _ in results] == [f"carmen/corridor-{a}-{b}" for a, b in carmen.PAIRS]
     for _, pair in results:
         assert isinstance(pair, Pair), pair.reason
         assert not is_identity(pair.truth) and pair.overlap > 0.5
@@ -134,7 +128,7 @@ def test_carmen_log_is_cut_into_parts_that_fit(tmp_path):
 def test_carmen_scans_draw_walls_and_free_space():
     poses, ranges = scans()
     frame = Sim3(0.6, (3.0, -2.0, 0.0))
-    drawn = real_carmen.draw(poses, ranges, frame)
+    drawn = carmen.draw(poses, ranges, frame)
     x, y = frame.inverse().apply(np.column_stack([drawn.walls, np.zeros(len(drawn.walls))]))[:, :2].T
     edge = np.minimum(np.minimum(np.abs(np.abs(y) - 1), np.abs(x + 2)), np.abs(x - 14))
     assert edge.max() < 0.06
@@ -143,15 +137,15 @@ def test_carmen_scans_draw_walls_and_free_space():
 
 
 def test_carmen_parts_share_no_scan_and_failed_ranges_say_nothing():
-    for a, b in real_carmen.PAIRS:
-        first, second = real_carmen.split(100, a, b)
+    for a, b in carmen.PAIRS:
+        first, second = carmen.split(100, a, b)
         assert not set(first) & set(second)
         assert min(len(first), len(second)) >= 37
     poses, ranges = scans()
     ranges[:, 90] = 81.9
-    assert len(real_carmen.draw(poses, np.full_like(ranges, 81.9), Sim3()).free) == 0
+    assert len(carmen.draw(poses, np.full_like(ranges, 81.9), Sim3()).free) == 0
     with pytest.raises(InputError, match="too short"):
-        real_carmen.split(30, "first", "last")
+        carmen.split(30, "first", "last")
 
 
 @pytest.mark.parametrize(
@@ -169,27 +163,27 @@ def test_carmen_damage_is_refused_in_one_line(tmp_path, damage, said):
     path = tmp_path / "x-corrected.log.gz"
     write_log(path, *scans())
     damage(path)
-    for _, result in real.collect("carmen", real_carmen.pairs(tmp_path)):
+    for _, result in sources.collect("carmen", carmen.pairs(tmp_path)):
         assert isinstance(result, Refusal) and said in result.reason
 
 
 def test_halmstad_similarity_is_that_of_the_key_points():
-    known = Sim3(2.0, (1.0, -3.0, 0.0), 0.6)
+    truth = Sim3(2.0, (1.0, -3.0, 0.0), 0.6)
     b = np.random.default_rng(0).uniform(0, 20, (9, 2))
-    a = known.apply(np.column_stack([b, np.zeros(9)]))[:, :2]
-    np.testing.assert_allclose(real_halmstad.fit_points(a, b).matrix, known.matrix, atol=1e-9)
+    a = truth.apply(np.column_stack([b, np.zeros(9)]))[:, :2]
+    np.testing.assert_allclose(halmstad.fit_points(a, b).matrix, truth.matrix, atol=1e-9)
     with pytest.raises(InputError, match="two points"):
-        real_halmstad.fit_points(a[:1], b[:1])
+        halmstad.fit_points(a[:1], b[:1])
 
 
 def test_halmstad_list_is_checked(tmp_path):
     path = tmp_path / "ground_truth_pairs.json"
     path.write_text("{")
-    ((_, result),) = real.collect("halmstad", real_halmstad.pairs(tmp_path))
+    ((_, result),) = sources.collect("halmstad", halmstad.pairs(tmp_path))
     assert "key points" in result.reason
     listed = {"keypoints_px": {"A_01": [[0, 0], [9, 9]]}, "pairs": [{"a": "A_01", "b": "A_02", "idx": [[0, 5]]}]}
     path.write_text(json.dumps(listed))
-    ((_, result),) = real.collect("halmstad", real_halmstad.pairs(tmp_path))
+    ((_, result),) = sources.collect("halmstad", halmstad.pairs(tmp_path))
     assert "no such file" in result.reason
 
 
@@ -198,12 +192,12 @@ def test_line_map_encloses_its_floor(tmp_path):
     sides = [(corners[k], corners[(k + 1) % 4]) for k in range(4)] + [((5, 0), (5, 2.5)), ((5, 3.5), (5, 6))]
     path = tmp_path / "x.vectormap.json"
     path.write_text(json.dumps([{"p0": {"x": a[0], "y": a[1]}, "p1": {"x": b[0], "y": b[1]}} for a, b in sides]))
-    drawn = real_utexas.read_lines(path)
+    drawn = utexas.read_lines(path)
     assert len(drawn.free) * drawn.cell**2 == pytest.approx(60, rel=0.04)
     assert (drawn.free > -0.1).all() and (drawn.free < [10.1, 6.1]).all()
     path.write_text("[{}]")
     with pytest.raises(InputError, match="line map"):
-        real_utexas.read_lines(path)
+        utexas.read_lines(path)
 
 
 def test_grid_is_raised_at_its_place_without_what_is_written_beside_it(tmp_path):
@@ -219,7 +213,7 @@ def test_grid_is_raised_at_its_place_without_what_is_written_beside_it(tmp_path)
     assert read.walls.min(axis=0) == pytest.approx([-5 + 1.05, 2 + 3.05])
     assert read.walls.max(axis=0) == pytest.approx([-5 + 4.95, 2 + 4.95])
     cloud = flat.raise_flat(read, z=1.0)
-    assert cloud.points[:, 2].min() == 1.0 and cloud.points[:, 2].max() == pytest.approx(1.0 + flat.HEIGHT)
+    assert cloud.points[:, 2].min() == 1.0 and cloud.points[:, 2].max() == pytest.approx(1.0 + flat.WALL_HEIGHT)
     assert len(cloud.free) == 18 * 38
     with pytest.raises(InputError, match="no such file"):
         flat.read_flat(tmp_path / "none.yaml")
@@ -230,8 +224,8 @@ def test_walls_are_fitted_and_measured():
     sides = [np.column_stack([np.linspace(0, 12, 200), np.full(200, y)]) for y in (0, 5, 7)]
     sides += [np.column_stack([np.full(90, x), np.linspace(0, 7, 90)]) for x in (0, 4, 12)]
     a = np.concatenate(sides)
-    known = Sim3(0.3, (2.0, 1.0, 0.0))
-    b = known.inverse().apply(np.column_stack([a, np.zeros(len(a))]))[:, :2] + rng.normal(0, 0.01, a.shape)
+    truth = Sim3(0.3, (2.0, 1.0, 0.0))
+    b = truth.inverse().apply(np.column_stack([a, np.zeros(len(a))]))[:, :2] + rng.normal(0, 0.01, a.shape)
     guess = Sim3(0.3 + 0.03, (2.2, 0.9, 0.0))
     fitted = wall_fit.fit_walls(a, b, guess)
     assert fitted.yaw == pytest.approx(0.3, abs=0.002)
@@ -240,8 +234,8 @@ def test_walls_are_fitted_and_measured():
         PointCloud(np.column_stack([np.tile(p, (26, 1)), np.repeat(np.arange(26) / 10, len(p))]).astype(np.float32))
         for p in (a, b)
     ]
-    pair = Pair("x", *clouds, known, (), 1.0, ("a", "b"), "s", "x")
-    found = wall_fit.residual(pair)
-    assert found.median < 0.03 and found.near > 0.99 and found.seen == 1.0
+    pair = Pair("x", *clouds, truth, (), 1.0, ("a", "b"), "s", "x")
+    fit = wall_fit.residual(pair)
+    assert fit.median < 0.03 and fit.near > 0.99 and fit.seen == 1.0
     wrong = Pair("x", *clouds, Sim3(0.3, (2.0, 1.25, 0.0)), (), 1.0, ("a", "b"), "s", "x")
     assert wall_fit.residual(wrong).median > 0.2

@@ -65,7 +65,7 @@ def test_a_room_that_the_map_does_not_show_is_none() -> None:
 def test_the_outline_of_a_cloud_is_that_of_its_largest_piece() -> None:
     away = plane((8, 9), (0, 1), 2, 0.0)
     space = realism_measures.outline_of(np.concatenate([box(floor=1.0), away]), 0.0, 2.7)
-    assert space.mask.sum() * realism_measures.CELL**2 == pytest.approx(20, rel=0.06)
+    assert space.mask.sum() * realism_measures.SURFACE_CELL**2 == pytest.approx(20, rel=0.06)
 
 
 def test_thickness_is_the_spread_across_planes() -> None:
@@ -73,9 +73,9 @@ def test_thickness_is_the_spread_across_planes() -> None:
     flat, wall = plane((0, 6), (0, 6), 2, 0.0), plane((0, 6), (1, 4), 0, 0.0)
     flat[:, 2] += rng.normal(0, 0.01, len(flat))
     wall[:, 0] += rng.normal(0, 0.03, len(wall))
-    found = realism_measures.thickness(np.concatenate([flat, wall]))
-    assert found["flat"] == pytest.approx(10, rel=0.1) and found["upright"] == pytest.approx(30, rel=0.1)
-    assert found["loose"] < 0.05
+    spread = realism_measures.thickness(np.concatenate([flat, wall]))
+    assert spread["flat"] == pytest.approx(10, rel=0.1) and spread["upright"] == pytest.approx(30, rel=0.1)
+    assert spread["loose"] < 0.05
     cloud = realism_measures.thickness(rng.uniform(0, 2, (20_000, 3)))
     assert cloud["loose"] > 0.95
 
@@ -125,6 +125,6 @@ def test_the_folder_must_be_named(capsys: pytest.CaptureFixture[str], monkeypatc
 @pytest.mark.slow
 @pytest.mark.data
 def test_real_clouds_have_a_floor_below_their_ceiling(data_dir: Path) -> None:
-    found = {title: (floor, ceiling) for title, _, floor, ceiling in realism_sources.real_clouds(data_dir)}
-    assert len(found) == 13
-    assert all(2.2 < ceiling - floor < 3.3 for floor, ceiling in found.values())
+    levels = {title: (floor, ceiling) for title, _, floor, ceiling in realism_sources.real_clouds(data_dir)}
+    assert len(levels) == 13
+    assert all(2.2 < ceiling - floor < 3.3 for floor, ceiling in levels.values())

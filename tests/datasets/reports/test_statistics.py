@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from topomerge.datasets.reports.statistics import (
-    BEGIN,
-    END,
+    TABLES_BEGIN,
+    TABLES_END,
     count_folder,
     count_manifest,
     item_of,
@@ -110,11 +110,15 @@ def test_pairs_of_another_version_are_left_out(cache: Path) -> None:
 
 def test_written_between_the_marks(cache: Path) -> None:
     page = cache / "page.md"
-    page.write_text(f"before\n\n{BEGIN}\nold\n{END}\n\nafter\n")
+    page.write_text(f"before\n\n{TABLES_BEGIN}\nold\n{TABLES_END}\n\nafter\n")
     words = [str(cache / "set.jsonl"), "--write", str(page)]
     assert main(words) == 0
     text = page.read_text()
-    assert text.startswith(f"before\n\n{BEGIN}\n3 pairs") and text.endswith(f"|\n{END}\n\nafter\n") and "old" not in text
+    assert (
+        text.startswith(f"before\n\n{TABLES_BEGIN}\n3 pairs")
+        and text.endswith(f"|\n{TABLES_END}\n\nafter\n")
+        and "old" not in text
+    )
     assert main(words) == 0 and page.read_text() == text
 
 

@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 from scipy import ndimage
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.simulation.floor_truth import CELL, NOWHERE, OUTSIDE, Truth, draw_rooms, in_frame, judge, said, truth_of
+from topomerge.datasets.simulation.floor_truth import (
+    NOT_JUDGED,
+    OUTSIDE_ROOMS,
+    TRUTH_CELL,
+    Truth,
+    draw_rooms,
+    in_frame,
+    judge,
+    said,
+    truth_of,
+)
 
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, Sim3, TopometricMap, VoxelGrid
 
@@ -26,7 +36,7 @@ def floor(building) -> tuple[Array, Array]:
     raster, origin = draw_rooms(building.rooms, building.storeys["floor"])
     inner = np.stack([np.where(ndimage.distance_transform_edt(level >= 0) > 2, level, -1) for level in raster])
     k, i, j = np.nonzero(inner >= 0)
-    x, y = (origin[:, None] + (np.stack([j, i]) + 0.5) * CELL).tolist()
+    x, y = (origin[:, None] + (np.stack([j, i]) + 0.5) * TRUTH_CELL).tolist()
     places = np.column_stack([x, y, building.storeys["floor"][k]])
     shifts = np.array([[dx, dy, 0.0] for dx in (-0.025, 0.025) for dy in (-0.025, 0.025)])
     return (places[:, None] + shifts).reshape(-1, 3), np.repeat(inner[k, i, j], 4)
@@ -37,7 +47,9 @@ def truth(building) -> Truth:
     """As if everything had been seen."""
     raster, origin = draw_rooms(building.rooms, building.storeys["floor"])
     k, i, j = np.nonzero(raster >= 0)
-    points = np.column_stack([origin[0] + (j + 0.5) * CELL, origin[1] + (i + 0.5) * CELL, building.storeys["floor"][k]])
+    points = np.column_stack(
+        [origin[0] + (j + 0.5) * TRUTH_CELL, origin[1] + (i + 0.5) * TRUTH_CELL, building.storeys["floor"][k]]
+    )
     return truth_of(building, np.ones(len(building.rooms), bool), points)
 
 
@@ -75,10 +87,10 @@ def test_drift_is_not_held_against_a_map(building, floor, truth) -> None:
     turned = in_frame(truth, FRAME)
     assert judge(moved, turned).rooms.iou < 0.9
     anchors = FRAME.apply(floor[0][::20]) + [0.5, 0, 0]
-    known = replace(turned, anchors=anchors, drift=np.tile([-0.5, 0.0, 0.0], (len(anchors), 1)))
-    assert judge(moved, known).rooms.iou > 0.995
-    again = in_frame(in_frame(known, Sim3(1.0, (3.0, 0.0, 0.0))), Sim3(1.0, (3.0, 0.0, 0.0)).inverse())
-    assert np.allclose(again.place(anchors), known.place(anchors))
+    undrifted = replace(turned, anchors=anchors, drift=np.tile([-0.5, 0.0, 0.0], (len(anchors), 1)))
+    assert judge(moved, undrifted).rooms.iou > 0.995
+    again = in_frame(in_frame(undrifted, Sim3(1.0, (3.0, 0.0, 0.0))), Sim3(1.0, (3.0, 0.0, 0.0)).inverse())
+    assert np.allclose(again.place(anchors), undrifted.place(anchors))
 
 
 def test_merged_and_missing_rooms_cost(building, floor, truth) -> None:
@@ -111,9 +123,9 @@ def test_what_was_not_seen_is_not_judged(building, floor, truth) -> None:
     seen = truth_of(building, truth.visited, few)
     judged = seen.raster >= 0
     assert 0 < judged.sum() < 0.2 * (truth.raster >= 0).sum()
-    assert (seen.raster == NOWHERE).any() and (seen.raster == OUTSIDE).any()
+    assert (seen.raster == NOT_JUDGED).any() and (seen.raster == OUTSIDE_ROOMS).any()
     open_ended = truth_of(building, truth.visited, few, complete=False)
-    assert not (open_ended.raster == OUTSIDE).any()
+    assert not (open_ended.raster == OUTSIDE_ROOMS).any()
 
 
 def test_the_strip_along_walls_goes_to_the_nearest_floor(building, floor, truth) -> None:
