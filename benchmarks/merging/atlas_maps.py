@@ -27,7 +27,7 @@ from topomerge.io.maps import save_map
 from topomerge.types import Array, Sim3
 
 KINDS = ("office", "hospital", "school", "hotel", "lab", "openplan")
-SENSORS = {"tls": 3, "lidar": 2, "depth": 3, "tablet": 1, "laser2d": 1}
+ATLAS_SENSORS = {"tls": 3, "lidar": 2, "depth": 3, "tablet": 1, "laser2d": 1}
 ROOMS = (6, 12)  # of a map, fewest and most
 CACHE = Path("cache/atlas")
 
@@ -45,8 +45,8 @@ class AtlasSet:
 def draw(split: str, maps: int, number: int) -> tuple[Atlas, Atlas | None]:
     """The clouds of a set, and where it has one the other building's."""
     rng = np.random.default_rng([maps, number, {"train": 0, "validation": 1, "test": 2}[split]])
-    names = sorted(SENSORS)
-    weight = np.array([SENSORS[n] for n in names], float)
+    names = sorted(ATLAS_SENSORS)
+    weight = np.array([ATLAS_SENSORS[n] for n in names], float)
     sensors = rng.choice(names, maps, p=weight / weight.sum()).tolist()
     first, last = seeds(split)
     for _ in range(20):
