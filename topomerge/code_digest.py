@@ -30,7 +30,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 TOP = "topomerge"
-BESIDE = ("models", "datasets", "configs")  # installed below topomerge; in a checkout they stand next to it
+DATA_BESIDE = ("models", "datasets", "configs")  # installed below topomerge; in a checkout they stand next to it
 LENGTH = 16  # hexadecimal digits
 SKIPPED = (".py", ".pyc", ".pyi")
 
@@ -110,7 +110,7 @@ def _file_of(module: str, package: Path) -> Path | None:
     top, *parts = module.split(".")
     if top != TOP:
         return None
-    beside = parts and parts[0] in BESIDE and not (package / parts[0]).is_dir()
+    beside = parts and parts[0] in DATA_BESIDE and not (package / parts[0]).is_dir()
     path = (package.parent if beside else package).joinpath(*parts)
     candidates = (path.with_name(f"{path.name}.py"), path / "__init__.py") if parts else (path / "__init__.py",)
     return next((p for p in candidates if p.is_file()), None)

@@ -17,7 +17,7 @@ from topomerge.types import Array
 
 HALF = 0.5  # IoU from which a room counts as found
 SAME = 0.1  # IoU from which two rooms correspond, for the edges of the graph
-PLAN, HEIGHT = 0.5, 1.0  # m between a true door and the one found
+PLAN, PLAN_HEIGHT = 0.5, 1.0  # m between a true door and the one found
 LEVEL = 0.5  # m between a true floor and the one found
 
 
@@ -41,42 +41,42 @@ class Scores:
     precision: float
     recall: float
     true: int
-    found: int
+    extracted: int
     right: int
 
     @staticmethod
-    def of(right: int, true: int, found: int) -> Scores:
+    def of(right: int, true: int, extracted: int) -> Scores:
         """From the numbers of right, true and found ones."""
-        return Scores(_ratio(right, found), _ratio(right, true), true, found, right)
+        return Scores(_ratio(right, extracted), _ratio(right, true), true, extracted, right)
 
 
 def _ratio(part: float, whole: float) -> float:
     return part / whole if whole else float("nan")
 
 
-def contingency(true: Array, found: Array, trues: int, founds: int) -> Array:
-    """(trues, founds) int64: places that have true room i and found room j.
+def contingency(true: Array, extracted: Array, trues: int, extracted_rooms: int) -> Array:
+    """(trues, extracted_rooms) int64: places that have true room i and found room j.
 
     Args:
-        true, found: (n,) labels of the same places, -1 none.
+        true, extracted: (n,) labels of the same places, -1 none.
     """
-    both = (true >= 0) & (found >= 0)
-    pair = true[both].astype(np.int64) * founds + found[both]
-    return np.bincount(pair, minlength=trues * founds).reshape(trues, founds)
+    both = (true >= 0) & (extracted >= 0)
+    pair = true[both].astype(np.int64) * extracted_rooms + extracted[both]
+    return np.bincount(pair, minlength=trues * extracted_rooms).reshape(trues, extracted_rooms)
 
 
-def overlaps(true: Array, found: Array, trues: int, founds: int) -> tuple[Array, Array]:
-    """IoU and Matthews correlation (trues, founds) of the mask of each true room against the mask of each found one.
+def overlaps(true: Array, extracted: Array, trues: int, extracted_rooms: int) -> tuple[Array, Array]:
+    """IoU and Matthews correlation (trues, extracted_rooms) of the mask of each true room against the mask of each found one.
 
     The correlation is over all places given, 0 where one of the masks is empty or full.
     """
-    both = contingency(true, found, trues, founds).astype(float)
+    both = contingency(true, extracted, trues, extracted_rooms).astype(float)
     of_true = np.bincount(true[true >= 0], minlength=trues).astype(float)[:, None]
-    of_found = np.bincount(found[found >= 0], minlength=founds).astype(float)[None]
+    of_extracted = np.bincount(extracted[extracted >= 0], minlength=extracted_rooms).astype(float)[None]
     total = float(len(true))
-    iou = both / np.maximum(of_true + of_found - both, 1)
-    spread = of_true * (total - of_true) * of_found * (total - of_found)
-    mcc = (both * total - of_true * of_found) / np.sqrt(np.maximum(spread, 1))
+    iou = both / np.maximum(of_true + of_extracted - both, 1)
+    spread = of_true * (total - of_true) * of_extracted * (total - of_extracted)
+    mcc = (both * total - of_true * of_extracted) / np.sqrt(np.maximum(spread, 1))
     return iou, np.where(spread > 0, mcc, 0.0)
 
 
@@ -86,12 +86,12 @@ def assign(iou: Array) -> Array:
     out = np.full(len(iou), -1, np.int64)
     if iou.size:
         i, j = linear_sum_assignment(iou, maximize=True)
-        kept = iou[i, j] > 0
-        out[i[kept]] = j[kept]
+        overlapping = iou[i, j] > 0
+        out[i[overlapping]] = j[overlapping]
     return out
 
 
-def score_rooms(true: Array, found: Array, trues: int, counted: Array, expected: Array | None = None) -> RoomScores:
+def score_rooms(true: Array, extracted: Array, trues: int, counted: Array, expected: Array | None = None) -> RoomScores:
     """Rooms found against true ones.
 
     Mean IoU: of the one-to-one assignment, over all expected true rooms; one that got no room counts 0. Precision and recall:
@@ -100,13 +100,13 @@ def score_rooms(true: Array, found: Array, trues: int, counted: Array, expected:
     the rooms (MAORIS: Mielle et al., "A method to segment maps from different modalities using free space layout", ICRA 2018).
 
     Args:
-        true, found: (n,) labels of all places: those of true rooms and those that the map says are of a room.
+        true, extracted: (n,) labels of all places: those of true rooms and those that the map says are of a room.
         trues: number of true rooms.
         counted: (F,) bool, found rooms that are wrong if they are no true room.
         expected: (trues,) bool, true rooms that should have been found; None: all.
     """
     expected = np.ones(trues, bool) if expected is None else expected
-    iou, mcc = overlaps(true, found, trues, len(counted))
+    iou, mcc = overlaps(true, extracted, trues, len(counted))
     iou[~expected] = 0
     assigned = assign(iou)
     rows, taken = np.arange(trues), np.maximum(assigned, 0)
@@ -129,43 +129,43 @@ def score_rooms(true: Array, found: Array, trues: int, counted: Array, expected:
     )
 
 
-def match_places(true: Array, found: Array, plan: float = PLAN, height: float = HEIGHT) -> Array:
-    """(m, 2) int64 pairs (true, found) of places within `plan` metres from above and `height` metres in height, one to one:
+def match_places(true: Array, extracted: Array, plan: float = PLAN, height: float = PLAN_HEIGHT) -> Array:
+    """(m, 2) int64 pairs (true, extracted) of places within `plan` metres from above and `height` metres in height, one to one:
     as many as possible, and then the nearest.
 
     Args:
-        true, found: (n, 3), m.
+        true, extracted: (n, 3), m.
     """
-    if not len(true) or not len(found):
+    if not len(true) or not len(extracted):
         return np.zeros((0, 2), np.int64)
-    apart = cdist(true[:, :2], found[:, :2])
-    fits = (apart <= plan) & (cdist(true[:, 2:], found[:, 2:]) <= height)
+    apart = cdist(true[:, :2], extracted[:, :2])
+    fits = (apart <= plan) & (cdist(true[:, 2:], extracted[:, 2:]) <= height)
     i, j = linear_sum_assignment(np.where(fits, apart, 1e3))
     return np.stack([i, j], axis=1)[fits[i, j]].astype(np.int64)
 
 
-def score_doors(true: Array, found: Array, counted: Array, others: Array | None = None) -> Scores:
+def score_doors(true: Array, extracted: Array, counted: Array, others: Array | None = None) -> Scores:
     """Doors found against true ones, one to one, by where they are (`match_places`).
 
     Args:
         true: (n, 3) centres of the doors that should be found, m.
-        found: (m, 3) centres of those of the map.
+        extracted: (m, 3) centres of those of the map.
         counted: (m,) bool, those that are wrong if there is no door; a right one always counts.
         others: (k, 3) centres of doors that need not be found: one found there is neither right nor wrong.
     """
-    pairs = match_places(true, found)
+    pairs = match_places(true, extracted)
     left = np.setdiff1d(np.flatnonzero(counted), pairs[:, 1])
     if others is not None and len(left):
-        left = np.delete(left, match_places(others, found[left])[:, 1])
+        left = np.delete(left, match_places(others, extracted[left])[:, 1])
     return Scores.of(len(pairs), len(true), len(pairs) + len(left))
 
 
-def score_edges(true: Iterable[Iterable[int]], found: Array, assigned: Array, counted: Array) -> Scores:
+def score_edges(true: Iterable[Iterable[int]], extracted: Array, assigned: Array, counted: Array) -> Scores:
     """Connected pairs of rooms found against the true ones, each pair once however many doors it has.
 
     Args:
         true: pairs of true rooms.
-        found: (e, 2) pairs of found rooms.
+        extracted: (e, 2) pairs of found rooms.
         assigned: (T,) the found room of each true one, -1 none.
         counted: (F,) bool, found rooms that are wrong if they are no true room; pairs with another one are left out.
     """
@@ -173,7 +173,7 @@ def score_edges(true: Iterable[Iterable[int]], found: Array, assigned: Array, co
     of = np.full(len(counted), -1)
     of[assigned[assigned >= 0]] = np.flatnonzero(assigned >= 0)
     got, false = set(), set()
-    for a, b in np.asarray(found).reshape(-1, 2).tolist():
+    for a, b in np.asarray(extracted).reshape(-1, 2).tolist():
         pair = frozenset((int(of[a]), int(of[b])))
         if of[a] >= 0 and of[b] >= 0:
             got.add(pair)
@@ -182,9 +182,9 @@ def score_edges(true: Iterable[Iterable[int]], found: Array, assigned: Array, co
     return Scores.of(len(wanted & got), len(wanted), len(got) + len(false))
 
 
-def storeys_right(true: Array, found: Array, within: float = LEVEL) -> bool:
+def storeys_right(true: Array, extracted: Array, within: float = LEVEL) -> bool:
     """Are there as many storeys as there should be, each floor within `within` metres?"""
-    return len(true) == len(found) and bool((np.abs(np.sort(true) - np.sort(found)) <= within).all())
+    return len(true) == len(extracted) and bool((np.abs(np.sort(true) - np.sort(extracted)) <= within).all())
 
 
 def consistency(a: Array, b: Array, least: int = 0, every: bool = True) -> float:
@@ -216,12 +216,12 @@ def bootstrap(values: Array, groups: Array, rounds: int = 2000, seed: int = 0) -
         groups: (n,) what each value belongs to.
     """
     values, groups = np.asarray(values, float), np.asarray(groups)
-    known = np.isfinite(values)
-    if not known.any():
+    finite = np.isfinite(values)
+    if not finite.any():
         return float("nan"), float("nan"), float("nan")
-    _, group = np.unique(groups[known], return_inverse=True)
-    total, count = np.bincount(group, values[known]), np.bincount(group)
+    _, group = np.unique(groups[finite], return_inverse=True)
+    total, count = np.bincount(group, values[finite]), np.bincount(group)
     drawn = np.random.default_rng(seed).integers(len(total), size=(rounds, len(total)))
     means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
     low, high = np.percentile(means, [2.5, 97.5]).tolist()
-    return float(values[known].mean()), low, high
+    return float(values[finite].mean()), low, high

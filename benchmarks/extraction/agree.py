@@ -12,7 +12,7 @@ from topomerge.io.atomic import replacing
 from topomerge.metrics import consistency
 from topomerge.types import Array
 
-LEAST = 1.0  # m2 of a room, on what both saw
+LEAST_COMMON_AREA = 1.0  # m2 of a room, on what both saw
 REFERENCE = "reference"
 Row = dict[str, Any]
 
@@ -32,7 +32,7 @@ def agreement(a: Path, b: Path) -> tuple[float, float]:
         return 0.0, 0.0
     with np.load(a, allow_pickle=False) as first, np.load(b, allow_pickle=False) as second:
         both = first["visited"] & second["visited"]
-        labels, least = (first["columns"][both], second["columns"][both]), round(LEAST / TRUTH_CELL**2)
+        labels, least = (first["columns"][both], second["columns"][both]), round(LEAST_COMMON_AREA / TRUTH_CELL**2)
         return consistency(*labels, least, every=False), consistency(*labels, least)
 
 

@@ -9,9 +9,9 @@ from typing import Any
 from benchmarks.extraction.scans import Case
 
 TEST = 900_000  # the first test seed of procedural buildings
-KINDS = ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab", "house")
-SENSORS = ("tls", "lidar", "depth", "tablet", "mono", "laser2d")
-ROOMS = 8  # that are visited, of the larger ones
+BUILDING_KINDS = ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab", "house")
+CASE_SENSORS = ("tls", "lidar", "depth", "tablet", "mono", "laser2d")
+ROOM_NUMBERS = 8  # that are visited, of the larger ones
 IPA = ("Freiburg52_scan", "Freiburg101_scan", "lab_a_scan", "lab_b_scan", "lab_c_scan", "lab_d_scan", "lab_f_scan", "lab_ipa")
 BARE = {"furniture": 0.0, "clutter": 0.0}
 HARD: dict[str, tuple[dict[str, float], str]] = {  # set -> difficulty, and what is done to the points
@@ -79,9 +79,9 @@ def dev() -> list[Case]:
 def simulated() -> list[Case]:
     """Every kind of building by every sensor."""
     return [
-        Case(f"by {sensor}", "procedural", kind, sensor, TEST + 10 * i + 2, rooms=ROOMS)
-        for sensor in SENSORS
-        for i, kind in enumerate(KINDS)
+        Case(f"by {sensor}", "procedural", kind, sensor, TEST + 10 * i + 2, rooms=ROOM_NUMBERS)
+        for sensor in CASE_SENSORS
+        for i, kind in enumerate(BUILDING_KINDS)
     ]
 
 
@@ -89,7 +89,7 @@ def hard() -> list[Case]:
     """The same five buildings made hard in one way after the other; and buildings of two to four storeys."""
     places = (("office", "tls"), ("school", "lidar"), ("hospital", "depth"), ("hotel", "tls"), ("lab", "depth"))
     out = [
-        Case(name, "procedural", kind, sensor, TEST + 100 + i, rooms=ROOMS, difficulty=_words(difficulty), spoil=spoil)
+        Case(name, "procedural", kind, sensor, TEST + 100 + i, rooms=ROOM_NUMBERS, difficulty=_words(difficulty), spoil=spoil)
         for name, (difficulty, spoil) in HARD.items()
         for i, (kind, sensor) in enumerate(places)
     ]
@@ -139,9 +139,10 @@ def pairs() -> list[Case]:
     """Two sessions in one building, by two sensors, with 60 % of the rooms in common."""
     sensors = (("tls", "depth"), ("lidar", "tls"), ("depth", "depth"), ("lidar", "depth"))
     moved = {"moved": 0.6, "gone": 0.2, "doors_moved": 0.6}
+    sets = (("two sessions", {}, BUILDING_KINDS), ("two sessions, furniture moved", moved, BUILDING_KINDS[::2]))
     return [
-        Case(name, "procedural", kind, sensor, TEST + 300 + i, rooms=ROOMS, difficulty=_words(difficulty), day=day)
-        for name, difficulty, kinds in (("two sessions", {}, KINDS), ("two sessions, furniture moved", moved, KINDS[::2]))
+        Case(name, "procedural", kind, sensor, TEST + 300 + i, rooms=ROOM_NUMBERS, difficulty=_words(difficulty), day=day)
+        for name, difficulty, kinds in sets
         for i, kind in enumerate(kinds)
         for day, sensor in enumerate(sensors[i % 4], 1)
     ]

@@ -15,7 +15,7 @@ from topomerge.datasets.simulation.scanner import moved
 from topomerge.io.atomic import replacing
 from topomerge.types import Array, PointCloud, Sim3, TrueRoom, VoxelGrid
 
-FORMAT = 3  # raise it when the same case gives other bytes
+SCAN_FORMAT = 3  # raise it when the same case gives other bytes
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Case:
     def key(self) -> str:
         """Hash of what the bytes of the scan depend on."""
         same = {"set": "", "thin": 0.0, "turn": 0.0, "shuffle": False, "voxel": 0.0}
-        inputs = {**asdict(self), **same, "format": FORMAT}
+        inputs = {**asdict(self), **same, "format": SCAN_FORMAT}
         return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:20]
 
 

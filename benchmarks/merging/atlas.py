@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.merging.atlas_maps import CACHE, AtlasSet, load
+from benchmarks.merging.atlas_maps import ATLAS_CACHE, AtlasSet, load
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import atlas
 from topomerge.fusion.pose_difference import pose_difference
@@ -104,11 +104,11 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 def main(split: str, anew: bool = False) -> None:
     """Measure what was not measured, and print the table."""
-    path = CACHE / f"results_{split}.jsonl"
+    path = ATLAS_CACHE / f"results_{split}.jsonl"
     if anew:
         path.unlink(missing_ok=True)
     done = {row["name"] for row in map(json.loads, path.read_text().splitlines())} if path.exists() else set()
-    for folder in sorted(p.parent for p in (CACHE / split).glob("[0-9]*/truth.json")):
+    for folder in sorted(p.parent for p in (ATLAS_CACHE / split).glob("[0-9]*/truth.json")):
         if folder.name not in done:
             one = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
             command = [sys.executable, "-m", "benchmarks.merging.atlas", "one", str(folder)]

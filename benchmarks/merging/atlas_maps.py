@@ -26,10 +26,10 @@ from topomerge.extraction.extract import extract
 from topomerge.io.maps import save_map
 from topomerge.types import Array, Sim3
 
-KINDS = ("office", "hospital", "school", "hotel", "lab", "openplan")
+ATLAS_KINDS = ("office", "hospital", "school", "hotel", "lab", "openplan")
 ATLAS_SENSORS = {"tls": 3, "lidar": 2, "depth": 3, "tablet": 1, "laser2d": 1}
-ROOMS = (6, 12)  # of a map, fewest and most
-CACHE = Path("cache/atlas")
+ATLAS_ROOMS = (6, 12)  # of a map, fewest and most
+ATLAS_CACHE = Path("cache/atlas")
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def draw(split: str, maps: int, number: int) -> tuple[Atlas, Atlas | None]:
     sensors = rng.choice(names, maps, p=weight / weight.sum()).tolist()
     first, last = seeds(split)
     for _ in range(20):
-        kind, seed = str(rng.choice(KINDS)), int(rng.integers(first, last))
-        rooms = int(rng.integers(ROOMS[0], ROOMS[1] + 1))
+        kind, seed = str(rng.choice(ATLAS_KINDS)), int(rng.integers(first, last))
+        rooms = int(rng.integers(ATLAS_ROOMS[0], ATLAS_ROOMS[1] + 1))
         other = number % 2 == 1 and maps >= 4
         try:
             atlas = make_atlas(make_building(kind, seed), sensors, rng, rooms)
@@ -63,7 +63,7 @@ def draw(split: str, maps: int, number: int) -> tuple[Atlas, Atlas | None]:
 
 def make(split: str, maps: int, number: int) -> Path:
     """Make one set, unless it is there."""
-    folder = CACHE / split / f"{maps:02d}_{number:02d}"
+    folder = ATLAS_CACHE / split / f"{maps:02d}_{number:02d}"
     if (folder / "truth.json").exists():
         return folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +104,7 @@ def sim3_of(matrix: Array) -> Sim3:
 
 def sets(split: str, maps: int) -> Iterator[AtlasSet]:
     """All sets of so many maps that were made."""
-    for folder in sorted((CACHE / split).glob(f"{maps:02d}_*")):
+    for folder in sorted((ATLAS_CACHE / split).glob(f"{maps:02d}_*")):
         if (folder / "truth.json").exists():
             yield load(folder)
 

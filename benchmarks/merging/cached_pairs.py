@@ -15,7 +15,7 @@ from topomerge.datasets.pairs.grid_pairs import build_grids
 
 from topomerge.errors import InputError
 
-CACHE = Path("cache")
+PAIRS_CACHE = Path("cache")
 SETS = {"train": "grids", "test": "grids_heldout"}
 DRAWN = "_drawings"  # of the names of splits
 
@@ -27,13 +27,13 @@ def pair_files(split: str, kinds: tuple[str, ...] = ()) -> list[Path]:
         InputError: they were not made yet.
     """
     name = SETS[split.removesuffix(DRAWN)] + (DRAWN if split.endswith(DRAWN) else "")
-    manifest = CACHE / f"{name}.jsonl"
+    manifest = PAIRS_CACHE / f"{name}.jsonl"
     if not manifest.is_file():
         made = f"python -m benchmarks.merging.cached_pairs {split.removesuffix(DRAWN)}"
         raise InputError(f"{manifest}: no such manifest; make it with {made}")
     rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
     rows.sort(key=lambda row: (row.get("set", 0), row.get("item", 0), row["file"]))
-    return [CACHE / "grids" / row["file"] for row in rows if not kinds or row["kind"] in kinds]
+    return [PAIRS_CACHE / "grids" / row["file"] for row in rows if not kinds or row["kind"] in kinds]
 
 
 def main(split: str, *words: str) -> None:

@@ -25,7 +25,7 @@ from topomerge.matching.match import match
 from topomerge.matching.room_plans import RoomPlans, room_plans
 from topomerge.types import Array, Sim3, TopometricMap
 
-NEAR, RIGHT = (1.0, 10.0), (0.5, 5.0)  # m, degrees
+NEAR_POSE, RIGHT = (1.0, 10.0), (0.5, 5.0)  # m, degrees
 PARTNERS = (1, 2, 3, CONSISTENCY.partners)  # of a room
 MOST = 1000  # poses that are looked through
 
@@ -45,7 +45,7 @@ def proposed(
     weight = similarities(cost)[tuple(pairs.T)] + 1e-3
     poses = candidate_poses(a, b, plans, pairs, weight, False)
     ranked = best_of(poses, votes(poses), plans[1].middle, MOST) if len(poses) else poses
-    places = (k for k in range(len(ranked)) if right(ranked.transform(k), pair, NEAR))
+    places = (k for k in range(len(ranked)) if right(ranked.transform(k), pair, NEAR_POSE))
     return len(poses), float(next(places, np.inf)) + 1
 
 

@@ -38,7 +38,7 @@ TARGETS = {"": CACHE / "peers.jsonl", "real": CACHE / "peers_real.jsonl", "heldo
 HELDOUT = Path("cache/evaluation/heldout.jsonl")
 VOXEL, ITERATIONS = 0.3, 100_000  # of Open3D
 WHOLE = 3  # every third pair goes the whole way to a joined map
-BINS = {"<40 m²": (1.0, 40.0), "40-80 m²": (40.0, 80.0), "≥80 m²": (80.0, np.inf)}
+AREA_BINS = {"<40 m²": (1.0, 40.0), "40-80 m²": (40.0, 80.0), "≥80 m²": (80.0, np.inf)}
 ORDER = ["lidar", "other 3D", "slice", "floor plan"]
 Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, s of processor
 
@@ -52,7 +52,7 @@ def kind_of(sensors: Sequence[str]) -> str:
 
 def bin_of(common: float) -> str:
     """Of the area that both maps saw."""
-    return next(name for name, (low, high) in BINS.items() if low <= common < high)
+    return next(name for name, (low, high) in AREA_BINS.items() if low <= common < high)
 
 
 def cloud(grid: VoxelGrid, free: VoxelGrid | None = None) -> PointCloud:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.merging.peers import BINS, ITERATIONS, TARGETS, VOXEL, bin_of, kind_of
-from benchmarks.merging.results import NAMES, Row, by, good, put, share
+from benchmarks.merging.peers import AREA_BINS, ITERATIONS, TARGETS, VOXEL, bin_of, kind_of
+from benchmarks.merging.results import METHOD_TITLES, Row, by, good, put, share
 
 FINE = (0.1, 1.0)  # m, degrees
 TEXT = (
@@ -65,8 +65,8 @@ def behind(rows: Sequence[Row], keys: Sequence[Callable[[Row], str]]) -> str:
         for group in sorted({key(r) for r in rows}):
             mine = [r for r in rows if key(r) == group]
             for limit in ((0.5, 5.0), FINE):
-                many = {m: sum(good(r, limit) for r in mine if r["method"] == m) for m in NAMES}
-                more = [f"{NAMES[m]} {n}" for m, n in many.items() if n > many["ours"]]
+                many = {m: sum(good(r, limit) for r in mine if r["method"] == m) for m in METHOD_TITLES}
+                more = [f"{METHOD_TITLES[m]} {n}" for m, n in many.items() if n > many["ours"]]
                 shortfalls += [f"{group}, within {limit[0]} m: {', '.join(more)}, topomerge {many['ours']}"] * bool(more)
     return "; ".join(shortfalls) or "nowhere"
 
@@ -81,7 +81,7 @@ def real() -> str:
 def heldout() -> str:
     """Held-out pairs of extracted maps by the area in common."""
     rows = rows_of_methods("heldout")
-    outcome = by(rows, lambda r: bin_of(r["common"]), list(BINS), "in common", (*HEADS, "right and believed"), with_verdict)
+    outcome = by(rows, lambda r: bin_of(r["common"]), list(AREA_BINS), "in common", (*HEADS, "right and believed"), with_verdict)
     return "\n\n".join([KEPT, outcome]) if rows else ""
 
 
@@ -99,19 +99,19 @@ def section() -> str:
     seconds = {k: np.median([r[k] for r in done]) for k in ("extract", "merge")}
     longest = max(r["extract"] + r["merge"] for r in done)
     names = {r["name"] for r in rows if r["method"] == "ours" and r["whole"]}
-    taken = {m: [r["seconds"] for r in rows if r["method"] == m and r["name"] in names] for m in NAMES}
+    taken = {m: [r["seconds"] for r in rows if r["method"] == m and r["name"] in names] for m in METHOD_TITLES}
     other = {m: float(np.median(s)) for m, s in taken.items() if s}
     return "\n\n".join([
         "`python -m benchmarks.merging.cached_pairs test jobs=2; "
         "python -m benchmarks.merging.peers 9000; python -m benchmarks.merging.peers_table docs/results/peers.md`",
         TEXT,
-        by(rows, keys[0], list(BINS), "in common", HEADS, measures),
+        by(rows, keys[0], list(AREA_BINS), "in common", HEADS, measures),
         by(rows, keys[1], kinds, "kind", HEADS, measures),
         f"Bins and kinds in which another method has more right than topomerge: {behind(rows, keys)}.",
         "From two clouds to one cloud is the way to the pose, as measured above: joining the points is the same for all. To one "
         f"topometric map, on {len(done)} pairs: extraction of both {seconds['extract']:.1f} s, merge with the joined map "
         f"and its rooms {seconds['merge']:.1f} s (medians; the longest pair {longest:.1f} s); to the pose alone, on these pairs: "
-        + ", ".join(f"{NAMES[m]} {s:.1f} s" for m, s in other.items())
+        + ", ".join(f"{METHOD_TITLES[m]} {s:.1f} s" for m, s in other.items())
         + ". For a joined map with rooms the others would need the same extraction and joining, too.",
         real(),
         heldout(),

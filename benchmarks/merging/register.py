@@ -97,7 +97,7 @@ def fgr(pair: GridPair, voxel: float = 0.3) -> Answer:
     return upright(solution.transformation, pair), True, float(solution.fitness)
 
 
-METHODS: dict[str, Callable[[GridPair], Answer]] = {
+REGISTRATIONS: dict[str, Callable[[GridPair], Answer]] = {
     "ours": ours, "kiss02": kiss(0.2), "kiss03": kiss(0.3), "fpfh": fpfh, "fgr": fgr,
 }  # fmt: skip
 
@@ -141,7 +141,7 @@ def run(split: str, limit: int, methods: list[str], target: Path) -> None:
                 continue
             began = time.process_time()
             try:
-                pose, believed, how = METHODS[method](pair)
+                pose, believed, how = REGISTRATIONS[method](pair)
             except Exception as failure:  # a peer that fails has not merged
                 print(f"{pair.name} {method}: {failure}", flush=True)
                 pose, believed, how = None, False, 0.0
@@ -157,7 +157,7 @@ def run(split: str, limit: int, methods: list[str], target: Path) -> None:
 def table(rows: list[dict[str, Any]], key: Callable[[dict[str, Any]], str]) -> None:
     """One line a method and group: pairs, right and fine among all, believed and right, believed and wrong, median seconds."""
     for group in sorted({key(r) for r in rows}):
-        for method in METHODS:
+        for method in REGISTRATIONS:
             mine = [r for r in rows if key(r) == group and r["method"] == method]
             if mine:
                 good = np.array([right(r["err"], r["sensors"]) for r in mine])
@@ -170,7 +170,7 @@ def table(rows: list[dict[str, Any]], key: Callable[[dict[str, Any]], str]) -> N
                 )
 
 
-def main(split: str = "train", limit: str = "40", methods: str = ",".join(METHODS)) -> None:
+def main(split: str = "train", limit: str = "40", methods: str = ",".join(REGISTRATIONS)) -> None:
     """Run and print."""
     target = Path("cache/merge") / f"results_{split}.jsonl"
     target.parent.mkdir(parents=True, exist_ok=True)

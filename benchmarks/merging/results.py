@@ -22,7 +22,7 @@ from topomerge.training.belief_hypotheses import fair, kind_of, right
 Row = dict[str, Any]
 CACHE = Path("cache/merge")
 THRESHOLD = float(model()["threshold"])
-NAMES = {
+METHOD_TITLES = {
     "ours": "topomerge", "learned": "topomerge, rooms matched by learning", "kiss02": "KISS-Matcher 0.2 m",
     "kiss03": "KISS-Matcher 0.3 m", "fpfh": "FPFH + RANSAC", "fgr": "FGR",
 }  # fmt: skip
@@ -81,7 +81,7 @@ def by(
     """A line a group and method: `columns` of its rows, under these heads."""
     out = []
     for group in groups:
-        for method, title in NAMES.items():
+        for method, title in METHOD_TITLES.items():
             mine = [r for r in rows if r["method"] == method and key(r) == group]
             if mine:
                 out.append([group, title, *columns(mine)])

@@ -16,9 +16,9 @@ from time import perf_counter
 import numpy as np
 
 from benchmarks.speed.bench import line
-from benchmarks.speed.floors import HEIGHT, WIDTH, storey
+from benchmarks.speed.floors import STOREY_HEIGHT, WIDTH, storey
 
-SLAB = 0.4  # m
+STOREY_GAP = 0.4  # m
 
 
 def measure(floors: int, preset: str, points: int, place: str) -> dict[str, object]:
@@ -28,7 +28,7 @@ def measure(floors: int, preset: str, points: int, place: str) -> dict[str, obje
 
     extract(storey(60_000), preset=preset)  # loads what was compiled
     cloud = storey(points)
-    step = np.array([0, 0, HEIGHT + SLAB] if place == "above" else [WIDTH + 1, 0, 0], np.float32)
+    step = np.array([0, 0, STOREY_HEIGHT + STOREY_GAP] if place == "above" else [WIDTH + 1, 0, 0], np.float32)
     chunks = (PointCloud(cloud + i * step) for i in range(floors))
     began = perf_counter()
     result = extract(chunks, preset=preset)

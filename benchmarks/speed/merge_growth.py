@@ -20,7 +20,7 @@ from topomerge.types import Array, Sim3, VoxelGrid
 CELL_EDGE, CEILING_CELLS = 0.1, 27  # m, cells from floor to ceiling
 SIZES = (10, 100, 1000)  # rooms
 ROW = 20  # rooms along one side of a corridor
-TURN = Sim3(0.7, (12.3, -4.1, 0.2))
+TURNED_POSE = Sim3(0.7, (12.3, -4.1, 0.2))
 
 
 def floor_plan(rooms: int, seed: int = 0) -> tuple[Array, Array]:
@@ -64,7 +64,7 @@ def measure(rooms: int) -> None:
     cells = as_cells(wall, door)
     quarter = wall.shape[0] // 4
     a = VoxelGrid.from_cells(cells[cells[:, 0] < 3 * quarter], np.zeros(3), CELL_EDGE)
-    points = TURN.apply((cells[cells[:, 0] > quarter] + 0.5) * CELL_EDGE)
+    points = TURNED_POSE.apply((cells[cells[:, 0] > quarter] + 0.5) * CELL_EDGE)
     base = np.floor(points.min(axis=0) / CELL_EDGE).astype(np.int64)
     b = VoxelGrid.from_cells(np.unique(np.floor(points / CELL_EDGE).astype(np.int64) - base, axis=0), base * CELL_EDGE, CELL_EDGE)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -74,7 +74,7 @@ def measure(rooms: int) -> None:
     middle = points.mean(axis=0)[None]
     off = float("nan")
     if registration.transform is not None:
-        off = float(np.linalg.norm(registration.transform.apply(middle) - TURN.inverse().apply(middle)))
+        off = float(np.linalg.norm(registration.transform.apply(middle) - TURNED_POSE.inverse().apply(middle)))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     steps = ", ".join(f"{k} {v:.2f}" for k, v in registration.seconds.items())
     outcome = f"p {registration.probability:.2f} | off {off:.2f} m"

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from topomerge.fusion.storey_plan import BANDS
+from topomerge.fusion.storey_plan import HEIGHT_BANDS
 from topomerge.kernels import align
 from topomerge.matching.plan_fields import FREE_MARGIN, PlanFields
 from topomerge.matching.refinement import storeys_at
@@ -17,7 +17,7 @@ from topomerge.types import Array, Sim3
 SAME_WALL = 0.15  # m: walls that near are one
 JUDGED_COLUMNS = 40_000  # of a storey; of larger ones so many
 INNER_REACH = 0.3  # m from walls, whose noise is no clutter
-SLICE_BITS = BANDS.mask(0.0, 0.75)  # where the lasers of robots look
+SLICE_BITS = HEIGHT_BANDS.mask(0.0, 0.75)  # where the lasers of robots look
 CEILING_BLOCK = 12  # columns
 LEAST_LIFTS = 50  # columns under both ceilings, by which a pose is raised
 

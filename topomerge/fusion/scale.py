@@ -19,7 +19,7 @@ from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.refinement import refine
 from topomerge.types import Array, Sim3
 
-SCALES = (0.5, 2.0)  # least and greatest that is looked for
+TRIED_SCALES = (0.5, 2.0)  # least and greatest that is looked for
 SCALE_STEP = 0.01  # of the logarithm
 HEAP_BIN = 0.1  # m
 HEAP_SIGMAS = (0.15, 1.0)  # m: heaps are sharper than the second and no sharper than the first
@@ -43,16 +43,16 @@ def search_scaled(
                 share = score / max(np.sqrt(len(v.walls) * len(w.walls)) * scale, 1.0)  # larger maps meet more walls
                 hypotheses.append(PoseHypothesis(Sim3(yaw, (x, y, offset), scale), share))
     best = refine(a, b, strongest(hypotheses), True)
-    return [h for h in best if h.from_rooms or SCALES[0] <= h.transform.scale <= SCALES[1]]  # refinement may run away
+    return [h for h in best if h.from_rooms or TRIED_SCALES[0] <= h.transform.scale <= TRIED_SCALES[1]]  # refinement may run away
 
 
 def scale_candidates(v: PlanFields, w: PlanFields, yaws: Sequence[float]) -> list[tuple[float, float, float]]:
     """(score, yaw, scale) whose wall spacings agree, best first; for each yaw the separate peaks over the scale."""
-    logs = np.arange(np.log(SCALES[0]), np.log(SCALES[1]) + SCALE_STEP, SCALE_STEP)
+    logs = np.arange(np.log(TRIED_SCALES[0]), np.log(TRIED_SCALES[1]) + SCALE_STEP, SCALE_STEP)
     main = np.radians(float(v.profile.argmax()) / 2)
     axes = np.array([[np.cos(main), -np.sin(main)], [np.sin(main), np.cos(main)]])  # columns: along and across
     first, second = _sample(v.walls), _sample(w.walls)
-    span = np.hypot(*np.ptp(first, axis=0)) + SCALES[1] * np.hypot(*np.ptp(second, axis=0))
+    span = np.hypot(*np.ptp(first, axis=0)) + TRIED_SCALES[1] * np.hypot(*np.ptp(second, axis=0))
     size = fft.next_fast_len(int(span / HEAP_BIN) + 16, real=True)
     fixed = [np.conj(fft.rfft(_heaps((first - first.min(axis=0)) @ axes[:, k : k + 1], size)[0])) for k in (0, 1)]
     candidates = []

@@ -28,9 +28,9 @@ from topomerge.kernels.plan import column_bits, on_lines
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
 COLUMN_EDGE = 0.1  # m
-BANDS = HeightBands(step=0.25, below=2, count=32)  # from 0.5 m below the floor
+HEIGHT_BANDS = HeightBands(step=0.25, below=2, count=32)  # from 0.5 m below the floor
 BODY_BANDS = np.concatenate([[BODY_HEIGHTS[0]], WALL_HEIGHTS])  # m, limits of the bands in which a map may have looked
-WALLS = WallRule()
+POSE_WALLS = WallRule()
 SLICE_ABOVE_FLOOR = 0.3  # m, guess of a slice's height above the floor
 SLICE_DRAWN = 1.375  # m above the floor, height at which slices are drawn
 FLOOR_RADIUS = 1.5  # m, over which the floor may rise and fall
@@ -75,7 +75,7 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
         heights = np.full(shape, base)
         if np.isfinite(floor) and not layers:
             heights = _local_floor(ix, iy, z, heights)
-        lattice = (heights, -BANDS.below * BANDS.step, BANDS.step)
+        lattice = (heights, -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
         occupied = column_bits(ix, iy, z, *lattice)
         crossed = column_bits(*crossing, *lattice) if crossing else np.zeros(shape, np.uint32)
         high = _ceiling(ix, iy, z, base, ceiling, shape)
@@ -126,19 +126,19 @@ def _plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: tuple[
         sliced: was it seen at one height only?
     """
     occupied, crossed, floor, ceiling = rasters
-    filled = band_stack(occupied, BANDS, BODY_BANDS)
+    filled = band_stack(occupied, HEIGHT_BANDS, BODY_BANDS)
     looked = observed_bands(filled)
-    masks = [BANDS.mask(low, high) for low, high in pairwise(BODY_BANDS)]
+    masks = [HEIGHT_BANDS.mask(low, high) for low, high in pairwise(BODY_BANDS)]
     observed = sum(mask for mask, seen in zip(masks, looked.tolist(), strict=True) if seen)
-    wall = wall_columns(filled[1:][looked[1:]], WALLS)
+    wall = wall_columns(filled[1:][looked[1:]], POSE_WALLS)
     standing = filled.any(axis=0)
-    shut = (occupied & ~np.uint32(BANDS.mask(*BODY_HEIGHTS))) > 0
-    rays = np.bitwise_count(crossed & np.uint32(BANDS.mask(*BODY_HEIGHTS))) >= max(int(looked.sum()) // 2, 1)
+    shut = (occupied & ~np.uint32(HEIGHT_BANDS.mask(*BODY_HEIGHTS))) > 0
+    rays = np.bitwise_count(crossed & np.uint32(HEIGHT_BANDS.mask(*BODY_HEIGHTS))) >= max(int(looked.sum()) // 2, 1)
     if sliced:
         wall = _straight(wall, cell)
     inside = ~wall & (standing | rays | (shut & (not sliced)))
     return StoreyPlan(
-        origin, cell, wall, inside, occupied, BANDS, floor, ceiling, levels=levels, observed=observed, sliced=sliced
+        origin, cell, wall, inside, occupied, HEIGHT_BANDS, floor, ceiling, levels=levels, observed=observed, sliced=sliced
     )
 
 

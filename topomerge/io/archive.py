@@ -22,7 +22,7 @@ DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can tell
 ARCHIVE_LIMIT = 4 << 30  # of all arrays together; a map of 100 million cells needs 2 GB
 MAX_RATIO = 1100  # deflate can't shrink by more than 1032; a file that claims more is damaged or hostile
 USUAL_RATIO, MODEST = 100, 1 << 28  # of a whole file: maps shrink by 12 to 17; small ones may claim more
-LONGEST_HEADER = 4096  # longest header of an array, bytes
+LONGEST_ARRAY_HEADER = 4096  # longest header of an array, bytes
 
 
 def write(arrays: Mapping[str, Array], path: str | Path) -> None:
@@ -91,11 +91,11 @@ def _read(file: io.BufferedReader, size: int) -> dict[str, Array]:
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
     """One array; its declared shape must fill the entry to the byte before the rest of it is read."""
     with archive.open(entry) as stream:
-        head = io.BytesIO(stream.read(LONGEST_HEADER))
+        head = io.BytesIO(stream.read(LONGEST_ARRAY_HEADER))
         version = np.lib.format.read_magic(head)
         if version != (1, 0):
             raise ValueError(f"{entry.filename} has an array format {version} that maps don't use")
-        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=LONGEST_HEADER)
+        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=LONGEST_ARRAY_HEADER)
         if dtype.hasobject:
             raise ValueError(f"{entry.filename} holds pickled objects, which are not read for safety")
         if by_columns or any(s < 0 for s in shape):

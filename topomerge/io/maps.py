@@ -70,6 +70,9 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
 def load_map(path: str | Path) -> TopometricMap:
     """Read a map that `save_map` wrote.
 
+    Args:
+        path: of the `.tmap`.
+
     Raises:
         InputError: no such file, not a map, of a newer format, damaged or cut off.
     """

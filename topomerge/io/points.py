@@ -78,7 +78,13 @@ def read_chunks(
     """The points of a file as clouds of at most `chunk` points, for files larger than memory.
 
     All clouds share one shift. Poses, free space and true rooms come with the first, warnings about the whole file with the
-    last. Meshes, building models, OctoMaps and NumPy archives are read whole and then cut. Arguments and errors: `read_points`.
+    last. Meshes, building models, OctoMaps and NumPy archives are read whole and then cut.
+
+    Args:
+        path: of the file.
+        chunk: points of a cloud, at most.
+        progress: called now and then with the share done and a text.
+        options: as of `read_points`, whose errors these are, too.
     """
     path = Path(path)
     file_format = _format_of(path)

@@ -21,8 +21,8 @@ from topomerge.kernels.plan import column_bits
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.types import Array, TopometricMap
 
-BANDS = HeightBands(step=0.25, below=2, count=32)  # from 0.5 m below the floor
-WALLS = WallRule()
+WALL_BANDS = HeightBands(step=0.25, below=2, count=32)  # from 0.5 m below the floor
+MATCHING_WALLS = WallRule()
 DIRECTION_BLUR = 1.5  # cells, before the direction of walls is measured
 
 
@@ -142,8 +142,8 @@ def _plan(map: TopometricMap, storey: int, navigable: Array) -> StoreyPlan:
     floor = np.full(navigable.shape, levels[0])
     ix, iy = np.ascontiguousarray(grid.cells[:, :2].T.astype(np.int64))
     z = grid.origin[2] + (grid.cells[:, 2] + 0.5) * grid.edge
-    profile = column_bits(ix, iy, z, floor, -BANDS.below * BANDS.step, BANDS.step)
-    filled = band_stack(profile, BANDS, WALL_HEIGHTS)
-    wall = wall_columns(filled[observed_bands(filled)], WALLS)
+    profile = column_bits(ix, iy, z, floor, -WALL_BANDS.below * WALL_BANDS.step, WALL_BANDS.step)
+    filled = band_stack(profile, WALL_BANDS, WALL_HEIGHTS)
+    wall = wall_columns(filled[observed_bands(filled)], MATCHING_WALLS)
     ceiling = np.full(navigable.shape, levels[1] - levels[0])
-    return StoreyPlan(grid.origin[:2], grid.edge, wall, navigable & ~wall, profile, BANDS, floor, ceiling, levels=levels)
+    return StoreyPlan(grid.origin[:2], grid.edge, wall, navigable & ~wall, profile, WALL_BANDS, floor, ceiling, levels=levels)

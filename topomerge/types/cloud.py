@@ -26,16 +26,30 @@ class TrueRoom:
 class PointCloud:
     """Points of one partial map, z up, in metres.
 
-    ``points + shift`` are the coordinates of the input file: float32 alone would lose centimetres in a national grid.
+    Args:
+        points: (N, 3) float32.
+        shift: (3,) float64; ``points + shift`` are the coordinates of the input file: float32 alone would lose centimetres in a
+            national grid.
+        colors: (N, 3) uint8.
+        labels: (N,) int32, true room of each point (index into `rooms`), -1: none.
+        poses: (K, 4, 4) float64, sensor into the file's frame.
+        pose_of: (N,) int32, index into `poses`, -1: unknown.
+        free: cells that the sensor saw to be empty.
+        rooms: the true rooms, where they are known.
+        source: file that the points come from.
+        warnings: what looked wrong while it was read.
+
+    Raises:
+        ValueError: arrays of other shapes.
     """
 
-    points: Array  # (N, 3) float32
-    shift: Array = field(default_factory=lambda: np.zeros(3))  # (3,) float64
-    colors: Array | None = None  # (N, 3) uint8
-    labels: Array | None = None  # (N,) int32, true room of each point (index into `rooms`), -1: none
-    poses: Array | None = None  # (K, 4, 4) float64, sensor into the file's frame
-    pose_of: Array | None = None  # (N,) int32, index into `poses`, -1: unknown
-    free: VoxelGrid | None = None  # cells known to be empty
+    points: Array
+    shift: Array = field(default_factory=lambda: np.zeros(3))
+    colors: Array | None = None
+    labels: Array | None = None
+    poses: Array | None = None
+    pose_of: Array | None = None
+    free: VoxelGrid | None = None
     rooms: tuple[TrueRoom, ...] = ()
     source: str = ""
     warnings: tuple[str, ...] = ()

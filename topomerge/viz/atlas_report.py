@@ -25,6 +25,7 @@ def atlas_html(result: AtlasResult, joined: Mapping[int, TopometricMap], title: 
     """The report as HTML.
 
     Args:
+        result: where the maps lie, and what contradicts.
         joined: component -> its joined map; of those that are left out there is no plan.
         title: what it is called.
     """

@@ -24,7 +24,7 @@ from topomerge.extraction.storeys import lowest_of_column
 from topomerge.kernels.profile import PROFILE_BELOW, PROFILE_LEVELS, profiles
 from topomerge.types import Array, VoxelGrid
 
-WALLS = WallRule(lacking=2, neighbours=8, least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
+ROOM_WALLS = WallRule(lacking=2, neighbours=8, least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
 THIN = 0.4  # share of the usual wall's levels: what has fewer is no wall
 OVER_FURNITURE = 2.05  # m: cupboards end below
 BLOCK = 0.5  # m: ceilings are measured on tiles of this size
@@ -33,8 +33,8 @@ FLOOR_REACH = 1.5  # m: so far from a seen floor a column still has its height
 LEAST_FLOOR = 0.5  # m2 of seen floor in a part
 HOLE = 4.0  # m2: gaps this small in what is known are filled
 TOUCHES = 0.25  # m: pieces this close to a longer wall belong to it
-MARGIN = 0.6  # m
-SLAB = 0.1  # m at least, between a ceiling and the floor above it
+PLAN_MARGIN = 0.6  # m
+LEAST_SLAB = 0.1  # m at least, between a ceiling and the floor above it
 
 
 def columns_of(plan: StoreyPlan, grid: VoxelGrid) -> tuple[Array, Array]:
@@ -56,7 +56,7 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
     floor = lowest_of_column(navigable)
     cells = navigable.cells[floor].astype(np.int64)
     mine = cells[storey[floor] == k]
-    margin = int(np.ceil(MARGIN / e))
+    margin = int(np.ceil(PLAN_MARGIN / e))
     low = mine[:, :2].min(axis=0) - margin
     size = mine[:, :2].max(axis=0) + margin + 1 - low
     base, seen, far = _heights(mine, low, size)
@@ -65,7 +65,7 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
     if len(above):
         nominal = int(np.median(above[:, 2]))
         upper, _, near = _heights(above[_within(above[:, :2] - low, size)], low, size, nominal)
-        top = np.minimum(top, np.where(near * e < 1.0, upper, nominal) - int(np.ceil(SLAB / e)))
+        top = np.minimum(top, np.where(near * e < 1.0, upper, nominal) - int(np.ceil(LEAST_SLAB / e)))
     profile = np.zeros(size, np.uint64)
     profiles(grid.cells, low, base, top, profile)
     bands = profile_bands(e)
@@ -108,12 +108,12 @@ def _filled_like_walls(profile: Array, bands: HeightBands) -> Array:
     """Is the column filled like a wall, at the heights at which the sensor looked?"""
     filled = band_stack(profile, bands)
     filled = filled[observed_bands(filled)]
-    like = wall_columns(filled, WALLS)
-    if len(filled) < WALLS.least_bands:
+    like = wall_columns(filled, ROOM_WALLS)
+    if len(filled) < ROOM_WALLS.least_bands:
         return like
     # flying points hang in every height of a doorway, but few of them
     levels = np.bitwise_count(profile & np.uint64(bands.mask(WALL_HEIGHTS[0], WALL_HEIGHTS[-1])))
-    full = filled.sum(axis=0) >= WALLS.least_of(len(filled))
+    full = filled.sum(axis=0) >= ROOM_WALLS.least_of(len(filled))
     usual = np.median(levels[full]) if full.any() else 0
     return np.asarray(like & (levels >= THIN * usual))
 
