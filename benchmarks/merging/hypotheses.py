@@ -17,7 +17,7 @@ import numpy as np
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_set
 
 from topomerge.embedding.embedders import embedder
-from topomerge.evaluation.score import FLAT, pose_error, within
+from topomerge.evaluation.score import FLAT_SENSORS, pose_error, within
 from topomerge.fusion.merge import merge
 from topomerge.matching.consistency import CONSISTENCY, best_of, candidate_poses, votes
 from topomerge.matching.costs import best_partners, descriptor_costs, similarities
@@ -33,7 +33,7 @@ MOST = 1000  # poses that are looked through
 def right(pose: Sim3, pair: EvaluationPair, limits: tuple[float, float]) -> bool:
     """Is a pose near the true one, in the middle of what both maps saw?"""
     assert pair.transform is not None
-    flat = any(sensor in FLAT for sensor in pair.about["sensors"])
+    flat = any(sensor in FLAT_SENSORS for sensor in pair.about["sensors"])
     return within(pose_error(pose, pair.transform, pair.anchor), flat, limits)
 
 

@@ -18,7 +18,16 @@ from topomerge.config import compose
 from topomerge.errors import InputError
 from topomerge.evaluation import predict as predicting
 from topomerge.evaluation.evaluate import claim, evaluate
-from topomerge.evaluation.settings import Evaluation, Pairs, check, difference, folder_of, run_title, told, variants
+from topomerge.evaluation.settings import (
+    Evaluation,
+    Pairs,
+    check,
+    difference,
+    folder_of,
+    prediction_settings,
+    run_title,
+    variants,
+)
 from topomerge.evaluation.tables import Table, write_section
 from topomerge.types import PointCloud, Sim3
 
@@ -69,20 +78,20 @@ def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
     settings = Evaluation(SMALL, folder=str(tmp_path), descriptors={"engineered": {"name": "engineered"}}, only=["engineered"])
     folder = folder_of(settings)
     assert folder == tmp_path / "two"
-    claim(folder, told(settings))
-    claim(folder, told(settings))  # the same again
+    claim(folder, prediction_settings(settings))
+    claim(folder, prediction_settings(settings))  # the same again
     with pytest.raises(InputError, match=r"k: \[0\] there, \[0, 1\] now.*another folder"):
-        claim(folder, told(replace(settings, k=[0, 1])))
+        claim(folder, prediction_settings(replace(settings, k=[0, 1])))
     with pytest.raises(InputError, match=r"data\.seed: 4 there, 5 now"):
-        claim(folder, told(replace(settings, data=replace(SMALL, seed=5))))
-    claim(folder, told(replace(settings, rounds=10, write="x.md")))  # how it is told changes no prediction
+        claim(folder, prediction_settings(replace(settings, data=replace(SMALL, seed=5))))
+    claim(folder, prediction_settings(replace(settings, rounds=10, write="x.md")))  # how it is told changes no prediction
     (folder / "evaluation.json").write_text("{")
     with pytest.raises(InputError, match="damaged"):
-        claim(folder, told(settings))
+        claim(folder, prediction_settings(settings))
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "photo.png").touch()
     with pytest.raises(InputError, match="something else"):
-        claim(tmp_path / "other", told(settings))
+        claim(tmp_path / "other", prediction_settings(settings))
 
 
 def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
@@ -93,17 +102,17 @@ def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
     settings = Evaluation(SMALL, run=runs, methods=["assignment", "mutual"], folder=str(tmp_path))
     assert [v.name for v in variants(settings)] == ["a", "b"] and folder_of(settings).name == "two-a-b"
     assert next(variants(settings)).methods == ("assignment", "mutual")
-    before = told(settings)
+    before = prediction_settings(settings)
     assert before["run"]["a"] != before["run"]["b"]
     (tmp_path / "b" / "best" / "weights.safetensors").write_bytes(b"three")
-    assert difference(before, told(settings)).startswith("run.b")
+    assert difference(before, prediction_settings(settings)).startswith("run.b")
 
 
 def test_runs_are_called_by_what_they_are_made_of() -> None:
     run = "topomerge/embedding/pretrained"
     assert run_title(run) == "scalars, gat around, infonce"
     settings = Evaluation(SMALL, run=[run], titles=True, mergers=[])
-    assert [v.name for v in variants(settings)] == ["scalars, gat around, infonce"] == list(told(settings)["run"])
+    assert [v.name for v in variants(settings)] == ["scalars, gat around, infonce"] == list(prediction_settings(settings)["run"])
     with pytest.raises(InputError, match="two are called 'scalars, gat around, infonce'"):
         check(replace(settings, run=[run, f"{run}/embedder.json"]))
 

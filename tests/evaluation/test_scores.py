@@ -25,9 +25,9 @@ from topomerge.evaluation.score import (
 from topomerge.types import Sim3, TrueRoom
 
 
-def kept(**changes: Any) -> EvaluationPair:
+def hand_made_pair(**changes: Any) -> EvaluationPair:
     """Map a has five rooms: true 0, 1, 1 (in two pieces), 2, none; map b four: true 1, 0, 2, 3. Room 2 of a has a twin."""
-    known = {
+    fields = {
         "name": "x",
         "folder": Path(),
         "matches": np.array([(0, 1), (1, 0), (2, 0), (3, 2)]),
@@ -39,24 +39,24 @@ def kept(**changes: Any) -> EvaluationPair:
         "anchor": np.array([5.0, 0.0, 0.0]),
         "about": {"kind": "overlap", "common": 100.0, "sensors": ["tls", "depth"], "rooms": "labelled"},
     }
-    return EvaluationPair(**(known | changes))
+    return EvaluationPair(**(fields | changes))
 
 
 def test_matches_are_counted_by_hand() -> None:
     rooms = np.array([(0, 1), (1, 0), (2, 0), (3, 3), (4, 2)])  # right, right, right piece of the same room, wrong, wrong
-    found = match_counts(kept(), rooms)
-    assert (found["predicted"], found["right"], found["units"], found["found"]) == (5, 3, 3, 2)
-    assert (found["predicted_twin"], found["right_twin"], found["units_twin"], found["found_twin"]) == (1, 0, 1, 0)
-    assert (found["predicted_single"], found["right_single"], found["units_single"], found["found_single"]) == (4, 3, 2, 2)
-    assert (found["strict_right"], found["strict_units"]) == (2, 3)
+    counts = match_counts(hand_made_pair(), rooms)
+    assert (counts["predicted"], counts["right"], counts["units"], counts["found"]) == (5, 3, 3, 2)
+    assert (counts["predicted_twin"], counts["right_twin"], counts["units_twin"], counts["found_twin"]) == (1, 0, 1, 0)
+    assert (counts["predicted_single"], counts["right_single"], counts["units_single"], counts["found_single"]) == (4, 3, 2, 2)
+    assert (counts["strict_right"], counts["strict_units"]) == (2, 3)
 
 
 def test_no_match_at_all() -> None:
-    found = match_counts(kept(), np.zeros((0, 2), int))
-    assert (found["predicted"], found["right"], found["units"], found["found"]) == (0, 0, 3, 0)
-    nothing = kept(matches=np.zeros((0, 2), int))
-    assert match_counts(nothing, np.array([(0, 0)])) | {"pairs": 1} == match_counts(nothing, np.array([(0, 0)]))
-    assert match_counts(nothing, np.array([(0, 0)]))["units"] == 0
+    counts = match_counts(hand_made_pair(), np.zeros((0, 2), int))
+    assert (counts["predicted"], counts["right"], counts["units"], counts["found"]) == (0, 0, 3, 0)
+    unmatched_pair = hand_made_pair(matches=np.zeros((0, 2), int))
+    assert match_counts(unmatched_pair, np.array([(0, 0)])) | {"pairs": 1} == match_counts(unmatched_pair, np.array([(0, 0)]))
+    assert match_counts(unmatched_pair, np.array([(0, 0)]))["units"] == 0
 
 
 def test_ranks_by_hand() -> None:
@@ -71,24 +71,24 @@ def test_rank_counts_of_both_directions() -> None:
     cost = np.ones((5, 4))
     cost[[0, 1, 2], [1, 0, 0]] = 0.0  # right and cheap
     cost[3, 2] = 2.0  # right but dear
-    found = rank_counts(kept(), cost)
-    assert found["queries"] == 4 + 3
-    assert found["chance"] == pytest.approx(4 / 4 + 4 / 5)  # four pairs of rooms, among four of b, and among five of a
-    assert found["first"] == 3 + 2  # rooms 0, 1 and 2 of a; rooms 0 and 1 of b
-    assert found["five"] == 7
-    assert found["reciprocal"] == pytest.approx(3 + 2 + 1 / 4 + 1 / 5)
-    assert found["queries_twin"] == 1 and found["first_twin"] == 0
-    assert (found["queries_whole"], found["first_whole"]) == (4, 2)  # rooms 0 and 3 of a, 1 and 2 of b, both entered
+    counts = rank_counts(hand_made_pair(), cost)
+    assert counts["queries"] == 4 + 3
+    assert counts["chance"] == pytest.approx(4 / 4 + 4 / 5)  # four pairs of rooms, among four of b, and among five of a
+    assert counts["first"] == 3 + 2  # rooms 0, 1 and 2 of a; rooms 0 and 1 of b
+    assert counts["five"] == 7
+    assert counts["reciprocal"] == pytest.approx(3 + 2 + 1 / 4 + 1 / 5)
+    assert counts["queries_twin"] == 1 and counts["first_twin"] == 0
+    assert (counts["queries_whole"], counts["first_whole"]) == (4, 2)  # rooms 0 and 3 of a, 1 and 2 of b, both entered
 
 
 def test_ranks_after_consensus() -> None:
     cost = np.ones((5, 4))
     cost[0, 3] = 0.5  # the descriptor prefers the wrong room to room 0's partner
     agreed = np.array([(0, 1), (3, 3)])  # right, wrong
-    found = after_counts(kept(), cost, agreed)
-    assert rank_counts(kept(), cost)["first"] == 0
-    assert found == {"first_after": 2, "first_single_after": 2, "five_after": 7}  # room 0 of a, room 1 of b, both without twin
-    assert all(np.isnan(v) for v in after_counts(kept(), cost, None).values()) and cost.min() == 0.5
+    counts = after_counts(hand_made_pair(), cost, agreed)
+    assert rank_counts(hand_made_pair(), cost)["first"] == 0
+    assert counts == {"first_after": 2, "first_single_after": 2, "five_after": 7}  # room 0 of a, room 1 of b, both without twin
+    assert all(np.isnan(v) for v in after_counts(hand_made_pair(), cost, None).values()) and cost.min() == 0.5
 
 
 def test_poses() -> None:
@@ -101,7 +101,7 @@ def test_poses() -> None:
     assert not within((0.1, 0.0, 5.1), False, (0.5, 5.0))
 
 
-def said(pose: Sim3 | None, believed: bool) -> dict[str, Any]:
+def verdict(pose: Sim3 | None, believed: bool) -> dict[str, Any]:
     matrix = None if pose is None else pose.matrix.tolist()
     return {"pose": matrix, "believed": believed, "probability": 0.9, "seconds": 1.0, "rooms": [[0, 1]], "chance": [0.8]}
 
@@ -116,15 +116,15 @@ def said(pose: Sim3 | None, believed: bool) -> dict[str, Any]:
     ],
 )
 def test_merges(pose: Sim3 | None, believed: bool, expected: dict[str, int]) -> None:
-    found = merge_counts(kept(), said(pose, believed))
-    assert {k: found[k] for k in expected} == expected and found["mergeable"] == 1
-    assert found["good"] == [True]
+    counts = merge_counts(hand_made_pair(), verdict(pose, believed))
+    assert {k: counts[k] for k in expected} == expected and counts["mergeable"] == 1
+    assert counts["good"] == [True]
 
 
 def test_whatever_is_believed_of_two_places_is_false() -> None:
-    hard = kept(about={"kind": "other-storey", "common": 0.0, "sensors": ["tls", "tls"], "rooms": "labelled"})
-    found = merge_counts(hard, said(Sim3(0.3, (1.0, 2.0, 0.0)), True))
-    assert (found["mergeable"], found["near"], found["false"]) == (0, 0, 1)
+    hard = hand_made_pair(about={"kind": "other-storey", "common": 0.0, "sensors": ["tls", "tls"], "rooms": "labelled"})
+    counts = merge_counts(hard, verdict(Sim3(0.3, (1.0, 2.0, 0.0)), True))
+    assert (counts["mergeable"], counts["near"], counts["false"]) == (0, 0, 1)
 
 
 def test_bins() -> None:
@@ -149,8 +149,8 @@ def test_ratios_are_of_sums() -> None:
 
 
 def test_the_interval_draws_whole_buildings() -> None:
-    found = value(ROWS, "recall@1", 4000)
-    assert (found.low, found.high) == (0.0, 0.5)  # only building b, only building a
+    recall = value(ROWS, "recall@1", 4000)
+    assert (recall.low, recall.high) == (0.0, 0.5)  # only building b, only building a
     one = value(ROWS[:2], "recall@1", 100)
     assert one.low == one.high == one.value
     assert draws(3, 50).sum(axis=1).tolist() == [3] * 50
@@ -161,18 +161,18 @@ def test_the_interval_draws_whole_buildings() -> None:
 
 def test_a_gain_is_paired() -> None:
     better = [{**r, "first": r["first"] + 1} for r in ROWS]
-    found = gain(better, ROWS, "recall@1", 500)
-    assert found.value == 3 / 8 and 0 < found.low <= found.high
+    recall_gain = gain(better, ROWS, "recall@1", 500)
+    assert recall_gain.value == 3 / 8 and 0 < recall_gain.low <= recall_gain.high
     assert gain(ROWS, ROWS, "recall@1", 500).high == 0
 
 
 def test_calibration_by_hand() -> None:
-    told = [0.05, 0.05, 0.95, 0.95, 0.95, 1.0]
+    probabilities = [0.05, 0.05, 0.95, 0.95, 0.95, 1.0]
     right = [False, True, True, True, False, True]
-    found = calibration(told, right)
-    assert found.count.tolist() == [2, 4]
-    assert found.told == pytest.approx([0.05, (3 * 0.95 + 1) / 4]) and found.right == pytest.approx([0.5, 0.75])
-    assert found.error == pytest.approx((2 * 0.45 + 4 * abs(0.9625 - 0.75)) / 6)
+    bins = calibration(probabilities, right)
+    assert bins.count.tolist() == [2, 4]
+    assert bins.probability == pytest.approx([0.05, (3 * 0.95 + 1) / 4]) and bins.right == pytest.approx([0.5, 0.75])
+    assert bins.error == pytest.approx((2 * 0.45 + 4 * abs(0.9625 - 0.75)) / 6)
     exact = np.random.default_rng(0).random(20_000)
     assert calibration(exact, np.random.default_rng(1).random(20_000) < exact).error < 0.02
 

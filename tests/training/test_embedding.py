@@ -91,15 +91,16 @@ def test_lost_rooms_take_their_doors_and_matches_along():
     one = pair(0, rooms=9)
     some = {name: one.a[name] for name in NAMES}
     generator = torch.Generator().manual_seed(1)
-    out, kept = changed(some, 9, Augment(rooms=0.9, edges=0.5, jitter=0.0, points=16), generator)
-    assert 2 <= len(kept) < 9 and torch.equal(out["x"], some["x"][kept]) and out["room_points"].shape == (len(kept), 16, 3)
-    assert out["edge_index"].max() < len(kept) and len(out["edge_attr"]) == out["edge_index"].shape[1]
+    out, rooms_left = changed(some, 9, Augment(rooms=0.9, edges=0.5, jitter=0.0, points=16), generator)
+    assert 2 <= len(rooms_left) < 9 and torch.equal(out["x"], some["x"][rooms_left])
+    assert out["room_points"].shape == (len(rooms_left), 16, 3)
+    assert out["edge_index"].max() < len(rooms_left) and len(out["edge_attr"]) == out["edge_index"].shape[1]
     assert torch.equal(out["edge_index"][0][out["door_index"][0]], out["edge_index"][0][out["door_index"][1]])
     near = out["near_index"]
     assert len(out["near_attr"]) == near.shape[1] and near.max() < len(out["edge_attr"])
     for k in range(out["edge_index"].shape[1]):  # each edge is one of the old ones, with its features
         old = (some["edge_attr"] == out["edge_attr"][k]).all(dim=1).nonzero()[0, 0]
-        assert torch.equal(some["edge_index"][:, old], kept[out["edge_index"][:, k]])
+        assert torch.equal(some["edge_index"][:, old], rooms_left[out["edge_index"][:, k]])
     batch = make_batch([one], NAMES, Augment(rooms=0.8), generator)
     i, j = batch.truth.same.nonzero(as_tuple=True)
     assert (
@@ -240,11 +241,11 @@ GROUPS += [(group, p.stem) for group in ("node", "loss", "experiment") for p in 
 
 @pytest.mark.parametrize(("group", "name"), GROUPS)
 def test_every_config_composes_and_builds(group, name):
-    found = from_words([f"{group}={name}"])
-    assert sum(p.numel() for p in Embedder(found.network).parameters()) > 1000
-    assert from_dict(to_dict(found)) == found
+    config = from_words([f"{group}={name}"])
+    assert sum(p.numel() for p in Embedder(config.network).parameters()) > 1000
+    assert from_dict(to_dict(config)) == config
     if group == "experiment":
-        assert found.name == name
+        assert config.name == name
 
 
 def test_typos_name_their_key(tmp_path):

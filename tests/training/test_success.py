@@ -39,10 +39,10 @@ def truth_of(b: Side) -> Array:
 def test_true_matches_give_the_true_pose(yaw):
     pose = Sim3(yaw, (12.0, -5.0, 3.0))
     a, b = maps(pose)
-    found = pose_of_matches(a, b, truth_of(b))
-    assert found is not None and np.allclose(found.matrix, pose.matrix, atol=1e-6)
+    estimate = pose_of_matches(a, b, truth_of(b))
+    assert estimate is not None and np.allclose(estimate.matrix, pose.matrix, atol=1e-6)
     at = b["pos"].mean(axis=0)
-    assert merged_right(found, pose.matrix, at)
+    assert merged_right(estimate, pose.matrix, at)
     far = Sim3(yaw, (12.0, -4.4, 3.0))
     assert not merged_right(far, pose.matrix, at) and not merged_right(None, pose.matrix, at)
     assert not merged_right(Sim3(yaw + 0.1, pose.translation), pose.matrix, np.zeros(3))
@@ -58,8 +58,8 @@ def test_wrong_matches_are_outvoted_and_partial_rooms_are_off():
     rng = np.random.default_rng(2)
     b["pos"] = b["pos"] + rng.normal(0, 0.4, b["pos"].shape) * [1, 1, 0]
     b["edge_pos"] = b["edge_pos"] + np.tile(rng.normal(0, 0.05, (9, 3)), (2, 1))
-    found = pose_of_matches(a, b, certain)
-    assert merged_right(found, pose.matrix, b["pos"].mean(axis=0))
+    estimate = pose_of_matches(a, b, certain)
+    assert merged_right(estimate, pose.matrix, b["pos"].mean(axis=0))
 
 
 def test_wrong_matches_give_no_true_pose():

@@ -45,15 +45,15 @@ class Inputs:
             began = time.process_time()
             self.arrays[key] = learned.arrays(m)
             self.seconds[*key, ""] = time.process_time() - began
-        known = self.arrays[key]
+        arrays = self.arrays[key]
         extras = [name for name in POINT_TABLES if name in learned.network.geometry.parts]
         for name in extras:
-            if name not in known and len(known["x"]):
+            if name not in arrays and len(arrays["x"]):
                 began = time.process_time()
-                known[name] = POINT_TABLES[name](known["room_points"])
+                arrays[name] = POINT_TABLES[name](arrays["room_points"])
                 self.seconds[*key, name] = time.process_time() - began
         began = time.process_time()
-        rows = np.asarray(learned.graph(known)[0])
+        rows = np.asarray(learned.graph(arrays)[0])
         spent = sum(self.seconds.get((*key, name), 0.0) for name in ("", *extras))
         return rows, time.process_time() - began + spent
 
@@ -68,15 +68,15 @@ def described(
         return (a, b), first + second
     options = settings.descriptors[variant.descriptor]
     top = max(settings.k) if variant.k and variant.context == "join" else 0
-    found, seconds = [], 0.0
+    descriptors, seconds = [], 0.0
     for side, m in zip("ab", maps, strict=True):
         shelf = Shelf(Path(settings.cache) / "descriptors", path.with_name(f"{path.stem}{side}.tmap"))
         rows, took = shelf.rows(m, options, top)
         if variant.context == "mean" and variant.k:
             rows = embedder(_gives(rows), variant.k, "mean")(m)
-        found.append(rows[:, : rows.shape[1] // (top + 1) * (variant.k + 1)] if top else rows)
+        descriptors.append(rows[:, : rows.shape[1] // (top + 1) * (variant.k + 1)] if top else rows)
         seconds += took
-    return (found[0], found[1]), seconds
+    return (descriptors[0], descriptors[1]), seconds
 
 
 def code_of(name: str) -> str:
@@ -105,12 +105,12 @@ class Shelf:
         file = self.folder / f"{hashlib.sha256(inputs.encode()).hexdigest()[:24]}.npz"
         if not file.exists():
             describe = embedder(str(options["name"]), **{k: v for k, v in options.items() if k != "name"})
-            own, took = self.rows(m, options, 0) if steps else (None, 0.0)
+            lone_rows, took = self.rows(m, options, 0) if steps else (None, 0.0)
             began = time.process_time()
-            if own is None:
+            if lone_rows is None:
                 rows = describe(m)
             else:
-                rows = embedder(lambda other: own if other is m else describe(other), steps, "join")(m)
+                rows = embedder(lambda other: lone_rows if other is m else describe(other), steps, "join")(m)
             archive.write({"rows": rows, "seconds": np.array(took + time.process_time() - began)}, file)
         data = archive.read(file, "cached descriptors")
         return data["rows"], float(data["seconds"])

@@ -18,7 +18,7 @@ from topomerge.errors import InputError
 from topomerge.evaluation.figures import save_figures
 from topomerge.evaluation.predict import CODE, predict_all
 from topomerge.evaluation.score import Row, score_all
-from topomerge.evaluation.settings import Evaluation, check, difference, folder_of, told
+from topomerge.evaluation.settings import Evaluation, check, difference, folder_of, prediction_settings
 from topomerge.evaluation.tables import (
     BY,
     Table,
@@ -61,7 +61,7 @@ def evaluate(settings: Evaluation, say: Say = lambda text: None, command: str = 
     """
     check(settings)
     folder = folder_of(settings)
-    claim(folder, told(settings))
+    claim(folder, prediction_settings(settings))
     pairs = listed_pairs(folder / "pairs.json", settings, say)
     if not pairs:
         raise InputError(f"{settings.data.name}: no pair could be made; see the reasons above")
@@ -90,8 +90,11 @@ def _write(path: Path, text: str) -> None:
         beside.write_text(text + "\n", encoding="utf-8")
 
 
-def claim(folder: Path, known: dict[str, Any]) -> None:
+def claim(folder: Path, plain_settings: dict[str, Any]) -> None:
     """Take a folder for an evaluation: a new one, or one that was made with the same settings.
+
+    Args:
+        plain_settings: of `prediction_settings`.
 
     Raises:
         InputError: it was made with others; the first key that differs is named.
@@ -102,13 +105,15 @@ def claim(folder: Path, known: dict[str, Any]) -> None:
             before = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise InputError(f"{path}: damaged ({error}); take another folder with name=...") from error
-        if found := difference(before, known):
-            raise InputError(f"{folder}: was made with other settings ({found}); take another folder with name=..., or delete it")
+        if mismatch := difference(before, plain_settings):
+            raise InputError(
+                f"{folder}: was made with other settings ({mismatch}); take another folder with name=..., or delete it"
+            )
         return
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder}: holds something else than an evaluation; take another folder with name=...")
     folder.mkdir(parents=True, exist_ok=True)
-    _write(path, json.dumps(known, indent=1, sort_keys=True))
+    _write(path, json.dumps(plain_settings, indent=1, sort_keys=True))
 
 
 def listed_pairs(listed: Path, settings: Evaluation, say: Say) -> list[Path]:
@@ -126,8 +131,8 @@ def pairs_of(settings: Evaluation, say: Say) -> list[Path]:
     """Files of the kept pairs, made where they are missing."""
     data = settings.data
     if data.real:
-        found = real_evaluation_pairs(data.folder, Path(settings.cache), data.real, data.voxel_size, say)
-        return found[: settings.limit or None]
+        real_pairs = real_evaluation_pairs(data.folder, Path(settings.cache), data.real, data.voxel_size, say)
+        return real_pairs[: settings.limit or None]
     if not data.maps:
         raise InputError(f"{data.name}: its maps are not kept; set data.maps=true")
     pairs = min(settings.limit, data.pairs) if settings.limit else data.pairs
@@ -152,13 +157,13 @@ def short(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Eva
     """The tables that go into the documentation."""
     if any(m["change"] for m in matches):
         return [curves(ranks, matches, merges, settings)]
-    made: dict[str, Callable[[], Table]] = {
+    table_makers: dict[str, Callable[[], Table]] = {
         "ranking": lambda: ranking(ranks, settings),
         "matching": lambda: beside(matches, settings),
         "merging": lambda: merging(merges, "area", settings),
         **{key: partial(grouped, ranks, matches, key, settings) for key in BY},
     }
-    return [made[name]() for name in settings.tables if (merges if name == "merging" else ranks)]
+    return [table_makers[name]() for name in settings.tables if (merges if name == "merging" else ranks)]
 
 
 def _about(ranks: list[Row], merges: list[Row], settings: Evaluation, command: str) -> str:

@@ -59,21 +59,21 @@ def _all(rows: Sequence[Row], key: str) -> list[Any]:
 def _reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
     """Share that was right against the probability that was told, with the number in each bin."""
     sets = [("merges", {n: ([r["probability"] for r in s], [r["near"] for r in s]) for n, s in _of(merges, "variant").items()})]
-    told = [m for m in matches if m["k"] == 0 and m["method"] in ("consistent", "mutual")]
-    named = _of([{**m, "title": f"{m['variant']} {m['method']}"} for m in told], "title")
+    rows_with_probability = [m for m in matches if m["k"] == 0 and m["method"] in ("consistent", "mutual")]
+    named = _of([{**m, "title": f"{m['variant']} {m['method']}"} for m in rows_with_probability], "title")
     sets.append(("matches of rooms", {n: (_all(s, "chance"), _all(s, "good")) for n, s in named.items()}))
-    sets = [(title, some) for title, some in sets if any(len(p) for p, _ in some.values())]
+    sets = [(title, predictions) for title, predictions in sets if any(len(p) for p, _ in predictions.values())]
     if not sets:
         return None
     figure, axes = _figure(len(sets))
-    for ax, (title, some) in zip(axes, sets, strict=True):
+    for ax, (title, predictions) in zip(axes, sets, strict=True):
         ax.plot([0, 1], [0, 1], color="0.7", lw=1)
-        for name, (p, y) in some.items():
+        for name, (p, y) in predictions.items():
             if len(p):
                 c = calibration(p, y)
-                line = ax.plot(c.told, c.right, "o-", ms=4, label=f"{name} ({len(p)}; ECE {c.error:.2f})")[0]
-                if len(some) == 1:
-                    for x, r, n in zip(c.told, c.right, c.count, strict=True):
+                line = ax.plot(c.probability, c.right, "o-", ms=4, label=f"{name} ({len(p)}; ECE {c.error:.2f})")[0]
+                if len(predictions) == 1:
+                    for x, r, n in zip(c.probability, c.right, c.count, strict=True):
                         ax.annotate(
                             str(n), (x, r), fontsize=7, color=line.get_color(), xytext=(3, -9), textcoords="offset points"
                         )
@@ -88,19 +88,19 @@ def _overlap(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]
     if not any(r["overlap"] in bins for r in ranks):
         return None
     panels = [("recall@1 of rooms", "recall@1", {n: s for n, s in _of(ranks, "variant").items() if s[0]["k"] == 0})]
-    own = [
+    method_rows = [
         {**m, "title": f"{m['variant']}, {m['method']}"}
         for m in matches
         if m["k"] == 0 and m["method"] in ("growing", "consistent")
     ]
-    panels.append(("F1 of matches", "F1", _of(own, "title")))
+    panels.append(("F1 of matches", "F1", _of(method_rows, "title")))
     if merges:
         panels.append(("pairs merged right", "merged", _of(merges, "variant")))
     figure, axes = _figure(len(panels))
-    for ax, (title, metric, some) in zip(axes, panels, strict=True):
-        for shift, (name, rows) in enumerate(some.items()):
+    for ax, (title, metric, rows_by_name) in zip(axes, panels, strict=True):
+        for shift, (name, rows) in enumerate(rows_by_name.items()):
             values = [value([r for r in rows if r["overlap"] == b], metric, ROUNDS) for b in bins]
-            x = np.arange(len(bins)) + 0.05 * (shift - len(some) / 2)
+            x = np.arange(len(bins)) + 0.05 * (shift - len(rows_by_name) / 2)
             mid = np.array([v.value for v in values])
             ends = np.array([[max(v.value - v.low, 0), max(v.high - v.value, 0)] for v in values]).T
             ax.errorbar(x, mid, yerr=np.nan_to_num(ends), fmt="o-", ms=4, lw=1, capsize=2, label=name)
@@ -114,25 +114,26 @@ def _precision_recall(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequ
     if not matches:
         return None
     figure, (ax,) = _figure(1)
-    for name, some in _of(matches, "variant").items():
-        if some[0]["k"]:
+    for name, variant_rows in _of(matches, "variant").items():
+        if variant_rows[0]["k"]:
             continue
         color = None
-        for method, these in _of(some, "method").items():
-            units = sum(r["units"] for r in these)
-            p, good = np.concatenate([r["chance"] for r in these]), np.concatenate([r["good"] for r in these]).astype(float)
+        for method, method_rows in _of(variant_rows, "method").items():
+            units = sum(r["units"] for r in method_rows)
+            p = np.concatenate([r["chance"] for r in method_rows])
+            good = np.concatenate([r["good"] for r in method_rows]).astype(float)
             if not len(p) or not units:
                 continue
             if method in ("consistent", "mutual"):
                 order = np.argsort(-p, kind="stable")
                 right = good[order].cumsum()
-                share = sum(r["found"] for r in these) / max(good.sum(), 1)  # pieces of a room found twice count once
+                share = sum(r["found"] for r in method_rows) / max(good.sum(), 1)  # pieces of a room found twice count once
                 line = ax.plot(
                     right * share / units, right / np.arange(1, len(p) + 1), lw=1.2, color=color, label=f"{name}, {method}"
                 )
                 color = line[0].get_color()
             else:
-                v = [value(these, m, 1).value for m in ("recall", "precision")]
+                v = [value(method_rows, m, 1).value for m in ("recall", "precision")]
                 mark = {"full": "s", "assignment": "o", "growing": "^"}.get(method, "x")
                 dot = ax.plot(*v, mark, ms=5, color=color, label=f"{name}, {method}")
                 color = dot[0].get_color()
@@ -148,11 +149,11 @@ def _robustness(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[R
         return None
     figure, axes = _figure(len(changes))
     for ax, change in zip(axes, changes, strict=True):
-        some = [
+        changed_rows = [
             m for m in matches if m["change"] == change and m["k"] == 0 and m["method"] in ("assignment", "consistent", "mutual")
         ]
-        values = sorted({m["value"] for m in some})
-        for name, rows in _of([{**m, "title": f"{m['variant']}, {m['method']}"} for m in some], "title").items():
+        values = sorted({m["value"] for m in changed_rows})
+        for name, rows in _of([{**m, "title": f"{m['variant']}, {m['method']}"} for m in changed_rows], "title").items():
             ax.plot(values, [value([r for r in rows if r["value"] == v], "F1", 1).value for v in values], "o-", ms=4, label=name)
         joined = [m for m in merges if m["change"] == change]
         if joined:

@@ -104,8 +104,8 @@ def gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds: int = 
         return Value(np.nan, np.nan, np.nan, 0, 0)
     drawn = draws(len(buildings), rounds)
     wholes, parts = [], []
-    for some in (rows, others):
-        counts = summed(some, needed(metric), buildings)
+    for compared_rows in (rows, others):
+        counts = summed(compared_rows, needed(metric), buildings)
         wholes.append(float(measure(metric, {n: c.sum() for n, c in counts.items()})))
         parts.append(measure(metric, {n: drawn @ c for n, c in counts.items()}))
     low, high = _interval(parts[0] - parts[1])
@@ -113,27 +113,27 @@ def gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds: int = 
 
 
 def _interval(values: Array) -> tuple[float, float]:
-    known = values[np.isfinite(values)]
-    if not len(known):
+    finite = values[np.isfinite(values)]
+    if not len(finite):
         return float("nan"), float("nan")
-    low, high = np.percentile(known, LEVELS).tolist()
+    low, high = np.percentile(finite, LEVELS).tolist()
     return low, high
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Reliability: of each bin of told probabilities their mean, the share that was right, and how many; and the expected
-    calibration error, the mean over all of the difference."""
+    """Reliability: of each bin (B,) of predicted probabilities their mean, the share that was right, and how many; and the
+    expected calibration error, the mean over all of the difference."""
 
-    told: Array
+    probability: Array
     right: Array
     count: Array
     error: float
 
 
-def calibration(told: Sequence[float], right: Sequence[bool], bins: int = 10) -> Calibration:
+def calibration(probabilities: Sequence[float], right: Sequence[bool], bins: int = 10) -> Calibration:
     """Probabilities against what came true, in bins of equal width; empty bins are left out."""
-    p, y = np.asarray(told, float), np.asarray(right, float)
+    p, y = np.asarray(probabilities, float), np.asarray(right, float)
     which = np.minimum((p * bins).astype(int), bins - 1)
     count = np.bincount(which, minlength=bins)
     held = count > 0

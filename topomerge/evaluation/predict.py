@@ -37,27 +37,28 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
     Raises:
         InputError: the pair can't be read.
     """
-    kept = load_evaluation_pair(path)
-    maps = kept.maps()
-    some = list(variants(settings))
+    pair = load_evaluation_pair(path)
+    maps = pair.maps()
+    evaluated_variants = list(variants(settings))
     arrays: dict[str, Array] = {}
-    told: dict[str, Any] = {"pair": kept.name, "version": topomerge.__version__, "code": code_digest(*CODE)}
+    record: dict[str, Any] = {"pair": pair.name, "version": topomerge.__version__, "code": code_digest(*CODE)}
     inputs = Inputs()
-    rows = {v.name: described(v, maps, path, settings, inputs) for v in some}
-    told["seconds"] = {name: seconds for name, (_, seconds) in rows.items()}
-    for v in some:
+    rows = {v.name: described(v, maps, path, settings, inputs) for v in evaluated_variants}
+    record["seconds"] = {name: seconds for name, (_, seconds) in rows.items()}
+    for v in evaluated_variants:
         a, b = rows[v.name][0]
         arrays[f"{v.name}/a"], arrays[f"{v.name}/b"] = a.astype(np.float32), b.astype(np.float32)
         arrays[f"{v.name}/cost"] = descriptor_costs(a, b).astype(np.float32)
         for method in v.methods:
             arrays |= {
                 f"{v.name}/{method}/{key}": value
-                for key, value in matched(v, method, maps, (a, b), kept.about["scale_free"]).items()
+                for key, value in matched(v, method, maps, (a, b), pair.about["scale_free"]).items()
             }
-    told["merge"] = {v.name: merged(maps, rows[v.name][0], kept, settings.poses) for v in some if merges(v, settings)}
-    arrays["told"] = np.frombuffer(json.dumps(plain(told)).encode(), np.uint8)
+    mergers = [v for v in evaluated_variants if merges(v, settings)]
+    record["merge"] = {v.name: merged(maps, rows[v.name][0], pair, settings.poses) for v in mergers}
+    arrays["told"] = np.frombuffer(json.dumps(plain(record)).encode(), np.uint8)
     archive.write(arrays, target)
-    return kept.name
+    return pair.name
 
 
 def merges(variant: Variant, settings: Evaluation) -> bool:
@@ -72,15 +73,15 @@ def matched(variant: Variant, method: str, maps: Maps, rows: tuple[Array, Array]
         rooms, probability = mutual(trained(variant.run), maps) if variant.run else (np.zeros((0, 2), int), np.zeros(0))
     else:
         name, largest = ("assignment", np.inf) if method == "full" else (method, None)
-        found = match(*maps, given(maps, rows), name, scale_free=free, largest_cost=largest)
-        rooms, probability = found.rooms, found.probability
+        room_matches = match(*maps, given(maps, rows), name, scale_free=free, largest_cost=largest)
+        rooms, probability = room_matches.rooms, room_matches.probability
     return {"rooms": rooms.astype(np.int32), "probability": probability, "seconds": np.array(time.process_time() - began)}
 
 
 def given(maps: Maps, rows: tuple[Array, Array]) -> Descriptor:
     """The descriptor that gives rows that were made before."""
-    known = {id(m): r for m, r in zip(maps, rows, strict=True)}
-    return lambda m: known[id(m)]
+    rows_by_map = {id(m): r for m, r in zip(maps, rows, strict=True)}
+    return lambda m: rows_by_map[id(m)]
 
 
 def mutual(learned: Any, maps: Maps) -> tuple[Array, Array]:
@@ -100,9 +101,9 @@ def mutual(learned: Any, maps: Maps) -> tuple[Array, Array]:
     return np.stack([i, j], axis=1), np.sqrt(rows[i, j] * columns[j, i])
 
 
-def merged(maps: Maps, rows: tuple[Array, Array], kept: EvaluationPair, poses: str) -> dict[str, Any]:
+def merged(maps: Maps, rows: tuple[Array, Array], pair: EvaluationPair, poses: str) -> dict[str, Any]:
     """What the merge of both maps says: as plain values."""
-    scale = "free" if kept.about["scale_free"] else "fixed"
+    scale = "free" if pair.about["scale_free"] else "fixed"
     began = time.process_time()
     try:
         result = merge(maps, scale=scale, embedder=given(maps, rows), poses=poses)
@@ -116,8 +117,8 @@ def merged(maps: Maps, rows: tuple[Array, Array], kept: EvaluationPair, poses: s
             "chance": [],
             "seconds": 0.0,
         }
-    found = result.registration
-    pose = None if found is None or found.transform is None else found.transform.matrix.tolist()
+    registration = result.registration
+    pose = None if registration is None or registration.transform is None else registration.transform.matrix.tolist()
     return {
         "probability": float(result.probability),
         "believed": result.merged,

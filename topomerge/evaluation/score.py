@@ -20,7 +20,7 @@ from topomerge.io import archive
 from topomerge.types import Array, Sim3
 
 Row = dict[str, Any]
-NEAR, FINE = (0.5, 5.0), (0.1, 1.0)  # m, degrees
+NEAR_POSE, FINE_POSE = (0.5, 5.0), (0.1, 1.0)  # m, degrees
 SHARED = 80.0  # m2 in common, from which on maps should be merged
 AREAS = (("<40", 40.0), ("40-80", 80.0), ("80-200", 200.0), (">200", np.inf))  # m2
 OVERLAPS = ((0.0, "0"), (0.175, "0.1"), (0.375, "0.25"), (0.625, "0.5"), (1.0, "0.75"))  # share: up to, name
@@ -33,36 +33,36 @@ def score_all(pairs: Sequence[Path], predictions: Sequence[Path], settings: Eval
     matches: list[Row] = []
     ranks: list[Row] = []
     merges: list[Row] = []
-    some = list(variants(settings))
+    evaluated_variants = list(variants(settings))
     for path, file in zip(pairs, predictions, strict=True):
-        kept, data = load_evaluation_pair(path), archive.read(file, "predictions")
-        told = json.loads(data["told"].tobytes())
-        about = {**group_of(kept, settings), "code": told["code"]}
-        known = kept.about["rooms"] != "laid" or bool(len(kept.matches))
-        for v in some if known else ():
+        pair, data = load_evaluation_pair(path), archive.read(file, "predictions")
+        record = json.loads(data["told"].tobytes())
+        about = {**group_of(pair, settings), "code": record["code"]}
+        rooms_have_truth = pair.about["rooms"] != "laid" or bool(len(pair.matches))
+        for v in evaluated_variants if rooms_have_truth else ():
             head = {**about, "variant": v.name, "descriptor": v.descriptor, "k": v.k, "context": v.context if v.k else "-"}
             cost, agreed = data[f"{v.name}/cost"], data.get(f"{v.name}/consistent/rooms")
             ranks.append(
-                {**head, "seconds": told["seconds"][v.name], **rank_counts(kept, cost), **after_counts(kept, cost, agreed)}
+                {**head, "seconds": record["seconds"][v.name], **rank_counts(pair, cost), **after_counts(pair, cost, agreed)}
             )
             for method in v.methods:
                 rooms, chance = data[f"{v.name}/{method}/rooms"], data[f"{v.name}/{method}/probability"]
                 seconds = float(data[f"{v.name}/{method}/seconds"])
-                row = {**head, "method": method, "seconds": seconds, **match_counts(kept, rooms)}
-                matches.append({**row, "chance": chance.tolist(), "good": right_matches(kept, rooms).tolist()})
-        merges += [{**about, "variant": name, **merge_counts(kept, said)} for name, said in told["merge"].items()]
+                row = {**head, "method": method, "seconds": seconds, **match_counts(pair, rooms)}
+                matches.append({**row, "chance": chance.tolist(), "good": right_matches(pair, rooms).tolist()})
+        merges += [{**about, "variant": name, **merge_counts(pair, verdict)} for name, verdict in record["merge"].items()]
     return matches, ranks, merges
 
 
-def group_of(kept: EvaluationPair, settings: Evaluation) -> Row:
+def group_of(pair: EvaluationPair, settings: Evaluation) -> Row:
     """What a pair is counted under."""
-    about = kept.about
+    about = pair.about
     source, common, kind = about["source"], float(about["common"]), about["kind"]
     size = next(name for name, limit in AREAS if common < limit) if kind == "overlap" and common >= 1 else "none"
     change = about.get("change") or ("", 0.0)
     change = ("", 0.0) if change[0] == "plan" else change  # another sensor, no curve
     return {
-        "pair": kept.name,
+        "pair": pair.name,
         "building": f"{source}/{about['building']}",
         "source": source,
         "seen": "trained" if source in settings.data.trained else "unseen",
@@ -83,43 +83,44 @@ def overlap_bin(share: float, kind: str = "overlap") -> str:
     return kind if kind != "overlap" else next(name for limit, name in OVERLAPS if share <= limit)
 
 
-def right_matches(kept: EvaluationPair, rooms: Array) -> Array:
+def right_matches(pair: EvaluationPair, rooms: Array) -> Array:
     """(M,) bool: are both rooms of each match one true room?"""
-    true = {tuple(m) for m in kept.matches.tolist()}
+    true = {tuple(m) for m in pair.matches.tolist()}
     return np.array([tuple(m) in true for m in rooms.tolist()], bool)
 
 
-def match_counts(kept: EvaluationPair, rooms: Array) -> Row:
+def match_counts(pair: EvaluationPair, rooms: Array) -> Row:
     """Counts of matches (M, 2).
 
     `predicted`, `right`: matches; `units`, `found`: true rooms that both maps have, and those that a right match found; each also
     of rooms with (`_twin`) and without (`_single`) a near-identical one in the other map. `strict_right`: right ones between the
     rooms that are assigned to the true room one to one; `strict_units`: true rooms for which both maps have one.
     """
-    good = right_matches(kept, rooms)
+    good = right_matches(pair, rooms)
     i, j = rooms.T if len(rooms) else (np.zeros(0, int), np.zeros(0, int))
-    twin = kept.twin[0][i] | kept.twin[1][j]
-    units = _units(kept)
-    hit = {_unit(kept, *m) for m in rooms[good].tolist()}
-    of_twins = {u for u, some in units.items() if any(kept.twin[0][a] or kept.twin[1][b] for a, b in some)}
-    strict = {u for u, some in units.items() if any(kept.one[0][a] and kept.one[1][b] for a, b in some)}
-    both = kept.one[0][i] & kept.one[1][j] & good
+    twin = pair.twin[0][i] | pair.twin[1][j]
+    units = _units(pair)
+    hit = {_unit(pair, *m) for m in rooms[good].tolist()}
+    of_twins = {u for u, pieces in units.items() if any(pair.twin[0][a] or pair.twin[1][b] for a, b in pieces)}
+    strict = {u for u, pieces in units.items() if any(pair.one[0][a] and pair.one[1][b] for a, b in pieces)}
+    both = pair.one[0][i] & pair.one[1][j] & good
     out: Row = {"strict_right": int(both.sum()), "strict_units": len(strict), "pairs": 1}
-    for name, some, these in zip(GROUPS, (twin | True, twin, ~twin), (set(units), of_twins, set(units) - of_twins), strict=True):
-        out |= {f"predicted{name}": int(some.sum()), f"right{name}": int((good & some).sum())}
-        out |= {f"units{name}": len(these), f"found{name}": len(these & hit)}
+    true_rooms = (set(units), of_twins, set(units) - of_twins)
+    for name, chosen, true in zip(GROUPS, (twin | True, twin, ~twin), true_rooms, strict=True):
+        out |= {f"predicted{name}": int(chosen.sum()), f"right{name}": int((good & chosen).sum())}
+        out |= {f"units{name}": len(true), f"found{name}": len(true & hit)}
     return out
 
 
-def _unit(kept: EvaluationPair, i: int, j: int) -> tuple[int, int]:
-    return int(kept.true[0][i]), int(kept.true[1][j])
+def _unit(pair: EvaluationPair, i: int, j: int) -> tuple[int, int]:
+    return int(pair.true[0][i]), int(pair.true[1][j])
 
 
-def _units(kept: EvaluationPair) -> dict[tuple[int, int], list[tuple[int, int]]]:
+def _units(pair: EvaluationPair) -> dict[tuple[int, int], list[tuple[int, int]]]:
     """True rooms that both maps have -> matches of their pieces."""
     out: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for i, j in kept.matches.tolist():
-        out.setdefault(_unit(kept, i, j), []).append((i, j))
+    for i, j in pair.matches.tolist():
+        out.setdefault(_unit(pair, i, j), []).append((i, j))
     return out
 
 
@@ -140,29 +141,29 @@ def ranks_of(cost: Array, matches: Array) -> tuple[Array, Array]:
     return rooms, rank
 
 
-def rank_counts(kept: EvaluationPair, cost: Array) -> Row:
+def rank_counts(pair: EvaluationPair, cost: Array) -> Row:
     """`queries`: rooms of either map with a true partner in the other; `first`, `five`: whose partner ranks first, within five;
     `reciprocal`: sum of 1 / rank; each also with and without a twin, and (`_whole`) where neither room was looked into only.
     `chance`: first ones to be expected of a draw."""
-    rank, twin, whole, chance = [], [], [], 0.0
-    for side, c, m in ((0, cost, kept.matches), (1, cost.T, kept.matches[:, ::-1])):
-        rooms, found = ranks_of(c, m)
-        rank.append(found)
-        twin.append(kept.twin[side][rooms])
-        entered = m[~kept.glimpsed[side][m[:, 0]] & ~kept.glimpsed[1 - side][m[:, 1]], 0]
-        whole.append(np.isin(rooms, entered))
+    rank, twin, entered, chance = [], [], [], 0.0
+    for side, c, m in ((0, cost, pair.matches), (1, cost.T, pair.matches[:, ::-1])):
+        rooms, room_ranks = ranks_of(c, m)
+        rank.append(room_ranks)
+        twin.append(pair.twin[side][rooms])
+        entered_rooms = m[~pair.glimpsed[side][m[:, 0]] & ~pair.glimpsed[1 - side][m[:, 1]], 0]
+        entered.append(np.isin(rooms, entered_rooms))
         chance += len(m) / max(c.shape[1], 1)
-    r, t, w = np.concatenate(rank), np.concatenate(twin).astype(bool), np.concatenate(whole)
+    r, t, w = np.concatenate(rank), np.concatenate(twin).astype(bool), np.concatenate(entered)
     out: Row = {"pairs": 1, "chance": chance}
-    for name, some in zip((*GROUPS, WHOLE), (t | True, t, ~t, w), strict=True):
-        out[f"queries{name}"] = int(some.sum())
-        out[f"first{name}"] = int((r[some] == 1).sum())
-        out[f"five{name}"] = int((r[some] <= 5).sum())
-        out[f"reciprocal{name}"] = float((1 / r[some]).sum())
+    for name, queries in zip((*GROUPS, WHOLE), (t | True, t, ~t, w), strict=True):
+        out[f"queries{name}"] = int(queries.sum())
+        out[f"first{name}"] = int((r[queries] == 1).sum())
+        out[f"five{name}"] = int((r[queries] <= 5).sum())
+        out[f"reciprocal{name}"] = float((1 / r[queries]).sum())
     return out
 
 
-def after_counts(kept: EvaluationPair, cost: Array, agreed: Array | None) -> Row:
+def after_counts(pair: EvaluationPair, cost: Array, agreed: Array | None) -> Row:
     """`first`, `first_single` and `five` as of `rank_counts`, each with `_after`: of a ranking in which the matches (M, 2) that
     one transform explains come first, and the descriptor ranks what they leave; nan where that was not run."""
     names = ("first", "first_single", "five")
@@ -170,8 +171,8 @@ def after_counts(kept: EvaluationPair, cost: Array, agreed: Array | None) -> Row
         return {f"{name}_after": np.nan for name in names}
     again = cost.astype(np.float64)
     again[agreed[:, 0], agreed[:, 1]] = -1.0  # costs are 0 or more
-    found = rank_counts(kept, again)
-    return {f"{name}_after": found[name] for name in names}
+    counts = rank_counts(pair, again)
+    return {f"{name}_after": counts[name] for name in names}
 
 
 def pose_error(pose: Sim3, truth: Sim3, anchor: Array) -> tuple[float, float, float]:
@@ -187,22 +188,22 @@ def within(error: tuple[float, float, float], flat: bool, limits: tuple[float, f
     return far < limits[0] and error[2] < limits[1]
 
 
-def merge_counts(kept: EvaluationPair, said: Mapping[str, Any]) -> Row:
+def merge_counts(pair: EvaluationPair, verdict: Mapping[str, Any]) -> Row:
     """`near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed and
     near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common."""
-    mergeable = kept.transform is not None and kept.about["kind"] == "overlap" and kept.about["common"] >= 1
+    mergeable = pair.transform is not None and pair.about["kind"] == "overlap" and pair.about["common"] >= 1
     near = fine = False
     error: tuple[float, float, float] | None = None
-    if mergeable and said["pose"] is not None:
-        assert kept.transform is not None
-        m = np.array(said["pose"])
+    if mergeable and verdict["pose"] is not None:
+        assert pair.transform is not None
+        m = np.array(verdict["pose"])
         pose = Sim3(float(np.arctan2(m[1, 0], m[0, 0])), tuple(m[:3, 3].tolist()), float(m[2, 2]))  # type: ignore[arg-type]
-        error = pose_error(pose, kept.transform, kept.anchor)
-        flat = any(s in FLAT for s in kept.about["sensors"])
-        near, fine = within(error, flat, NEAR), within(error, flat, FINE)
-    believed = bool(said["believed"])
-    rooms = np.array(said["rooms"], np.int64).reshape(-1, 2)
-    counted = match_counts(kept, rooms)
+        error = pose_error(pose, pair.transform, pair.anchor)
+        flat = any(s in FLAT_SENSORS for s in pair.about["sensors"])
+        near, fine = within(error, flat, NEAR_POSE), within(error, flat, FINE_POSE)
+    believed = bool(verdict["believed"])
+    rooms = np.array(verdict["rooms"], np.int64).reshape(-1, 2)
+    counted = match_counts(pair, rooms)
     return {
         "mergeable": int(mergeable),
         "near": int(near),
@@ -212,13 +213,13 @@ def merge_counts(kept: EvaluationPair, said: Mapping[str, Any]) -> Row:
         "merged_fine": int(believed and fine),
         "false": int(believed and not near),
         "refused": int(near and not believed),
-        "probability": said["probability"],
-        "seconds": said["seconds"],
+        "probability": verdict["probability"],
+        "seconds": verdict["seconds"],
         "error": error,
         **counted,
-        "chance": list(said["chance"]),
-        "good": right_matches(kept, rooms).tolist(),
+        "chance": list(verdict["chance"]),
+        "good": right_matches(pair, rooms).tolist(),
     }
 
 
-FLAT = ("laser2d", "drawing")  # sensors whose maps have no height
+FLAT_SENSORS = ("laser2d", "drawing")  # sensors whose maps have no height

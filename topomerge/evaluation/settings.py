@@ -17,9 +17,9 @@ from topomerge.errors import InputError
 from topomerge.fusion.inputs import POSE_SOURCES
 from topomerge.io.listing import plain
 
-METHODS = ("full", "assignment", "growing", "consistent", "mutual")
+EVALUATED_METHODS = ("full", "assignment", "growing", "consistent", "mutual")
 TABLES = ("ranking", "matching", "merging", "overlap", "area", "sensors", "source", "seen")
-FORMAT = 1  # of the predictions
+PREDICTIONS_FORMAT = 1  # raised when predictions on disk change what they hold
 
 
 @dataclass
@@ -109,10 +109,10 @@ def check(settings: Evaluation) -> None:
     for name, options in settings.descriptors.items():
         if options.get("name") not in EMBEDDERS:
             raise InputError(f"descriptors.{name}.name {options.get('name')!r}: {', '.join(EMBEDDERS)} are possible")
-    for key, known in (("methods", METHODS), ("context", CONTEXT_KINDS), ("tables", TABLES)):
+    for key, choices in (("methods", EVALUATED_METHODS), ("context", CONTEXT_KINDS), ("tables", TABLES)):
         for value in getattr(settings, key):
-            if value not in known:
-                raise InputError(f"{key}: unknown {value!r}; {', '.join(known)} are possible")
+            if value not in choices:
+                raise InputError(f"{key}: unknown {value!r}; {', '.join(choices)} are possible")
     if settings.poses not in POSE_SOURCES:
         raise InputError(f"poses: unknown {settings.poses!r}; {', '.join(POSE_SOURCES)} are possible")
     if any(k < 0 for k in settings.k) or settings.limit < 0 or settings.rounds < 1 or settings.jobs < 1:
@@ -160,8 +160,8 @@ def run_title(run: str) -> str:
     """
     network, _, about = read_weights(run)
     node = network.node
-    told = {"bare": not node.edges, "paper": not node.edge_values, "doors": node.doors, "around": node.around}
-    words = [node.kind, *(word for word, so in told.items() if so and node.kind != "none")]
+    features = {"bare": not node.edges, "paper": not node.edge_values, "doors": node.doors, "around": node.around}
+    words = [node.kind, *(word for word, so in features.items() if so and node.kind != "none")]
     seed = f", seed {about['seed']}" if about.get("seed") else ""
     return f"{' + '.join(network.geometry.parts)}, {' '.join(words)}, {about.get('loss', 'infonce')}{seed}"
 
@@ -172,20 +172,20 @@ def folder_of(settings: Evaluation) -> Path:
     return Path(settings.folder) / name
 
 
-def told(settings: Evaluation) -> dict[str, Any]:
+def prediction_settings(settings: Evaluation) -> dict[str, Any]:
     """What the predictions depend on, as plain values; the weights of runs as a digest."""
     keys = ("data", "limit", "descriptors", "k", "context", "methods", "slow_k", "merge", "mergers")
-    known = {k: v for k, v in asdict(settings).items() if k in keys}
-    known["data"].pop("trained")
-    known["data"].pop("folder")
-    known["descriptors"] = {name: settings.descriptors[name] for name in settings.only}
+    options = {k: v for k, v in asdict(settings).items() if k in keys}
+    options["data"].pop("trained")
+    options["data"].pop("folder")
+    options["descriptors"] = {name: settings.descriptors[name] for name in settings.only}
     if settings.poses != "search":
-        known["poses"] = settings.poses
+        options["poses"] = settings.poses
     if not settings.run:
-        known["methods"] = [m for m in settings.methods if m != "mutual"]
+        options["methods"] = [m for m in settings.methods if m != "mutual"]
     runs = {v.name: digest_of(Path(v.run)) for v in variants(settings) if v.run}
-    found: dict[str, Any] = plain({"format": FORMAT, **known, "run": runs})
-    return found
+    plain_settings: dict[str, Any] = plain({"format": PREDICTIONS_FORMAT, **options, "run": runs})
+    return plain_settings
 
 
 def digest_of(path: Path) -> str:
@@ -203,8 +203,8 @@ def difference(old: Mapping[str, Any], new: Mapping[str, Any], at: str = "") -> 
     for key in sorted({*old, *new}):
         a, b = old.get(key), new.get(key)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
-            if found := difference(a, b, f"{at}{key}."):
-                return found
+            if nested_difference := difference(a, b, f"{at}{key}."):
+                return nested_difference
         elif json.dumps(a) != json.dumps(b):
             return f"{at}{key}: {json.dumps(a)} there, {json.dumps(b)} now"
     return ""

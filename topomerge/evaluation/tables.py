@@ -26,7 +26,7 @@ RANKING = ("recall@1", "recall@1_single", "recall@1_twin", "recall@1_whole", "re
 AFTER = ("recall@1_after", "recall@1_single_after", "recall@5_after")
 MATCHING = ("precision", "recall", "F1", "F1_single", "F1_twin", "strict recall")
 MERGING = ("right poses", "merged", "merged finely", "refused")
-NAMES = {
+METRIC_NAMES = {
     "recall@1": "recall@1", "recall@1_single": "without twin", "recall@1_twin": "with twin",
     "recall@1_whole": "entered", "recall@5": "recall@5", "MRR": "MRR",
     "recall@1_after": "after consensus: recall@1", "recall@1_single_after": "without twin", "recall@5_after": "recall@5",
@@ -85,14 +85,14 @@ def ranking(ranks: Sequence[Row], settings: Evaluation) -> Table:
     """How high the true partner of a room ranks among all rooms of the other map."""
     first = [r for r in ranks if r["variant"] == settings.baseline]
     rows, after = [], AFTER if any(np.isfinite(r["first_after"]) for r in ranks) else ()
-    for name, some in _variants(ranks).items():
-        better = gain(some, first, "recall@1", settings.rounds) if name != settings.baseline else None
-        cells = [cell(value(some, m, settings.rounds), m in ("recall@1", "recall@5")) for m in RANKING]
-        took = np.median([r["seconds"] for r in some])
-        cells += [_signed(better), *(cell(value(some, m, settings.rounds), m == AFTER[0]) for m in after)]
+    for name, variant_rows in _variants(ranks).items():
+        better = gain(variant_rows, first, "recall@1", settings.rounds) if name != settings.baseline else None
+        cells = [cell(value(variant_rows, m, settings.rounds), m in ("recall@1", "recall@5")) for m in RANKING]
+        took = np.median([r["seconds"] for r in variant_rows])
+        cells += [_signed(better), *(cell(value(variant_rows, m, settings.rounds), m == AFTER[0]) for m in after)]
         rows.append([name, *cells, f"{took:.2f}"])
     more = f"recall@1 more than {settings.baseline}"
-    head = ["descriptor", *(NAMES[m] for m in RANKING), more, *(NAMES[m] for m in after), "s a pair"]
+    head = ["descriptor", *(METRIC_NAMES[m] for m in RANKING), more, *(METRIC_NAMES[m] for m in after), "s a pair"]
     return Table("Ranking of rooms: is a room's true partner the nearest?", head, rows)
 
 
@@ -108,16 +108,17 @@ def _variants(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: r["vari
 
 
 def matching(matches: Sequence[Row], settings: Evaluation) -> Table:
-    """Precision, recall and F1 of each descriptor and method where maps share rooms; how many matches are told of where not."""
+    """Precision, recall and F1 of each descriptor and method where maps share rooms; how many matches there are where not."""
     rows = []
-    for name, some in _variants(matches).items():
-        for method, these in _variants(some, lambda r: r["method"]).items():
+    for name, variant_rows in _variants(matches).items():
+        for method, these in _variants(variant_rows, lambda r: r["method"]).items():
             sharing, apart = shares(these)
             cells = [cell(value(sharing, m, settings.rounds), m == "F1") for m in MATCHING]
             large = cell(value([r for r in these if r["large"]], "F1", settings.rounds))
             wrong = f"{np.mean([r['predicted'] for r in apart]):.1f}" if apart else "–"
             rows.append([name, method, *cells, large, wrong, f"{np.median([r['seconds'] for r in these]):.2f}"])
-    head = ["descriptor", "matching", *(NAMES[m] for m in MATCHING), "F1, ≥ 80 m² shared", "matches where none is", "s a pair"]
+    metrics = (METRIC_NAMES[m] for m in MATCHING)
+    head = ["descriptor", "matching", *metrics, "F1, ≥ 80 m² shared", "matches where none is", "s a pair"]
     return Table("Matches of rooms, in pairs that share some", head, rows, 2)
 
 
@@ -125,10 +126,10 @@ def beside(matches: Sequence[Row], settings: Evaluation) -> Table:
     """Precision, recall and F1 of the methods beside each other, a line a descriptor: the thesis' table, with recall."""
     methods = list(dict.fromkeys(m["method"] for m in matches))
     rows = []
-    for name, some in _variants(shares(matches)[0]).items():
+    for name, variant_rows in _variants(shares(matches)[0]).items():
         cells = []
         for method in methods:
-            these = [r for r in some if r["method"] == method]
+            these = [r for r in variant_rows if r["method"] == method]
             both = " / ".join(cell(value(these, m, settings.rounds), False) for m in ("precision", "recall"))
             cells += [both if these else "–", cell(value(these, "F1", settings.rounds))]
         rows.append([name, *cells])
@@ -144,11 +145,12 @@ def shares(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
 def grouped(ranks: Sequence[Row], matches: Sequence[Row], key: str, settings: Evaluation) -> Table:
     """recall@1, and F1 of each method, for each group and descriptor without context or trained one."""
     rows = []
-    of = by(matches, key)
-    for group, some in by(ranks, key).items():
-        for name, these in _variants([r for r in some if r["k"] == 0]).items():
-            own = _variants(shares([m for m in of.get(group, []) if m["variant"] == name])[0], lambda r: r["method"])
-            cells = [cell(value(own.get(m, []), "F1", settings.rounds)) for m in _methods(matches)]
+    matches_by_group = by(matches, key)
+    for group, group_rows in by(ranks, key).items():
+        for name, these in _variants([r for r in group_rows if r["k"] == 0]).items():
+            sharing = shares([m for m in matches_by_group.get(group, []) if m["variant"] == name])[0]
+            matches_by_method = _variants(sharing, lambda r: r["method"])
+            cells = [cell(value(matches_by_method.get(m, []), "F1", settings.rounds)) for m in _methods(matches)]
             pairs = value(these, "recall@1", settings.rounds)
             rows.append([group, str(pairs.pairs), str(pairs.buildings), name, cell(pairs), *cells])
     head = [key, "pairs", "buildings", "descriptor", "recall@1", *(f"F1 {m}" for m in _methods(matches))]
@@ -162,39 +164,44 @@ def _methods(matches: Sequence[Row]) -> list[str]:
 def merging(merges: Sequence[Row], key: str, settings: Evaluation) -> Table:
     """Share of pairs merged right, refused and merged wrongly, by group."""
     rows = []
-    for name, some in _variants(merges).items():
-        groups = {"all": some, **(by(some, key) if key else {})}
+    for name, variant_rows in _variants(merges).items():
+        groups = {"all": variant_rows, **(by(variant_rows, key) if key else {})}
         if key == "area":
-            groups["≥ 80"] = [r for r in some if r["large"]]
+            groups["≥ 80"] = [r for r in variant_rows if r["large"]]
         for group, these in groups.items():
             pairs, able = len({r["pair"] for r in these}), sum(r["mergeable"] for r in these)
             cells = [cell(value(these, m, settings.rounds), m == "merged") for m in MERGING]
             false, took = sum(r["false"] for r in these), np.median([r["seconds"] for r in these] or [0.0])
             rows.append([name, group, str(pairs), str(able), *cells, str(false), f"{took:.1f}"])
-    head = ["descriptor", key or "pairs", "pairs", "mergeable", *(NAMES[m] for m in MERGING), "merged wrong", "s a pair"]
+    head = ["descriptor", key or "pairs", "pairs", "mergeable", *(METRIC_NAMES[m] for m in MERGING), "merged wrong", "s a pair"]
     title = "Merges: of the pairs that have something in common, within 0.5 m and 5°"
     return Table(title + (f", by {BY[key][0].lower()}{BY[key][1:]}" if key else ""), head, rows, 2)
 
 
 def reliability(matches: Sequence[Row], merges: Sequence[Row]) -> Table:
-    """How far told probabilities are from what came true."""
+    """How far predicted probabilities are from what came true."""
     rows = []
-    for what, some in ((f"match, {m}", r) for m, r in _variants(matches, lambda r: f"{r['variant']} {r['method']}").items()):
-        if some[0]["k"] == 0 and some[0]["method"] in ("consistent", "mutual"):
-            rows.append(_calibrated(what, [p for r in some for p in r["chance"]], [g for r in some for g in r["good"]]))
-    for name, some in _variants(merges).items():
-        rows.append(_calibrated(f"merge, {name}", [r["probability"] for r in some], [bool(r["near"]) for r in some]))
-        chance, good = [p for r in some for p in r["chance"]], [g for r in some for g in r["good"]]
-        rows.append(_calibrated(f"match of believed merges, {name}", chance, good))
+    for name, method_rows in _variants(matches, lambda r: f"{r['variant']} {r['method']}").items():
+        if method_rows[0]["k"] == 0 and method_rows[0]["method"] in ("consistent", "mutual"):
+            rows.append(_calibrated(f"match, {name}", *_of_matches(method_rows)))
+    for name, variant_rows in _variants(merges).items():
+        near = [bool(r["near"]) for r in variant_rows]
+        rows.append(_calibrated(f"merge, {name}", [r["probability"] for r in variant_rows], near))
+        rows.append(_calibrated(f"match of believed merges, {name}", *_of_matches(variant_rows)))
     head = ["probability of", "number", "told, mean", "right", "expected calibration error"]
     return Table("Calibration", head, [r for r in rows if r])
 
 
-def _calibrated(what: str, told: Sequence[float], right: Sequence[bool]) -> list[str]:
-    if not len(told):
+def _of_matches(rows: Sequence[Row]) -> tuple[list[float], list[bool]]:
+    """Probability of each match of rows, and whether it is right."""
+    return [p for r in rows for p in r["chance"]], [g for r in rows for g in r["good"]]
+
+
+def _calibrated(what: str, probabilities: Sequence[float], right: Sequence[bool]) -> list[str]:
+    if not len(probabilities):
         return []
-    found = calibration(told, right)
-    return [what, str(len(told)), f"{np.mean(told):.2f}", f"{np.mean(right):.2f}", f"{found.error:.3f}"]
+    error = calibration(probabilities, right).error
+    return [what, str(len(probabilities)), f"{np.mean(probabilities):.2f}", f"{np.mean(right):.2f}", f"{error:.3f}"]
 
 
 def curves(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Table:
@@ -217,9 +224,9 @@ def curves(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], 
 def long_rows(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Iterator[Row]:
     """Every metric of every group, one a row, for other tools."""
     for rows, metrics in ((ranks, (*RANKING, *AFTER)), (matches, MATCHING), (merges, (*MERGING, "false"))):
-        for (variant, method), some in _pairs(rows).items():
+        for (variant, method), variant_rows in _pairs(rows).items():
             for key in ("all", *BY):
-                for group, these in {"all": some}.items() if key == "all" else by(some, key).items():
+                for group, these in {"all": variant_rows}.items() if key == "all" else by(variant_rows, key).items():
                     sharing = shares(these)[0] if rows is matches else these
                     for metric in metrics:
                         v = value(sharing, metric, min(settings.rounds, 500))

@@ -19,7 +19,7 @@ from topomerge.training.task_settings import TaskSettings
 from topomerge.training.tasks import TASKS
 from topomerge.types import Array
 
-BANDS = (0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.97, 1.0)  # of probabilities, over which their calibration is measured
+PROBABILITY_BANDS = (0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.97, 1.0)  # over which calibration is measured
 Settings = TypeVar("Settings", bound=TaskSettings)
 
 
@@ -63,9 +63,9 @@ def run_fit(settings: Settings, make: Callable[[Settings, Say], Fitted], say: Sa
 
 
 def calibration_error(p: Array, y: Array) -> float:
-    """Expected calibration error: how far probabilities (n,) are from how often it was so (n,), over `BANDS`."""
+    """Expected calibration error: how far probabilities (n,) are from how often it was so (n,), over `PROBABILITY_BANDS`."""
     error = 0.0
-    for low, high in pairwise(BANDS):
+    for low, high in pairwise(PROBABILITY_BANDS):
         band = (p >= low) & (p < high + (high == 1))
         if band.any():
             error += band.mean() * abs(float(np.mean(p[band])) - float(np.mean(y[band])))

@@ -24,7 +24,7 @@ from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array
 
 BENT = (1.5, 5.0)  # m, degrees: a map that is bent by drift fits in no one pose; neither right nor wrong
-NAMES = [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR]
+BELIEF_FEATURES = [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR]
 SIGN = {
     "ratio": 1, "walls": 1, "conflict": -1, "worst": -1, "free": 1, "opposed": -1, "lift": 1, "met": 1, "missed": -1, "share": 1,
     "level": -1, "ceilings": -1, "margin": 1, "ahead": 1, "tall": -1, "crossing": 1, "worst_ratio": 1, "squares": 1,
@@ -46,7 +46,7 @@ def fit_belief(settings: MergeBelief, say: Say) -> Fitted:
     """The models for pairs of maps with heights, from all pairs without drawings, and those for slices and drawings, from all
     pairs; what left-out pairs say about them is reported of the pairs that each is for."""
     rows = [row for row in belief_rows(settings.data, settings, say) if row["hyps"] and fair(row)]
-    weights: dict[str, Any] = {"names": NAMES, "threshold": settings.threshold}
+    weights: dict[str, Any] = {"names": BELIEF_FEATURES, "threshold": settings.threshold}
     metrics: dict[str, float] = {}
     parts = []
     for name, flat in (("solid", False), ("flat", True)):
@@ -159,10 +159,10 @@ def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) ->
     believed = np.zeros(len(y))
     for train, test in folds(building, settings.folds):
         train = train[y[train] >= 0]
-        model = fitted(x[train], y[train] > 0, NAMES, settings.winner_strength, weight[train])
+        model = fitted(x[train], y[train] > 0, BELIEF_FEATURES, settings.winner_strength, weight[train])
         believed[test] = 1 / (1 + np.exp(-logits(model, x[test])))
     certain = y >= 0
-    winner = fitted(x[certain], y[certain] > 0, NAMES, settings.winner_strength, weight[certain])
+    winner = fitted(x[certain], y[certain] > 0, BELIEF_FEATURES, settings.winner_strength, weight[certain])
     mine = np.array([is_flat(t.rows[i]) == flat for i, _ in first], bool)
     scored = [t.rows[i] for (i, _), so in zip(first, mine, strict=True) if so]
     model = {"pairs": len(first), "pose": pose, "winner": winner}
