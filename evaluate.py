@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import sys
 
+from topomerge.datasets.core.script import exit_status
+
 from topomerge.config import compose
-from topomerge.errors import InputError
 from topomerge.evaluation.evaluate import evaluate
 from topomerge.evaluation.settings import Evaluation
 
@@ -31,24 +32,20 @@ def main(words: list[str]) -> int:
         return 0
     command = f"python evaluate.py {' '.join(words)}"
     task = next((word[len("task=") :] for word in words if word.startswith("task=")), "embedding")
-    try:
+
+    def work() -> None:
         if task == "embedding":
-            words = [word for word in words if not word.startswith("task=")]
-            words = [f"run=[{w[4:]}]" if w.startswith("run=") and not w.startswith("run=[") else w for w in words]
-            scores = evaluate(compose("evaluate", Evaluation, words), say, command)
+            keys = [word for word in words if not word.startswith("task=")]
+            keys = [f"run=[{w[4:]}]" if w.startswith("run=") and not w.startswith("run=[") else w for w in keys]
+            scores = evaluate(compose("evaluate", Evaluation, keys), say, command)
             print(f"{scores.summary}\n\nAll tables and figures: {scores.folder}")
         else:
             from topomerge.training.judging import judge_task
 
             judgement = judge_task(task, words, say)
             print(f"{judgement.summary}\n\nWritten to {judgement.folder}")
-    except InputError as error:
-        print(f"evaluate: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("evaluate: interrupted; start it again to go on", file=sys.stderr)
-        return 130
-    return 0
+
+    return exit_status("evaluate", work)
 
 
 if __name__ == "__main__":

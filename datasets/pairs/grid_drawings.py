@@ -24,7 +24,7 @@ from topomerge.datasets.pairs.flat import raise_flat
 from topomerge.datasets.pairs.grid_pairs import (
     COLUMN_EDGE,
     GRID_FORMAT,
-    LONGEST_PAIR,
+    LONGEST_GRID_PAIR,
     GridItem,
     GridPair,
     GridRecipe,
@@ -110,7 +110,7 @@ def make_drawing(item: DrawingItem, plans: Sequence[Plans], folder: str) -> Row:
         path = Path(folder) / f"{item.pair.name}.npz"
         return _with_common(drawing_arrays(path, here, there, storey, kind, frame, f"{item.name}.npz"), here)
 
-    return make_item(item.name, folder, make, LONGEST_PAIR)
+    return make_item(item.name, folder, make, LONGEST_GRID_PAIR)
 
 
 def drawn_place(item: DrawingItem, plans: Sequence[Plans], folder: Path) -> tuple[Place, Place, int, str]:

@@ -34,7 +34,7 @@ NOTHING_IN_COMMON = 99.0  # m: nothing is shown by both
 POINTS_SHOWN = 200  # points of a room that a map shows
 CEILING_BELOW = 0.15  # m: what is that far below a floor is the storey below's ceiling
 RAY_STEP = 0.08  # m along a ray
-LONGEST_PAIR = 120.0  # s
+LONGEST_GRID_PAIR = 120.0  # s
 WEIGHTS = {
     "sources": {"procedural": 0.65, "r2v": 0.1, "campus": 0.25},
     "kinds": {
@@ -181,7 +181,7 @@ def make_grids(item: GridItem, plans: list[tuple[object, ...]], folder: str) -> 
         about = {"difficulty": dict(item.item.difficulty), "source": item.item.source, "set": item.set, "item": item.number}
         return pair_arrays(_first_pair(item.item, plans), {**about, "file": f"{item.name}.npz"})  # type: ignore[arg-type]
 
-    return make_item(item.name, folder, make, LONGEST_PAIR)
+    return make_item(item.name, folder, make, LONGEST_GRID_PAIR)
 
 
 def grid_of(cloud: PointCloud) -> VoxelGrid:
@@ -282,8 +282,8 @@ def unpacked(name: str, data: Mapping[str, Array], mean: bool = False) -> GridPa
         shape = tuple(int(s) for s in data[f"{side}.shape"])
         cells, origin = data[f"{side}.cells"].astype(np.int32), data[f"{side}.origin"]
         middle = origin + (cells + (data[f"{side}.mean"] + 0.5) / 256) * GRID_EDGE
-        known = {"mean": middle.astype(np.float32)} if mean else {}
-        grids.append(VoxelGrid(cells, origin, GRID_EDGE, shape, known))  # type: ignore[arg-type]
+        properties = {"mean": middle.astype(np.float32)} if mean else {}
+        grids.append(VoxelGrid(cells, origin, GRID_EDGE, shape, properties))  # type: ignore[arg-type]
         empty = data.get(f"{side}.free")
         free.append(None if empty is None else VoxelGrid(empty.astype(np.int32), origin, GRID_EDGE, shape))  # type: ignore[arg-type]
     truth = sim3_of(data["truth"])

@@ -130,9 +130,9 @@ def build_plans(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: No
     first = splits.seeds(recipe.split)[0] + recipe.seed
     items = [draw_item(seed, plans) for seed in range(first, first + recipe.scans)]
     folder = Path(sharing.cache).resolve() / "plans"
-    known = {(source, name): plan for source, entries in plans.items() for name, plan in entries}
+    plan_of_item = {(source, name): plan for source, entries in plans.items() for name, plan in entries}
     begin, step = sharing.part
-    tasks = [(item, known.get((item.source, item.plan)), str(folder)) for item in items[begin - 1 :: step]]
+    tasks = [(item, plan_of_item.get((item.source, item.plan)), str(folder)) for item in items[begin - 1 :: step]]
     report = build_set(folder.parent / f"{recipe.name}.jsonl", tasks, make_plan_file, sharing, say, unit="scans")
     return [path for item in items if (path := folder / f"{item.name}.npz").exists()], report
 

@@ -1,4 +1,4 @@
-"""Which true room an extracted room is, so that a match of two maps can be judged (method, section 4)."""
+"""Which true room an extracted room is, so that a match of two maps can be judged (method 5)."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ OUTLINE_NEAR = 2  # cells; a wall is seen, and a cell belongs to it, within so m
 FLOOR_OFF = 0.15  # m that a point of a floor may lie off it
 CEILING_OFF = 0.3  # m, likewise of a ceiling: they hang lower here and there
 LEAST_SEEN = 0.2  # share of a room's columns with a point, from which on the map is one of this room
-HEIGHT_BANDS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0))  # m above the floor
+MEASURED_HEIGHTS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0))  # m above the floor
 PATCH_RADIUS, PATCHES = 0.3, 400  # m, number of the patches that planes are fitted to
 CELLS_AROUND = 3  # cells around a room that are looked at, too
 
@@ -108,7 +108,7 @@ def _walls(full: Array, mask: Array, height: float) -> dict[str, float]:
     edge = mask & ~ndimage.binary_erosion(mask)
     near = ndimage.binary_dilation(full, np.ones((2 * OUTLINE_NEAR + 1, 2 * OUTLINE_NEAR + 1, 1)))
     out = {}
-    for k, (low, high) in enumerate(HEIGHT_BANDS):
+    for k, (low, high) in enumerate(MEASURED_HEIGHTS):
         first, last = round(low / SURFACE_CELL) + 3, round(min(high, height - SURFACE_CELL) / SURFACE_CELL) + 3
         seen = near[edge][:, first:last].sum()
         whole = edge.sum() * max(last - first, 0)

@@ -209,7 +209,7 @@ def test_parameters_are_checked_and_kept():
 
 
 def test_the_thesis_preset_is_the_table_of_the_method():
-    """method.md, section 1, the column of the finished thesis."""
+    """method 2, the column of the finished thesis."""
     p = PRESETS["thesis"]
     assert isinstance(p, ThesisParameters)
     assert (p.stem_height, p.body_width, p.body_height, p.dilation) == (0.25, 0.30, 0.75, 0.25)

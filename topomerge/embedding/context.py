@@ -1,4 +1,4 @@
-"""k-step context: what lies around a room, appended to what it is (method, section 2; finished thesis).
+"""k-step context: what lies around a room, appended to what it is (method 3; finished thesis).
 
 Averaging the neighbours' descriptors is cheaper but blurs: prototypes lost recall by it, so joining geometry is the default.
 """

@@ -1,4 +1,4 @@
-"""Engineered features of a room: the twelve of the thesis, and its place in the graph (seeds 3.1.1; method, section 2).
+"""Engineered features of a room: the twelve of the thesis, and its place in the graph (seeds 3.1.1; method 3).
 
 Lengths are metres and nothing depends on the frame. Sizes are taken as logarithms, then all is scaled by statistics of a training
 set, which stand in `engineered.json` (made by ``train.py task=feature_scale``): either every feature by its spread over

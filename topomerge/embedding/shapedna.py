@@ -1,4 +1,4 @@
-"""ShapeDNA: the smallest eigenvalues of a room's Laplacian (seeds 3.1.2; method, section 2; Reuter et al. 2006)."""
+"""ShapeDNA: the smallest eigenvalues of a room's Laplacian (seeds 3.1.2; method 3; Reuter et al. 2006)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """One row of counts for each pair, variant and method: what is right, what is wrong, what was missed.
 
 Counts are kept, not ratios, so that any group of pairs can be summed (`groups`). A match is right when both rooms are the same
-true room; of a room that came out in pieces every piece may be matched (method, section 4). What should be found are the true
+true room; of a room that came out in pieces every piece may be matched (method 5). What should be found are the true
 rooms that both maps have: one right match finds one.
 """
 

@@ -1,4 +1,4 @@
-"""Free space: the cells that rays crossed (method.md, section 1: the evidence that later rejects a wrong merge)."""
+"""Free space: the cells that rays crossed (method 4: what later rejects a wrong merge)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bridging gaps in the floor, without making ceilings or table tops into floor (beyond the thesis: method.md, section 1)."""
+"""Bridging gaps in the floor, without making ceilings or table tops into floor (beyond the thesis: method 2)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Maps and where they lie -> one map: cells are fused one map after the other, rooms and doors extracted once, at the end (seeds
-3.3; method.md, 3).
+3.3; method 4).
 
 Cells are resampled: a cell of the joined lattice is occupied where its middle lies in a cell of a moved map, and where the middle
 of a cell of a moved map lies in it. So no cell is lost, and a turned floor or wall gets no holes.

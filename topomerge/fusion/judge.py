@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from topomerge.fusion.storey_plan import HEIGHT_BANDS
+from topomerge.extraction.plans.storey_plan import HEIGHT_BANDS
 from topomerge.kernels import align
 from topomerge.matching.plan_fields import FREE_MARGIN, PlanFields
 from topomerge.matching.refinement import storeys_at

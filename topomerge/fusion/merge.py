@@ -1,4 +1,4 @@
-"""Maps -> one map, or an honest refusal: rooms matched, poses judged on the whole maps, cells fused (seeds 3.3; method.md, 3)."""
+"""Maps -> one map, or an honest refusal: rooms matched, poses judged on the whole maps, cells fused (seeds 3.3; method 4)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fine registration under gravity: point-to-plane with yaw and translation only (method 3; Chen and Medioni 1991)."""
+"""Fine registration under gravity: point-to-plane with yaw and translation only (method 4; Chen and Medioni 1991)."""
 
 from __future__ import annotations
 

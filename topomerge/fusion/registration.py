@@ -1,4 +1,4 @@
-"""Registration of two whole maps by their geometry: search, judge, refine, believe or not (method 3; no rooms, no learning)."""
+"""Registration of two whole maps by their geometry: search, judge, refine, believe or not (method 4; no rooms, no learning)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unknown scale: found from the spacing of walls along their two main directions, before any position is known (method 3).
+"""Unknown scale: found from the spacing of walls along their two main directions, before any position is known (method 4).
 
 Projected across a direction, walls are heaps on a line. Two maps of one building have the same heaps, shifted and stretched; the
 stretch that correlates best in both directions is cheap to find, as everything has one dimension only.

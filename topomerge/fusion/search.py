@@ -1,4 +1,4 @@
-"""Candidate poses of one map in another: heights from floors, yaw from wall directions, translation by correlation (method 3).
+"""Candidate poses of one map in another: heights from floors, yaw from wall directions, translation by correlation (method 4).
 
 Free space decides: walls on walls count for a pose, walls of one map on seen-empty ground of the other against it.
 """

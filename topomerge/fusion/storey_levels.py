@@ -1,4 +1,4 @@
-"""At which heights a map shows storeys: floors and ceilings, layers of slices, or lines that were given walls (method 3)."""
+"""At which heights a map shows storeys: floors and ceilings, layers of slices, or lines that were given walls (method 4)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Map -> plans: what each storey shows from above. Walls, empty space and clutter are what registration goes by (method 3).
+"""Map -> plans: what each storey shows from above. Walls, empty space and clutter are what registration goes by (method 4).
 
 A *wall* column is filled at most of the heights between 0.5 and 2.0 m above the floor; a *free* one has a floor or a ceiling and
 nothing between, or rays crossed it; the rest of the occupied ones are *clutter*. Works for scans, extruded drawings, and slices.
@@ -14,10 +14,10 @@ from scipy import ndimage
 from topomerge.errors import InputError
 from topomerge.extraction.plans.storey_plan import (
     BODY_HEIGHTS,
+    HEIGHT_BANDS,
     WALL_HEIGHTS,
-    HeightBands,
+    WALL_RULE,
     StoreyPlan,
-    WallRule,
     band_stack,
     observed_bands,
     wall_columns,
@@ -28,9 +28,7 @@ from topomerge.kernels.plan import column_bits, on_lines
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
 COLUMN_EDGE = 0.1  # m
-HEIGHT_BANDS = HeightBands(step=0.25, below=2, count=32)  # from 0.5 m below the floor
 BODY_BANDS = np.concatenate([[BODY_HEIGHTS[0]], WALL_HEIGHTS])  # m, limits of the bands in which a map may have looked
-POSE_WALLS = WallRule()
 SLICE_ABOVE_FLOOR = 0.3  # m, guess of a slice's height above the floor
 SLICE_DRAWN = 1.375  # m above the floor, height at which slices are drawn
 FLOOR_RADIUS = 1.5  # m, over which the floor may rise and fall
@@ -130,7 +128,7 @@ def _plan(rasters: tuple[Array, ...], origin: Array, cell: float, levels: tuple[
     looked = observed_bands(filled)
     masks = [HEIGHT_BANDS.mask(low, high) for low, high in pairwise(BODY_BANDS)]
     observed = sum(mask for mask, seen in zip(masks, looked.tolist(), strict=True) if seen)
-    wall = wall_columns(filled[1:][looked[1:]], POSE_WALLS)
+    wall = wall_columns(filled[1:][looked[1:]], WALL_RULE)
     standing = filled.any(axis=0)
     shut = (occupied & ~np.uint32(HEIGHT_BANDS.mask(*BODY_HEIGHTS))) > 0
     rays = np.bitwise_count(crossed & np.uint32(HEIGHT_BANDS.mask(*BODY_HEIGHTS))) >= max(int(looked.sum()) // 2, 1)

@@ -8,21 +8,12 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.plans.storey_plan import (
-    WALL_HEIGHTS,
-    HeightBands,
-    StoreyPlan,
-    WallRule,
-    band_stack,
-    observed_bands,
-    wall_columns,
-)
+from topomerge.extraction.plans import storey_plan
+from topomerge.extraction.plans.storey_plan import HEIGHT_BANDS, WALL_RULE, StoreyPlan
 from topomerge.kernels.plan import column_bits
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.types import Array, TopometricMap
 
-WALL_BANDS = HeightBands(step=0.25, below=2, count=32)  # from 0.5 m below the floor
-MATCHING_WALLS = WallRule()
 DIRECTION_BLUR = 1.5  # cells, before the direction of walls is measured
 
 
@@ -142,8 +133,8 @@ def _plan(map: TopometricMap, storey: int, navigable: Array) -> StoreyPlan:
     floor = np.full(navigable.shape, levels[0])
     ix, iy = np.ascontiguousarray(grid.cells[:, :2].T.astype(np.int64))
     z = grid.origin[2] + (grid.cells[:, 2] + 0.5) * grid.edge
-    profile = column_bits(ix, iy, z, floor, -WALL_BANDS.below * WALL_BANDS.step, WALL_BANDS.step)
-    filled = band_stack(profile, WALL_BANDS, WALL_HEIGHTS)
-    wall = wall_columns(filled[observed_bands(filled)], MATCHING_WALLS)
+    profile = column_bits(ix, iy, z, floor, -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
+    filled = storey_plan.band_stack(profile, HEIGHT_BANDS, storey_plan.WALL_HEIGHTS)
+    wall = storey_plan.wall_columns(filled[storey_plan.observed_bands(filled)], WALL_RULE)
     ceiling = np.full(navigable.shape, levels[1] - levels[0])
-    return StoreyPlan(grid.origin[:2], grid.edge, wall, navigable & ~wall, profile, WALL_BANDS, floor, ceiling, levels=levels)
+    return StoreyPlan(grid.origin[:2], grid.edge, wall, navigable & ~wall, profile, HEIGHT_BANDS, floor, ceiling, levels=levels)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 
-from topomerge.errors import InputError
+from topomerge.datasets.core.script import exit_status
 
 
 def main(words: list[str]) -> int:
@@ -16,19 +16,15 @@ def main(words: list[str]) -> int:
     from topomerge.training.embedding import fit
     from topomerge.training.settings import from_dict, from_file, to_dict
 
-    try:
+
+    def work() -> None:
         values = to_dict(from_file(words[0]))
         for word in words[1:]:
             key, _, value = word.partition("=")
             values[key.lstrip("-")] = _value(value) if "=" in word else True
         fit(from_dict(values))
-    except InputError as error:
-        print(f"train: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("train: interrupted; go on with resume=true", file=sys.stderr)
-        return 130
-    return 0
+
+    return exit_status("train", work, "go on with resume=true")
 
 
 def _value(text: str) -> object:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from topomerge.datasets.core.script import exit_status
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 from topomerge.training.tasks import TASKS, settings_of, train
@@ -30,7 +31,8 @@ def main(words: Sequence[str]) -> int:
     only = next((word[5:].split(",") for word in words if word.startswith("only=")), list(TASKS))
     runs = Path(next((word[5:] for word in words if word.startswith("runs=")), str(RUNS)))
     shared = [word for word in words if not word.startswith(("only=", "runs="))]
-    try:
+
+    def work() -> None:
         if unknown := next((task for task in only if task not in TASKS), ""):
             raise InputError(f"only={unknown}: {', '.join(TASKS)} are possible")
         for task in [task for task in TASKS if task in only]:
@@ -43,13 +45,8 @@ def main(words: Sequence[str]) -> int:
             began = time.time()
             make_task(task, runs, shared)
             _record(runs, task, seconds.get(f"{task} so far", 0.0) + time.time() - began)
-    except InputError as error:
-        print(f"weights: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("weights: interrupted; start it again to go on", file=sys.stderr)
-        return 130
-    return 0
+
+    return exit_status("weights", work)
 
 
 def make_task(task: str, runs: Path, shared: Sequence[str]) -> None:

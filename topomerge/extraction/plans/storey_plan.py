@@ -38,6 +38,9 @@ class HeightBands:
         return (1 << last) - (1 << first)
 
 
+HEIGHT_BANDS = HeightBands(step=0.25, below=2, count=32)  # of the plans that poses are judged by: from 0.5 m below the floor
+
+
 @dataclass(frozen=True, eq=False)
 class StoreyPlan:
     """One storey as rasters (nx, ny) of columns, the first axis is x; column (0, 0) has its corner at `origin`.
@@ -140,6 +143,9 @@ class WallRule:
     def least_of(self, observed: int) -> int:
         """How many of the observed bands a wall fills."""
         return max(int(np.ceil(self.share * observed - 1e-6)), 1)
+
+
+WALL_RULE = WallRule()  # of the plans that poses are judged by
 
 
 def first_above(profile: Array, bands: HeightBands, height: float = UPRIGHT) -> Array:

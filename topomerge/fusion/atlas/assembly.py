@@ -1,4 +1,4 @@
-"""Hypotheses of pairs -> sets of maps that lie in one frame without contradiction (method 3: agreement around cycles).
+"""Hypotheses of pairs -> sets of maps that lie in one frame without contradiction (method 4: agreement around cycles).
 
 Links are taken in the order of their probability, as in a maximum spanning tree, but each is heard before: every two maps that it
 would bring over each other say what they think of that, its own two if they contradict it. What contradicts better evidence is

@@ -1,4 +1,4 @@
-"""Poses of many maps from measured poses of pairs: robust least squares over yaw, translation and, where free, scale (method 3).
+"""Poses of many maps from measured poses of pairs: robust least squares over yaw, translation and, where free, scale (method 4).
 
 A measurement T_ij says where points of map j lie in map i. Its residuals are how far some points of the place that both maps saw
 lie apart when each map puts them into the common frame: metres where it matters, and no weight of angles against lengths.

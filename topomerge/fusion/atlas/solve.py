@@ -1,4 +1,4 @@
-"""More than two maps: pairs are registered as far as needed, cycles must close, a pose graph settles the rest (method 3).
+"""More than two maps: pairs are registered as far as needed, cycles must close, a pose graph settles the rest (method 4).
 
 Nothing depends on the order of the maps, and little on how many pairs there are: maps that lie in one frame already are not
 searched in each other again, they are only asked whether they agree. Maps that nothing connects stay apart, and are named.

@@ -11,7 +11,7 @@ from topomerge.errors import InputError
 from topomerge.types import Array, Sim3
 
 FEATURE_RADIUS = 1.0  # m
-EDGE_RATIO = 0.8  # of the edges of two triples (method 3)
+EDGE_RATIO = 0.8  # of the edges of two triples (method 4)
 INLIER_DISTANCE = 0.3  # m
 TRIPLES = 20_000  # that are drawn at most
 CONFIDENCE = 0.999  # that a better triple would have been drawn

@@ -1,5 +1,5 @@
 """Clusters of poses and their means, in place of the thesis' DBSCAN: rotations are averaged as rotations, so that -179 and 179
-degrees give 180 (method 3)."""
+degrees give 180 (method 4)."""
 
 from __future__ import annotations
 

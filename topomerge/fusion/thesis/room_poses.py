@@ -1,4 +1,4 @@
-"""Poses from matched rooms, as the finished thesis fuses maps (method 3): each pair of rooms is aligned by itself, and the poses
+"""Poses from matched rooms, as the finished thesis fuses maps (method 4): each pair of rooms is aligned by itself, and the poses
 that agree are averaged.
 
 Point features and a random sample consensus give a first pose, point-to-plane refinement under gravity the pose; pairs whose
@@ -16,7 +16,7 @@ from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
 ROOM_POINTS = 2_000  # of a room at most
 ROOM_LEAST_POINTS = 20
-LARGEST_ERROR = 0.2  # m, root mean square distance of the surfaces (method 3)
+LARGEST_ERROR = 0.2  # m, root mean square distance of the surfaces (method 4)
 ALIGNED_PAIRS = 30  # of rooms, the likeliest ones
 Room = tuple[Surface, Features]
 
