@@ -92,9 +92,9 @@ def value(rows: Sequence[Row], metric: str, rounds: int = 2000) -> Value:
     if not rows:
         return Value(np.nan, np.nan, np.nan, 0, 0)
     counts = summed(rows, needed(metric), buildings)
-    whole = float(measure(metric, {n: c.sum() for n, c in counts.items()}))
+    ratio = float(measure(metric, {n: c.sum() for n, c in counts.items()}))
     low, high = _interval(measure(metric, {n: draws(len(buildings), rounds) @ c for n, c in counts.items()}))
-    return Value(whole, low, high, len({r["pair"] for r in rows}), len(buildings))
+    return Value(ratio, low, high, len({r["pair"] for r in rows}), len(buildings))
 
 
 def gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds: int = 2000) -> Value:
@@ -103,13 +103,13 @@ def gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds: int = 
     if not rows or not others:
         return Value(np.nan, np.nan, np.nan, 0, 0)
     drawn = draws(len(buildings), rounds)
-    wholes, parts = [], []
+    ratios, drawn_ratios = [], []
     for compared_rows in (rows, others):
         counts = summed(compared_rows, needed(metric), buildings)
-        wholes.append(float(measure(metric, {n: c.sum() for n, c in counts.items()})))
-        parts.append(measure(metric, {n: drawn @ c for n, c in counts.items()}))
-    low, high = _interval(parts[0] - parts[1])
-    return Value(wholes[0] - wholes[1], low, high, len({r["pair"] for r in rows}), len(buildings))
+        ratios.append(float(measure(metric, {n: c.sum() for n, c in counts.items()})))
+        drawn_ratios.append(measure(metric, {n: drawn @ c for n, c in counts.items()}))
+    low, high = _interval(drawn_ratios[0] - drawn_ratios[1])
+    return Value(ratios[0] - ratios[1], low, high, len({r["pair"] for r in rows}), len(buildings))
 
 
 def _interval(values: Array) -> tuple[float, float]:

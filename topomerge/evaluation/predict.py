@@ -149,5 +149,5 @@ def _done(left: Sequence[tuple[Path, Path]], settings: Evaluation) -> Iterator[s
     from joblib import Parallel, delayed
 
     parallel = Parallel(settings.jobs, return_as="generator", batch_size=1)
-    made: Iterator[str] = parallel(delayed(predict)(p, t, settings) for p, t in left)
-    return made
+    names: Iterator[str] = parallel(delayed(predict)(p, t, settings) for p, t in left)
+    return names

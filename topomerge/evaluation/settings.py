@@ -192,10 +192,10 @@ def digest_of(path: Path) -> str:
     """Hash of a trained embedder's weights."""
     files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.suffix == ".safetensors")
     best = [f for f in files if "best" in f.parts or f.stem == "best"] or files
-    whole = hashlib.sha256()
+    digest = hashlib.sha256()
     for file in best:
-        whole.update(file.read_bytes())
-    return whole.hexdigest()[:16]
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def difference(old: Mapping[str, Any], new: Mapping[str, Any], at: str = "") -> str:

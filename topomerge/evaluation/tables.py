@@ -54,8 +54,16 @@ class Table:
         lines = [" & ".join(_escaped(c) for c in row) + r" \\" for row in (self.head, *self.rows)]
         body = "\n".join([lines[0], r"\midrule", *lines[1:]])
         caption = f"\\caption{{{_escaped(self.title)}}}"
-        whole = [r"\begin{table}", r"\centering", caption, f"\\begin{{tabular}}{{{columns}}}", r"\toprule", body, r"\bottomrule"]
-        return "\n".join([*whole, r"\end{tabular}", r"\end{table}"])
+        opening = [
+            r"\begin{table}",
+            r"\centering",
+            caption,
+            f"\\begin{{tabular}}{{{columns}}}",
+            r"\toprule",
+            body,
+            r"\bottomrule",
+        ]
+        return "\n".join([*opening, r"\end{tabular}", r"\end{table}"])
 
 
 def _escaped(text: str) -> str:
@@ -255,9 +263,9 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
 def write_section(path: Path, mark: str, text: str) -> None:
     """Replace what stands between the two marks of a file, or add marks and a section at its end."""
     begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
-    whole = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
-    if begin not in whole or end not in whole:
-        whole = f"{whole.rstrip()}\n\n## {mark.capitalize()}\n\n{begin}\n{end}\n"
-    before, rest = whole.split(begin, 1)
+    page = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
+    if begin not in page or end not in page:
+        page = f"{page.rstrip()}\n\n## {mark.capitalize()}\n\n{begin}\n{end}\n"
+    before, rest = page.split(begin, 1)
     with replacing(path) as beside:
         beside.write_text(f"{before}{begin}\n{text}\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")

@@ -163,10 +163,10 @@ def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) ->
         believed[test] = 1 / (1 + np.exp(-logits(model, x[test])))
     certain = y >= 0
     winner = fitted(x[certain], y[certain] > 0, BELIEF_FEATURES, settings.winner_strength, weight[certain])
-    mine = np.array([is_flat(t.rows[i]) == flat for i, _ in first], bool)
-    scored = [t.rows[i] for (i, _), so in zip(first, mine, strict=True) if so]
+    same_kind = np.array([is_flat(t.rows[i]) == flat for i, _ in first], bool)
+    scored = [t.rows[i] for (i, _), so in zip(first, same_kind, strict=True) if so]
     model = {"pairs": len(first), "pose": pose, "winner": winner}
-    return model, (scored, np.minimum(believed[: len(first)], share)[mine], y[: len(first)][mine])
+    return model, (scored, np.minimum(believed[: len(first)], share)[same_kind], y[: len(first)][same_kind])
 
 
 def belief_scores(rows: Sequence[dict[str, Any]], believed: Array, true: Array, threshold: float) -> dict[str, float]:

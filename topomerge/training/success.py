@@ -72,11 +72,11 @@ def _places(a: Mapping[str, Array], b: Mapping[str, Array], pairs: Array) -> Pla
         if len(to) > MOST_PLACES:
             break
         doors = [g["edge_pos"][g["edge_index"][0] == room] for g, room in ((a, i), (b, j))]
-        here, there = (n.ravel() for n in np.meshgrid(*(np.arange(len(d)) for d in doors), indexing="ij"))
-        to += [a["pos"][i], *doors[0][here]]
-        of += [b["pos"][j], *doors[1][there]]
-        match += [k] * (len(here) + 1)
-        off += [MIDDLE_OFF, *[DOOR_OFF] * len(here)]
+        doors_a, doors_b = (n.ravel() for n in np.meshgrid(*(np.arange(len(d)) for d in doors), indexing="ij"))
+        to += [a["pos"][i], *doors[0][doors_a]]
+        of += [b["pos"][j], *doors[1][doors_b]]
+        match += [k] * (len(doors_a) + 1)
+        off += [MIDDLE_OFF, *[DOOR_OFF] * len(doors_a)]
     return Places(np.array(to).reshape(-1, 3), np.array(of).reshape(-1, 3), np.array(match, int), np.array(off))
 
 

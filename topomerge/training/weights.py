@@ -51,18 +51,20 @@ def main(words: Sequence[str]) -> int:
 
 def make_task(task: str, runs: Path, shared: Sequence[str]) -> None:
     """Build the sets of a task where it does not do so itself, and train it, or go on training it."""
-    own = [word for word in shared if word.partition("=")[0] in ("cache", "jobs", "cluster")] if task == "embedding" else shared
+    training_words = list(shared)
     if task == "embedding":
         from topomerge.config import compose
         from topomerge.datasets.pairs.build import Build, build
 
+        build_words = [word for word in shared if word.partition("=")[0] in ("cache", "jobs", "cluster")]
         for text in SETS[task]:
-            words = [f"data={text.split()[0]}", *text.split()[1:], *own]
+            words = [f"data={text.split()[0]}", *text.split()[1:], *build_words]
             build(compose("build", Build, words), _say)
-        own = [word for word in shared if not word.startswith(("jobs=", "cluster=", "part="))]
+        training_words = [word for word in shared if not word.startswith(("jobs=", "cluster=", "part="))]
     resume = f"resume={'true' if (runs / task / 'last').exists() else 'false'}"
     exported = [] if any(word.startswith("export=") for word in shared) else ["export=package"]
-    train(settings_of([f"task={task}", *SHIPPED.get(task, []), f"runs={runs}", f"name={task}", resume, *exported, *own]), _say)
+    words = [f"task={task}", *SHIPPED.get(task, []), f"runs={runs}", f"name={task}", resume, *exported, *training_words]
+    train(settings_of(words), _say)
 
 
 def _say(text: str) -> None:
