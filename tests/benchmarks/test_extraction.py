@@ -61,7 +61,7 @@ def test_rooms_of_a_robot_grid_are_those_of_its_segmentation(benchmark, data_dir
 
     from topomerge.extraction.extract import extract
 
-    scans = importlib.import_module("extraction_scans")
+    scans = importlib.import_module("benchmarks.extraction.scans")
     case = scans.Case("grids", "ipa", "lab_ipa", "")
     scan = scans.load(case, tmp_path, data_dir)
     rooms = judge(extract(scan.cloud, voxel_size=case.voxel), scan.truth).rooms

@@ -201,7 +201,7 @@ def test_folder_names_are_unique_and_siblings_are_found(tmp_path: Path) -> None:
 
 def test_rooms_that_no_door_reaches_are_left_out_and_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     rooms = ((0, 0, 150, 160), (150, 0, 300, 160), (400, 0, 450, 60))
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.INFO, "topomerge"):
         (plan,) = read_plans(write.campus(tmp_path / "a.xml", rooms=rooms, labels=("CLASSROOM", "CORRIDOR", "CLOSET")))
     assert len(plan.rooms) == 2 and "kept 2 of 3 rooms" in caplog.text
     far = ((0, 0, 150, 160), (150, 0, 300, 160), (400, 0, 900, 160))
