@@ -14,6 +14,7 @@ from topomerge.datasets.pairs.evaluation_pair import load_evaluation_pair
 from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.pairs.recipe import check as check_recipe
 
+from tests.recipes import SMALL_HOUSES
 from topomerge.config import compose
 from topomerge.errors import InputError
 from topomerge.evaluation import predict as predicting
@@ -32,20 +33,7 @@ from topomerge.evaluation.tables import Table, write_section
 from topomerge.types import PointCloud, Sim3
 
 SETS = ("heldout", "heldout_small", "heldout_plans", "real", "robustness")
-SMALL = Pairs(
-    name="two",
-    pairs=2,
-    seed=4,
-    split="test",
-    sources={"procedural": 1.0},
-    kinds={"house": 1.0},
-    overlaps=[0.5],
-    sensors={"depth": 1.0},
-    rooms=[3, 4],
-    points_per_room=16,
-    voxel_size=0.15,
-    maps=True,
-)
+SMALL = Pairs(name="two", pairs=2, split="test", maps=True, **SMALL_HOUSES)
 
 
 @pytest.mark.parametrize("data", SETS)

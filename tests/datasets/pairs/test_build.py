@@ -25,22 +25,12 @@ from topomerge.datasets.pairs.recipe import Recipe, check
 
 from tests.datasets.boxes import room
 from tests.package_copy import copied, edited_kernel
+from tests.recipes import SMALL_HOUSES
 from topomerge.code_digest import code_digest, data_digest
 from topomerge.config import compose
 from topomerge.errors import InputError
 
-SMALL = Recipe(
-    name="small",
-    pairs=3,
-    seed=4,
-    sources={"procedural": 1.0},
-    kinds={"house": 1.0},
-    overlaps=[0.5],
-    sensors={"depth": 1.0},
-    rooms=[3, 4],
-    points_per_room=16,
-    voxel_size=0.15,
-)
+SMALL = Recipe(name="small", pairs=3, **SMALL_HOUSES)
 WORDS = [
     "data=procedural", "data.name=small", "data.seed=4", "data.overlaps=[0.5]", "data.rooms=[3,4]", "data.points_per_room=16",
     "data.voxel_size=0.15", "data.two_storeys=0", *(f"data.hard.{h}=0" for h in ("other-building", "other-storey", "twin-wing")),
