@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import topomerge
@@ -16,6 +17,7 @@ def module_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+@cache
 def import_graph() -> dict[str, set[str]]:
     """Module -> the modules of the house that it imports, at its top, inside functions, or through the package's face."""
     files = {module_of(path): path for _, _, path in sources()}
