@@ -22,6 +22,7 @@ from topomerge.datasets.plans.raster import DOORWAY_THICKNESS, add_contacts, add
 from topomerge.datasets.plans.sketch import Sketch
 
 from topomerge.errors import InputError
+from topomerge.io.grid import IMAGE_FORMATS
 from topomerge.types import Array
 
 IPA_CELL = 0.05  # m, nominal
@@ -172,6 +173,8 @@ def _map(folder: Path) -> tuple[Array, float, Array]:
 def _yaml(path: Path) -> Any:
     try:
         return yaml.safe_load(path.read_bytes()) or {}
+    except yaml.reader.ReaderError as error:
+        raise InputError(f"damaged YAML: {path.name}: is no text") from error
     except yaml.YAMLError as error:
         raise InputError(f"damaged YAML: {path.name}: {' '.join(str(error).split())[:100]}") from error
 
@@ -179,7 +182,7 @@ def _yaml(path: Path) -> Any:
 def _image(path: Path) -> Array:
     """(h, w) uint8 grey levels, lowest row first; transparent is as dark as it is painted."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise InputError(f"absurd size: {path.name} has {image.width} by {image.height} pixels")
             return np.flipud(np.asarray(image.convert("L"))).copy()

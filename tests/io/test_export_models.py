@@ -52,6 +52,26 @@ def test_indoorgml_graph(tmp_path):
     assert root.find(f"{GML}boundedBy/{GML}Envelope/{GML}upperCorner") is not None
 
 
+def test_dsg_of_pairs_with_two_ways(tmp_path):
+    """Two doors between two rooms, two narrowings between two areas: one edge each, as the library refuses a second."""
+    dsg = pytest.importorskip("spark_dsg")
+    map = with_areas()
+    second = map.edges[:1].copy()
+    second["rooms"] = map.edges["rooms"][0][::-1]
+    second["width"] = map.edges["width"][0] + 0.5
+    second["centre"] = map.edges["centre"][0] + (1.5, 0.0, 0.0)
+    map = replace(map, edges=np.concatenate([map.edges, second]), narrows=np.concatenate([map.narrows, map.narrows]))
+    graph = dsg.DynamicSceneGraph.load(str(write(map, "dsg", tmp_path / "a.json")))
+    assert graph.get_layer(dsg.DsgLayers.PLACES).num_nodes() == 7 + 6, "both doors are places"
+    rooms = [dsg.NodeSymbol("R", r).value for r in map.edges["rooms"][0]]
+    joins = graph.get_edge(*rooms).info.metadata.get()
+    widths = [map.edges["width"][0], map.edges["width"][-1]]
+    assert joins["width"] == pytest.approx(widths[1]) and [w["width"] for w in joins["ways"]] == pytest.approx(widths)
+    assert [w["centre"] for w in joins["ways"]] == [map.edges["centre"][i].tolist() for i in (0, -1)]
+    narrow = graph.get_edge(dsg.NodeSymbol("p", 5).value, dsg.NodeSymbol("p", 6).value).info.metadata.get()
+    assert narrow["kind"] == "narrow" and len(narrow["ways"]) == 2
+
+
 def test_dsg_opens_in_spark_dsg(tmp_path):
     dsg = pytest.importorskip("spark_dsg")
     map = with_areas()

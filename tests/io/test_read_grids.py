@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import EpsImagePlugin, Image
+from topomerge.datasets.plans import grid as plan_grid
 
 from tests.samples import octomap_node, write_octomap
 from topomerge.errors import InputError
@@ -135,6 +136,43 @@ def test_yaml_that_is_no_map_and_maps_without_image(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("image: a.pgm\nresolution: 0.05\n")
     with pytest.raises(InputError, match=r"its image a\.pgm does not exist"):
         read_points(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize("data", [b"\x89PNG\xff\xfe\x00", b"image: a\x00.png\n", "resolution: é".encode("latin-1")])
+def test_yaml_that_is_no_text(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        read_points(path)
+    assert str(caught.value) == f"{path}: is no text; give the yaml that names the image"
+
+
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 20 20\n%%EndComments\nshowpage\n%%EOF\n"
+
+
+def test_a_picture_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """PostScript under the name of a picture: Pillow would hand it to Ghostscript."""
+    started = []
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *a, **k: started.append(a) or Image.new("RGB", (20, 20)).im)
+    path = tmp_path / "plan.png"
+    path.write_bytes(POSTSCRIPT)
+    with pytest.raises(InputError, match="is not an image of PPM, PNG, JPEG, BMP, TIFF") as caught:
+        read_points(path, resolution=0.1)
+    assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
+    (tmp_path / "plan.yaml").write_text("image: plan.png\nresolution: 0.1\n")
+    with pytest.raises(InputError, match=r"plan\.png: is not an image"):
+        read_points(tmp_path / "plan.yaml")
+    with pytest.raises(InputError, match=r"damaged image: plan\.png"):
+        plan_grid._image(path)
+    assert not started
+
+
+@pytest.mark.parametrize("kind", grid.IMAGE_FORMATS)
+def test_the_content_tells_the_format(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "plan.png"
+    Image.fromarray(np.full((4, 5), FREE_PIXEL, np.uint8)).save(path, format=kind)
+    bright, _ = grid.read_image(path)
+    assert bright.shape == (4, 5) and (bright > 0.98).all()
 
 
 def test_an_image_needs_a_resolution_and_a_map_has_one(samples: dict[str, Path]) -> None:

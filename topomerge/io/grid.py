@@ -27,6 +27,8 @@ from topomerge.types import Array
 PIXELS = 100_000_000  # more is refused
 LARGEST_YAML = 1 << 20  # bytes
 IMAGES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+# What those are by their content (PPM holds PGM): other plugins of Pillow start programs, as that of PostScript does.
+IMAGE_FORMATS = ("PPM", "PNG", "JPEG", "BMP", "TIFF")
 MODES = ("trinary", "scale", "raw")
 
 
@@ -74,7 +76,9 @@ def read_yaml(path: Path) -> Plan:
         raise InputError(f"{path}: is too large for a map_server file; give the yaml that names the image")
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+    except (UnicodeDecodeError, yaml.reader.ReaderError) as error:
+        raise InputError(f"{path}: is no text; give the yaml that names the image") from error
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise damaged(path, "a map_server file", getattr(error, "problem", None) or error) from error
     if not isinstance(values, dict) or "image" not in values or "resolution" not in values:
         raise InputError(f"{path}: is not a map_server file (no image and resolution); give the yaml that names the image")
@@ -138,7 +142,7 @@ def read_image(path: Path) -> tuple[Array, Array]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # our own limit is stricter than the library's warning
-            with Image.open(path) as image:
+            with Image.open(path, formats=IMAGE_FORMATS) as image:
                 width, height = image.size
                 if width * height > PIXELS:
                     limit = f"the limit is {PIXELS // 10**6} megapixels"
@@ -151,7 +155,9 @@ def read_image(path: Path) -> tuple[Array, Array]:
                 rgba = np.asarray(image if image.mode == kind else image.convert(kind))
     except Image.DecompressionBombError as error:
         raise InputError(f"{path}: has far too many pixels; crop it or make it smaller") from error
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
+    except UnidentifiedImageError as error:
+        raise InputError(f"{path}: is not an image of {', '.join(IMAGE_FORMATS)}; save it as PNG") from error
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise damaged(path, "an image", error if str(error) else "cut short") from error
     clear = rgba[..., 3] == 0 if kind == "RGBA" else np.zeros(rgba.shape[:2], bool)
     bright = rgba.astype(np.float32) if kind == "L" else rgba[..., :3].mean(axis=2, dtype=np.float32)

@@ -103,17 +103,28 @@ def _rooms(map: TopometricMap) -> Iterator[Json]:
 
 
 def _room_edges(map: TopometricMap) -> Iterator[Json]:
-    """Rooms to their building, and to each other: one edge a pair, since the graph knows no second one, with its widest way."""
+    """Rooms to their building, and to each other."""
     for r in range(len(map.rooms)):
         yield _edge(symbol("B", 0), symbol("R", r))
+    for (a, b), ways in _ways_by_pair(map.edges).items():
+        yield _edge(symbol("R", a), symbol("R", b), _ways_metadata(ways))
+
+
+def _ways_by_pair(table: Array) -> dict[tuple[int, int], list[Any]]:
+    """The rows of an edge table by the pair that they join, in order: the library refuses a second edge of a pair."""
     ways: dict[tuple[int, int], list[Any]] = {}
-    for edge in map.edges:
-        a, b = sorted(edge["rooms"].tolist())
-        ways.setdefault((a, b), []).append(edge)
-    for (a, b), edges in sorted(ways.items()):
-        best = max(edges, key=lambda e: e["width"])
-        metadata = {"kind": str(best["kind"]), "width": float(best["width"]), "doors": len(edges)}
-        yield _edge(symbol("R", a), symbol("R", b), metadata)
+    for way in table:
+        a, b = sorted(way["rooms"].tolist())
+        if a != b:
+            ways.setdefault((a, b), []).append(way)
+    return dict(sorted(ways.items()))
+
+
+def _ways_metadata(ways: list[Any], kind: str = "") -> Json:
+    """Kind and width (m) of the widest way, then each way with its centre (m); a given kind stands for that of all."""
+    listed = [{"kind": kind or str(w["kind"]), "width": float(w["width"]), "centre": w["centre"].tolist()} for w in ways]
+    widest = max(listed, key=lambda way: way["width"])
+    return {"kind": widest["kind"], "width": widest["width"], "ways": listed}
 
 
 def _places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
@@ -121,10 +132,9 @@ def _places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
     colours, floors = room_colours(map), floor_polygons(map)
     owner, centres = _areas(map, floors)
     narrows: dict[int, list[Json]] = {}
-    for narrow in map.narrows:
-        a, b = sorted(narrow["rooms"].tolist())
+    for (a, b), ways in _ways_by_pair(map.narrows).items():
         far = float(np.linalg.norm(centres[a] - centres[b]))
-        narrows.setdefault(b, []).append(_edge(symbol("p", a), symbol("p", b), {"kind": "narrow"}, far))
+        narrows.setdefault(b, []).append(_edge(symbol("p", a), symbol("p", b), _ways_metadata(ways, "narrow"), far))
     for i, (r, at) in enumerate(zip(owner.tolist(), centres, strict=True)):
         clear = 0.0 if floors[r].is_empty else floors[r].boundary.distance(shapely.Point(at[:2]))
         place = _place(i, f"area {i}", at, clear, colours[r], {"room": r, "storey": int(map.rooms["storey"][r])})
@@ -134,7 +144,7 @@ def _places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
         metadata = {"kind": kind, "open": bool(way["open"]), "confidence": float(way["confidence"])}
         place = _place(number, kind, way["centre"], way["width"] / 2, GREY, {**metadata, "rooms": ends})
         edges = [_edge(symbol("R", ends[0]), symbol("p", number))]  # a node has one parent
-        for r in ends:
+        for r in dict.fromkeys(ends):
             areas_of_room = np.flatnonzero(owner == r)
             apart = np.linalg.norm(centres[areas_of_room] - way["centre"], axis=1)
             near = int(areas_of_room[apart.argmin()])
