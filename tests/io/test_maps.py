@@ -150,6 +150,72 @@ def test_contents_that_contradict_each_other(saved: Path, tmp_path: Path) -> Non
         refused(rewritten(saved, tmp_path / name, **change), "damaged")
 
 
+@pytest.mark.parametrize(("name", "rows", "words"), [
+    ("rooms", 20_000, "20,000 rooms, more than 10,000"), ("edges", 100_000, "100,000 edges, more than 200 .20 a room"),
+    ("storeys", 1_001, "1,001 storeys"), ("areas", 10_000, "10,000 areas, more than"),
+])  # fmt: skip
+def test_more_declared_than_a_building_has(name: str, rows: int, words: str, saved: Path, tmp_path: Path) -> None:
+    table = archive.read(saved)[name]
+    table = table if len(table) else np.zeros(1, table.dtype)
+    refused(rewritten(saved, tmp_path / "a.tmap", **{name: np.resize(table, rows)}), words)
+
+
+def test_more_rooms_than_cells(tmp_path: Path) -> None:
+    rooms = np.zeros(30, ROOM_DTYPE)
+    save_map(replace(nothing(), rooms=rooms, storeys=np.zeros(1, STOREY_DTYPE)), tmp_path / "a.tmap")
+    refused(tmp_path / "a.tmap", "30 rooms and has only 0 cells")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e300])
+@pytest.mark.parametrize(("name", "column"), [
+    ("rooms", "centroid"), ("rooms", "area"), ("edges", "centre"), ("edges", "width"), ("edges", "confidence"),
+    ("storeys", "floor"),
+])  # fmt: skip
+def test_tables_hold_finite_numbers(name: str, column: str, value: float, saved: Path, tmp_path: Path) -> None:
+    table = archive.read(saved)[name]
+    table[column][0] = value
+    refused(rewritten(saved, tmp_path / "a.tmap", **{name: table}), f"{name} has a {column} that is no number")
+
+
+def test_a_ceiling_may_be_unseen_but_not_infinite(saved: Path, tmp_path: Path) -> None:
+    storeys = archive.read(saved)["storeys"]
+    storeys["ceiling"] = np.nan
+    assert np.isnan(load_map(rewritten(saved, tmp_path / "a.tmap", storeys=storeys)).storeys["ceiling"]).all()
+    storeys["ceiling"] = np.inf
+    refused(rewritten(saved, tmp_path / "b.tmap", storeys=storeys), "ceiling")
+
+
+@pytest.mark.parametrize(("frame", "words"), [
+    ([1e300, 0, 0, 0.1], "origin beyond"), ([0, 0, -2e9, 0.1], "origin beyond"),
+    ([0, 0, 0, 1e-4], "cells of 0.0001 m"), ([0, 0, 0, 1e12], r"cells of 1e\+12 m"),
+])  # fmt: skip
+@pytest.mark.parametrize("grid", ["grid", "navigable"])
+def test_frames_that_no_building_has(grid: str, frame: list[float], words: str, saved: Path, tmp_path: Path) -> None:
+    refused(rewritten(saved, tmp_path / "a.tmap", **{f"{grid}_frame": np.array(frame)}), words)
+
+
+def test_a_map_that_could_not_be_loaded_is_not_written(scene: TopometricMap, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cells of 50 m"):
+        save_map(replace(scene, grid=replace(scene.grid, edge=50.0)), tmp_path / "a.tmap")
+    assert not list(tmp_path.iterdir())
+
+
+def test_many_edges_of_many_rooms(saved: Path, tmp_path: Path) -> None:
+    arrays = archive.read(saved)
+    tables = {"rooms": np.resize(arrays["rooms"], 9_000), "edges": np.resize(arrays["edges"], 100_000)}
+    refused(rewritten(saved, tmp_path / "a.tmap", **tables), "100,000 edges, more than 30,000")
+
+
+def test_warnings_are_limited_in_number_and_length(scene: TopometricMap, tmp_path: Path) -> None:
+    path = tmp_path / "a.tmap"
+    save_map(replace(scene, warnings=("x\n" * 100_000, *("again",) * 99_999)), path)
+    warnings = load_map(path).warnings
+    assert len(warnings) == 21 and warnings[-1] == "and 99,980 more warnings"
+    assert len(warnings[0]) <= 500 and "\n" not in warnings[0]
+    save_map(load_map(path), path)
+    assert load_map(path).warnings == warnings
+
+
 def test_not_a_map(tmp_path: Path) -> None:
     refused(tmp_path / "absent.tmap", "no such file")
     refused(tmp_path, "folder")

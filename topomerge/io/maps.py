@@ -37,6 +37,14 @@ __all__ = ["TMAP_FORMAT", "load_map", "map_to_json", "save_json", "save_map", "s
 
 TMAP_FORMAT = 2
 KIND = "map of topomerge (.tmap)"
+# What a file may declare. The largest buildings have about 1,000 rooms.
+ROOM_LIMIT, STOREY_LIMIT = 10_000, 1_000
+CONNECTION_LIMIT = 30_000  # of edges, areas and narrows each, however many rooms there are
+EDGES_PER_ROOM, AREAS_PER_ROOM = 20, 20  # on average
+COORDINATE_LIMIT = 1e9  # m, either way: beyond, float64 is coarser than 0.1 micrometres
+AREA_LIMIT = 1e12  # m2, and m3 for volumes
+SHORTEST_CELL_EDGE, LONGEST_CELL_EDGE = 0.001, 10.0  # m
+WARNING_LIMIT, LONGEST_WARNING = 20, 500  # warnings of a map, characters of one
 
 
 def save_map(map: TopometricMap, path: str | Path) -> None:
@@ -45,9 +53,14 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
     Tuples in the parameters come back as lists.
 
     Raises:
-        InputError: the path can't be written.
+        InputError: the path can't be written, or a frame is one that `load_map` refuses.
         ValueError: a property of a grid holds Python objects.
     """
+    for name, grid in (("grid", map.grid), ("navigable", map.navigable)):
+        try:
+            _require_usable_frame(name, grid.origin, grid.edge)
+        except ValueError as error:
+            raise InputError(f"{path}: not written ({error}); check --unit, --scale and --voxel-size") from error
     arrays = _pack("grid", map.grid) | {"room": map.room.astype("<i4")}
     arrays |= _pack("navigable", map.navigable) | {"navigable_room": map.navigable_room.astype("<i4")}
     arrays |= {"rooms": map.rooms, "edges": map.edges, "storeys": map.storeys, "areas": map.areas, "narrows": map.narrows}
@@ -74,7 +87,8 @@ def load_map(path: str | Path) -> TopometricMap:
         path: of the `.tmap`.
 
     Raises:
-        InputError: no such file, not a map, of a newer format, damaged or cut off.
+        InputError: no such file, not a map, of a newer format, damaged or cut off; more rooms or edges than a building has, a
+            number in a table that is none, a frame that no building has.
     """
     arrays = archive.read(path, KIND)
     if "format" not in arrays or "about" not in arrays:
@@ -115,6 +129,7 @@ def _unpack(arrays: dict[str, Array], name: str) -> VoxelGrid:
     shape = _typed(arrays, f"{name}_shape", "i", 1)
     if frame.shape != (4,) or shape.shape != (3,) or not np.isfinite(frame).all():
         raise ValueError(f"{name} has no proper frame")
+    _require_usable_frame(name, frame[:3], float(frame[3]))
     codes = np.cumsum(deltas, dtype=np.uint64)
     if len(codes) and (int(codes[-1]) >> 63 or not (codes[1:] > codes[:-1]).all()):
         raise ValueError(f"the cells of {name} are not in order")
@@ -122,6 +137,13 @@ def _unpack(arrays: dict[str, Array], name: str) -> VoxelGrid:
     properties = {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
     x, y, z = shape.tolist()
     return VoxelGrid(morton.decode(codes), frame[:3].copy(), float(frame[3]), (x, y, z), properties)
+
+
+def _require_usable_frame(name: str, origin: Array, edge: float) -> None:
+    if (np.abs(origin) > COORDINATE_LIMIT).any():
+        raise ValueError(f"{name} has its origin beyond {COORDINATE_LIMIT:.0e} m")
+    if not SHORTEST_CELL_EDGE * (1 - 1e-6) <= edge <= LONGEST_CELL_EDGE * (1 + 1e-6):
+        raise ValueError(f"{name} has cells of {edge:.4g} m, not of {SHORTEST_CELL_EDGE} to {LONGEST_CELL_EDGE:g} m")
 
 
 def _typed(arrays: dict[str, Array], name: str, kind: str, dimensions: int) -> Array:
@@ -135,7 +157,50 @@ def _table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
     table = _typed(arrays, name, "V", 1)
     if table.dtype != dtype:
         raise ValueError(f"{name} has other columns")
+    for column in (c for c in dtype.names or () if dtype[c].base.kind == "f"):
+        values = table[column]
+        if (name, column) == ("storeys", "ceiling"):
+            values = values[~np.isnan(values)]  # nan: not seen
+        limit = AREA_LIMIT if column in ("area", "volume") else COORDINATE_LIMIT
+        if not (np.abs(values) <= limit).all():  # nan is not, either
+            raise ValueError(f"{name} has a {column} that is no number or beyond {limit:.0e}")
     return table.astype(dtype, copy=False)
+
+
+def _require_sane_counts(arrays: dict[str, Array]) -> None:
+    """Refuses tables longer than the cells of the map can fill, before anything is done for each of their rows.
+
+    Raises:
+        ValueError: more rooms, edges, storeys, areas or narrows than a building has.
+    """
+    rooms, areas = arrays["rooms"].size, arrays["areas"].size
+    cells = arrays["room"].size + arrays["navigable_room"].size
+    limits = {
+        "rooms": (ROOM_LIMIT, ""),
+        "storeys": (STOREY_LIMIT, ""),
+        "edges": (min(EDGES_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} a room)"),
+        "areas": (min(AREAS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({AREAS_PER_ROOM} a room)"),
+        "narrows": (min(EDGES_PER_ROOM * areas, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} an area)"),
+    }
+    for name, (limit, share) in limits.items():
+        words = share if limit < CONNECTION_LIMIT else ""
+        if arrays[name].size > limit:
+            raise ValueError(f"declares {arrays[name].size:,} {name}, more than {limit:,}{words}")
+    if rooms > cells:
+        raise ValueError(f"declares {rooms:,} rooms and has only {cells:,} cells")
+
+
+def _limited_warnings(messages: list[Any]) -> tuple[str, ...]:
+    """The first warnings, each one line of bounded length, and how many more there are."""
+    surplus = len(messages) - WARNING_LIMIT
+    if surplus <= 1:  # one more takes no more room than the line that counts it, which may be that one
+        surplus = 0
+    lines = []
+    for message in messages[: len(messages) - surplus]:
+        text = str(message)
+        cut = text if len(text) <= LONGEST_WARNING else text[: LONGEST_WARNING - 1] + "…"
+        lines.append(" ".join(cut.splitlines()))
+    return (*lines, f"and {surplus:,} more warnings") if surplus else tuple(lines)
 
 
 def _map(arrays: dict[str, Array]) -> TopometricMap:
@@ -143,6 +208,7 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
     if missing := set(about["arrays"]) - set(arrays):
         raise KeyError(min(missing))
     provenance = _typed(arrays, "provenance", "u", 1).astype(np.uint32) if "provenance" in arrays else None
+    _require_sane_counts(arrays)
     edges = _table(arrays, "edges", EDGE_DTYPE)
     narrows = _table(arrays, "narrows", EDGE_DTYPE)
     for table in (edges, narrows):
@@ -163,5 +229,5 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
         source=str(about["source"]),
         parameters=dict(about["parameters"]),
         seconds={str(step): float(s) for step, s in about["seconds"].items()},
-        warnings=tuple(str(message) for message in about["warnings"]),
+        warnings=_limited_warnings(list(about["warnings"])),
     )
