@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +18,7 @@ from topomerge.training.task_settings import NetworkTask
 from topomerge.training.tasks import TASKS
 
 
-class NetworkJob:
+class NetworkJob(ABC):
     """A job without processes beside it; a task adds batches, steps, scores and the file of weights."""
 
     def __init__(self, settings: NetworkTask, network: torch.nn.Module, origin: Mapping[str, Any]) -> None:
@@ -36,9 +37,9 @@ class NetworkJob:
         """The weights as torch has them."""
         write_network(self.network, folder)
 
+    @abstractmethod
     def write_weights(self, path: Path) -> None:
         """The weights as the package has them."""
-        raise NotImplementedError
 
     def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
         """The file of weights and its card."""
