@@ -27,6 +27,7 @@ RANKS = {
     "configs": 8,
     "config": 8,
     "metrics": 8,
+    "statistics": 8,
     "datasets": 9,
     "checkpoint": 9,
     "training": 10,

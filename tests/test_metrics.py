@@ -11,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 from tests.grids import COMPILED
 from topomerge.metrics import (
     assign,
-    bootstrap,
     consistency,
     contingency,
     match_places,
@@ -157,11 +156,3 @@ def test_storeys() -> None:
     assert storeys_right(np.array([0.0, 3.0]), np.array([3.4, -0.2]))
     assert not storeys_right(np.array([0.0, 3.0]), np.array([0.0, 3.6]))
     assert not storeys_right(np.array([0.0]), np.array([0.0, 3.0]))
-
-
-def test_intervals_over_buildings() -> None:
-    mean, low, high = bootstrap([0.2, 0.4, 0.9, np.nan], ["a", "a", "b", "c"])
-    assert mean == pytest.approx(0.5)
-    assert low == pytest.approx(0.3) and high == pytest.approx(0.9)
-    assert bootstrap([0.5, 0.7], ["a", "a"]) == pytest.approx((0.6, 0.6, 0.6))
-    assert np.isnan(bootstrap([np.nan], ["a"])).all()

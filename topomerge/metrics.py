@@ -206,22 +206,3 @@ def consistency(a: Array, b: Array, least: int = 0, every: bool = True) -> float
         return 0.0 if max(iou.shape) else float("nan")
     i, j = linear_sum_assignment(iou, maximize=True)
     return float(iou[i, j].sum() / (max(iou.shape) if every else min(iou.shape)))
-
-
-def bootstrap(values: Array, groups: Array, rounds: int = 2000, seed: int = 0) -> tuple[float, float, float]:
-    """Mean of values and the ends of its 95 % confidence interval, drawing whole groups (buildings) with replacement.
-
-    Args:
-        values: (n,), nan where a value does not exist: left out.
-        groups: (n,) what each value belongs to.
-    """
-    values, groups = np.asarray(values, float), np.asarray(groups)
-    finite = np.isfinite(values)
-    if not finite.any():
-        return float("nan"), float("nan"), float("nan")
-    _, group = np.unique(groups[finite], return_inverse=True)
-    total, count = np.bincount(group, values[finite]), np.bincount(group)
-    drawn = np.random.default_rng(seed).integers(len(total), size=(rounds, len(total)))
-    means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
-    low, high = np.percentile(means, [2.5, 97.5]).tolist()
-    return float(values[finite].mean()), low, high

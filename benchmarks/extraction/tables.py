@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.io.atomic import replacing
-from topomerge.metrics import bootstrap
+from topomerge.statistics import bootstrap
 
 Row = dict[str, Any]
 COLUMNS = {

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
 
 from topomerge.fusion.verify import model
 from topomerge.io.atomic import replacing
-from topomerge.metrics import bootstrap
+from topomerge.statistics import bootstrap, exact_interval
 from topomerge.training.belief_hypotheses import fair, kind_of, right
 
 Row = dict[str, Any]
@@ -114,8 +113,7 @@ def tally(name: str, rows: Sequence[Row]) -> list[object]:
         first = r["building"].split(" + ")[0]
         buildings[first] = buildings.get(first, False) or r["believed"]
     n, k = len(buildings), sum(buildings.values())
-    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
+    low, high = exact_interval(k, n)
     most = np.round(sorted((r["probability"] for r in rows), reverse=True)[:3], 2).tolist()
     interval = f"{k} of {n}: {100 * low:.1f} to {100 * high:.1f} %"
     return [name, len(rows), sum(r["believed"] for r in rows), interval, ", ".join(map(str, most))]

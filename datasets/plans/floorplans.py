@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from topomerge.datasets.core.physical import STRANGERS, named_storey
 from topomerge.datasets.core.plan import Flight, Plan, PlanRoom
 from topomerge.datasets.plans.sketch import Sketch, finish
 
@@ -48,9 +49,6 @@ NOT_PLANS = re.compile(r"(^|/)(NOTE|README|LICENSE[^/]*)\.txt$|\.vectormap\.txt$
 
 FORMATS_WITH_LEVELS = ("rmf", "ifc")  # formats with several storeys a file
 SURVEYED = ("mall",)  # formats whose storeys, one a folder, are in one frame
-WORDS = {"basement": -1.0, "lower": 0.0, "ground": 0.0, "main": 1.0, "first": 1.0, "upper": 2.0, "second": 2.0, "third": 3.0}
-ALIASES = {"romainrolland": "romainroland"}  # misspelt by the owner
-STRANGERS = ("scuolasconosciuta",)  # "unknown school": the three are different ones
 
 Maker = Callable[[], Sketch]
 
@@ -149,7 +147,7 @@ def siblings(folder: str | Path) -> list[list[str]]:
             groups[("", names[0])] = [(k, name) for k, name in enumerate(names)]
         elif len(names) == 1:
             above, _, last = names[0].rpartition("/")
-            base, level = _storey(last)
+            base, level = named_storey(last)
             if base not in STRANGERS:
                 groups.setdefault((above if base or level else names[0], base), []).append((level, names[0]))
     return sorted([name for _, name in sorted(group)] for group in groups.values() if len(group) > 1)
@@ -176,18 +174,6 @@ def _names(file: Path) -> list[str]:
         return [name for name, _ in import_module(f"topomerge.datasets.plans.{_reader(file)}").sketches(file)]
     except Exception:  # refused by `iter_plans`, with the reason
         return []
-
-
-def _storey(name: str) -> tuple[str, float]:
-    """What a plan's name says of its building and of its storey: ("Sabadell", 2) of Sabadell2."""
-    word = re.fullmatch(rf"(.*?)[ _-]*({'|'.join(WORDS)})(?:[ _-]*floor)?", name, re.IGNORECASE)
-    if word:
-        return word[1].lower(), WORDS[word[2].lower()]
-    number = re.fullmatch(r"(.*?)[ _-]*([PFBL]?)(\d)(v\d|[ns]?e?)", name)
-    if not number:
-        return name, 0.0
-    base, level = number[1].lower(), float(number[3])
-    return ALIASES.get(base, base), (-level if number[2] == "B" else level) + (0.5 if number[4] else 0.0)
 
 
 def summarise(results: Iterable[tuple[str, Plan | Refusal] | Refusal]) -> dict[str, int]:
