@@ -14,7 +14,9 @@ from topomerge.metrics import (
     consistency,
     contingency,
     match_places,
+    on_storey,
     overlaps,
+    pose_right,
     score_doors,
     score_edges,
     score_rooms,
@@ -156,3 +158,25 @@ def test_storeys() -> None:
     assert storeys_right(np.array([0.0, 3.0]), np.array([3.4, -0.2]))
     assert not storeys_right(np.array([0.0, 3.0]), np.array([0.0, 3.6]))
     assert not storeys_right(np.array([0.0]), np.array([0.0, 3.0]))
+
+
+@pytest.mark.parametrize(
+    ("error", "flat", "good"),
+    [
+        ((0.3, 0.3, 4.9), False, True),
+        ((0.3, 0.45, 1.0), False, False),  # 0.54 m in space
+        ((0.3, 0.45, 1.0), True, True),
+        ((0.1, 0.0, 5.1), False, False),
+        ((0.1, 0.0, 5.1), True, False),
+        ((0.1, 1.3, 0.0), True, True),
+        ((0.1, 2.8, 0.0), True, False),
+        ((0.1, -2.8, 0.0), True, False),
+    ],
+)
+def test_a_pose_is_right_in_space_or_on_its_storey(error, flat, good) -> None:
+    assert pose_right(error, flat, (0.5, 5.0)) == good
+
+
+def test_storeys_are_nearer_to_their_own_floor() -> None:
+    for height in (2.8, 3.2, 4.0):
+        assert on_storey(0.0) and on_storey(0.1 * height) and not on_storey(height) and not on_storey(-0.9 * height)

@@ -6,7 +6,7 @@ none. `datasets.judge` makes such arrays from maps and from what is true about a
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ HALF = 0.5  # IoU from which a room counts as found
 SAME = 0.1  # IoU from which two rooms correspond, for the edges of the graph
 PLAN, PLAN_HEIGHT = 0.5, 1.0  # m between a true door and the one found
 LEVEL = 0.5  # m between a true floor and the one found
+OFF_STOREY = 1.4  # m: half of the lowest storey: what is off by more lies nearer to another floor
 
 
 @dataclass(frozen=True)
@@ -206,3 +207,25 @@ def consistency(a: Array, b: Array, least: int = 0, every: bool = True) -> float
         return 0.0 if max(iou.shape) else float("nan")
     i, j = linear_sum_assignment(iou, maximize=True)
     return float(iou[i, j].sum() / (max(iou.shape) if every else min(iou.shape)))
+
+
+def on_storey(vertical: float) -> bool:
+    """Does a pose that is so many metres too high or too low lay a slice or a drawing on its own storey?
+
+    They tell no height, so that registration takes it from the floors: a slice is laid 0.3 m above one, a drawing on one. On the
+    right floor that is within half a metre; another floor is a storey's height off.
+    """
+    return abs(vertical) < OFF_STOREY
+
+
+def pose_right(error: Sequence[float], flat: bool, limits: tuple[float, float]) -> bool:
+    """Is a pose right?
+
+    Args:
+        error: horizontal and vertical, m, and of the yaw, degrees.
+        flat: one of the maps is a slice or a drawing, which has no height of its own: the distance is the horizontal one, and
+            the pose must be `on_storey`.
+        limits: m, degrees.
+    """
+    far = error[0] if flat else float(np.hypot(error[0], error[1]))
+    return far < limits[0] and error[2] < limits[1] and (not flat or on_storey(error[1]))

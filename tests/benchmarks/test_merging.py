@@ -38,3 +38,10 @@ def test_a_slice_or_a_drawing_says_nothing_of_its_height() -> None:
     off = [0.1, 1.0, 1.0]
     assert right(off, ("tls", "laser2d")) and right(off, ("drawing", "tls")) and not right(off, ("tls", "depth"))
     assert not right(None, ("tls", "laser2d"))
+
+
+def test_a_slice_or_a_drawing_on_the_wrong_storey_is_wrong() -> None:
+    right = importlib.import_module("topomerge.training.belief_hypotheses").right
+    for sensors in (("tls", "laser2d"), ("drawing", "tls"), ("laser2d", "laser2d")):
+        assert not right([0.05, 2.9, 0.1], sensors) and not right([0.05, -2.9, 0.1], sensors)
+        assert right([0.05, 0.45, 0.1], sensors) and right([0.05, -0.45, 0.1], sensors)

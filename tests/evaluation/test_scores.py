@@ -99,6 +99,7 @@ def test_poses() -> None:
     assert within((0.3, 0.3, 4.9), False, (0.5, 5.0))
     assert not within((0.3, 0.45, 1.0), False, (0.5, 5.0)) and within((0.3, 0.45, 1.0), True, (0.5, 5.0))
     assert not within((0.1, 0.0, 5.1), False, (0.5, 5.0))
+    assert not within((0.1, 3.1, 1.0), True, (0.5, 5.0))
 
 
 def verdict(pose: Sim3 | None, believed: bool) -> dict[str, Any]:

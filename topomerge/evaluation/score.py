@@ -17,6 +17,7 @@ import numpy as np
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair
 from topomerge.evaluation.settings import Evaluation, variants
 from topomerge.io import archive
+from topomerge.metrics import pose_right
 from topomerge.types import Array, Sim3
 
 Row = dict[str, Any]
@@ -183,9 +184,8 @@ def pose_error(pose: Sim3, truth: Sim3, anchor: Array) -> tuple[float, float, fl
 
 
 def within(error: tuple[float, float, float], flat: bool, limits: tuple[float, float]) -> bool:
-    """Is a pose right? A slice says nothing of its height."""
-    far = error[0] if flat else float(np.hypot(error[0], error[1]))
-    return far < limits[0] and error[2] < limits[1]
+    """Is a pose right? A slice says nothing of its height, but must lie on its storey (`metrics.pose_right`)."""
+    return pose_right(error, flat, limits)
 
 
 def merge_counts(pair: EvaluationPair, verdict: Mapping[str, Any]) -> Row:

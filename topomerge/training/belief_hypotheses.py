@@ -24,6 +24,7 @@ from topomerge.fusion.verify import rank
 from topomerge.fusion.winner_features import winner_features
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.poses import wrapped
+from topomerge.metrics import pose_right
 from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array, Sim3
 
@@ -65,11 +66,8 @@ def error(pose: Sim3, pair: GridPair) -> list[float] | None:
 
 
 def right(err: Sequence[float] | None, sensors: Sequence[str], limits: tuple[float, float] = RIGHT_POSE) -> bool:
-    """Is a pose right? A slice or a drawing says nothing of its height."""
-    if err is None:
-        return False
-    flat = "laser2d" in sensors or "drawing" in sensors
-    return (err[0] if flat else float(np.hypot(err[0], err[1]))) < limits[0] and err[2] < limits[1]
+    """Is a pose right? A slice or a drawing says nothing of its height, but must lie on its storey (`metrics.pose_right`)."""
+    return err is not None and pose_right(err, "laser2d" in sensors or "drawing" in sensors, limits)
 
 
 def together(first: GridPair, second: GridPair) -> GridPair:
