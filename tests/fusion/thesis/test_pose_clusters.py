@@ -49,3 +49,41 @@ def test_clusters_begin_with_the_cluster_with_most_weight():
     moved, turned, _ = pose_difference(mean, true, np.zeros(3))
     assert weight >= 8 and set(range(12, 20)) <= set(members) and moved < 0.05 and turned < 0.02
     assert sorted(i for _, _, m in clusters for i in m) == list(range(20))
+
+
+def test_means_are_weighted():
+    """A pose of weight 3 counts as three of weight 1, in its turn, its place and its scale."""
+    light, heavy = Sim3(0.1, (0.0, 8.0, 1.0), 1.0), Sim3(0.3, (4.0, 0.0, 2.0), 1.1)
+    mean = mean_pose([light, heavy], [1, 3])
+    assert np.allclose(mean.matrix, mean_pose([light, heavy, heavy, heavy]).matrix)
+    assert mean.translation == pytest.approx((3.0, 2.0, 1.75)) and mean.yaw == pytest.approx(0.25, abs=1e-3)
+    assert np.log(mean.scale) == pytest.approx(0.75 * np.log(1.1))
+
+
+def test_one_heavy_pose_outweighs_several_light_ones():
+    """Of three rooms that agree and one large room that says otherwise, the area decides, and the mean leans to what is large."""
+    light, heavy = [Sim3(0.0, (0.1 * k, 0.0, 0.0)) for k in range(3)], [Sim3(1.0, (9.0, 0.0, 0.0)), Sim3(1.0, (9.4, 0.0, 0.0))]
+    (first, weight, members), (second, rest, others) = pose_clusters([*light, *heavy], [5.0, 5.0, 5.0, 30.0, 10.0])
+    assert (weight, members, rest, others) == (40.0, [3, 4], 15.0, [0, 1, 2])
+    assert first.translation[0] == pytest.approx(9.1) and second.translation[0] == pytest.approx(0.1)
+
+
+def test_members_are_those_near_the_mean_not_near_the_seed():
+    """The seed lies at 0.3 m; the mean of what is near it at 0.6 m has others around it, and one of the first no more."""
+    poses = [Sim3(0.0, (x, 0.0, 0.0)) for x in (0.0, 0.3, 0.75, 0.8, 1.25)]
+    mean, weight, members = pose_clusters(poses, [1.0, 2.0, 4.0, 4.0, 0.5])[0]
+    assert members == [1, 2, 3] and weight == 10.0 and mean.translation[0] == pytest.approx(6.8 / 10)
+
+
+@pytest.mark.parametrize("other", [Sim3(0.0, (0.6, 0.0, 0.0)), Sim3(np.radians(6.0)), Sim3(scale=1.06)])
+def test_poses_that_differ_in_one_thing_are_two_clusters(other):
+    assert len(pose_clusters([Sim3(), other], [1.0, 1.0])) == 2
+    assert len(pose_clusters([Sim3(), Sim3(np.radians(4.0), (0.4, 0.0, 0.0), 1.04)], [1.0, 1.0])) == 1
+
+
+def test_clusters_are_compared_where_the_map_lies():
+    """Turns of 2 degrees about the middle of a map 100 m away from the origin are one pose, though their translations differ."""
+    anchor = np.array([100.0, 0.0, 0.0])
+    turned = [Sim3(np.radians(y)) for y in (-1.0, 1.0)]
+    turned = [Sim3(p.yaw, tuple((anchor - p.apply(anchor[None])[0]).tolist())) for p in turned]  # type: ignore[arg-type]
+    assert len(pose_clusters(turned, [1.0, 1.0], anchor)) == 1 and len(pose_clusters(turned, [1.0, 1.0])) == 2
