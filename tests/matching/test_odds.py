@@ -1,0 +1,49 @@
+"""How likely hypotheses and matches are: features by hand, and what more evidence does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.scenes_map import building
+from topomerge.matching.odds import hypothesis_features, hypothesis_probability, match_features, match_probability
+
+
+def test_features_of_a_hypothesis():
+    """20 m of walls agree, 3 m conflict, 50 m2 of floor in common: a score of 20 - 2 * 3 + 0.1 * 50."""
+    features = hypothesis_features(np.array([[20.0, 3.0, 50.0], [0.0, 0.0, 0.0]]))
+    assert features == pytest.approx(np.array([[1.0, np.log(21.0), 3 / 23, 1.9], [1.0, 0.0, 0.0, 0.0]]))
+
+
+def test_hypotheses_share_what_none_of_them_leaves():
+    alike = hypothesis_probability(np.array([[40.0, 1.0, 100.0]] * 2))
+    alone = hypothesis_probability(np.array([[40.0, 1.0, 100.0]]))
+    assert alike[0] == alike[1] < alone[0] < 1 and alike.sum() < 1
+    odds = alone[0] / (1 - alone[0])  # against "none of them", which does not depend on how many there are
+    assert alike == pytest.approx([odds / (2 * odds + 1)] * 2)
+
+
+def test_conflict_speaks_against_a_hypothesis():
+    agreeing, conflicting = (hypothesis_probability(np.array([[40.0, c, 100.0]]))[0] for c in (0.0, 15.0))
+    assert agreeing > conflicting
+
+
+def test_features_of_a_match():
+    a, b = building(2), building(2)
+    a.rooms["area"], b.rooms["area"] = (12.0, 0.1, 30.0, 8.0, 9.0), (10.0, 20.0, 4.0, 8.0, 9.0)
+    a.rooms["glimpsed"], b.rooms["glimpsed"] = (True, False, False, False, False), (True, False, True, False, False)
+    rooms, fit = np.array([[0, 0], [1, 1], [2, 2], [3, 3], [3, 4]]), np.array([0.9, 0.8, 0.7, 0.6, 0.5])
+    features = match_features(a, b, rooms, fit)
+    assert features[:, :2] == pytest.approx(np.column_stack([np.ones(5), fit]))
+    assert np.exp(features[:, 2]) == pytest.approx([10.0, 0.5, 4.0, 8.0, 8.0])  # the smaller room, a scrap at least
+    assert features[:, 3].tolist() == [2, 0, 1, 0, 0]
+    assert features[:, 4].tolist() == [0, 0, 0, 1, 1]  # room 3 of a is cut in two
+    turned = match_features(b, a, rooms[:, ::-1], fit)
+    assert turned == pytest.approx(features)
+
+
+def test_rooms_that_fit_well_are_likelier_one_than_glimpsed_scraps():
+    a, b = building(2), building(2)
+    a.rooms["area"][2], a.rooms["glimpsed"][2] = 0.3, True
+    good, poor, scrap = match_probability(a, b, np.array([[0, 0], [1, 1], [2, 2]]), np.array([0.95, 0.2, 0.2]))
+    assert 1 > good > poor > scrap > 0
