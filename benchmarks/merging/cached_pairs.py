@@ -7,11 +7,15 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
+from functools import cache
 from pathlib import Path
+from typing import Any
 
+from topomerge.datasets.core.physical import physical_building
 from topomerge.datasets.pairs.grid_drawings import build_drawings
-from topomerge.datasets.pairs.grid_pairs import build_grids
+from topomerge.datasets.pairs.grid_pairs import GridPair, build_grids, grid_items
 
 from topomerge.errors import InputError
 
@@ -36,11 +40,58 @@ def pair_files(split: str, kinds: tuple[str, ...] = ()) -> list[Path]:
     return [PAIRS_CACHE / "grids" / row["file"] for row in rows if not kinds or row["kind"] in kinds]
 
 
-def main(split: str, *words: str) -> None:
-    """Make what is missing of a split."""
+@cache
+def other_buildings(split: str) -> dict[tuple[int, int], str]:
+    """Of pairs of two buildings, by set and number: the name of the second one, which the files do not tell."""
+    items, _ = grid_items(_settings(split).data)
+    out = {}
+    for k in items:
+        if k.item.hard == "other-building":
+            name = k.item.other[0]
+            out[k.set, k.number] = f"{k.item.kind}-{name}-{k.item.storeys}" if k.item.source == "procedural" else name
+    return out
+
+
+def buildings_of(pair: GridPair, split: str) -> tuple[str, str]:
+    """Names of the buildings of a and of b of a cached pair."""
+    about: dict[str, Any] = pair.about
+    whole = str(about["building"])
+    if about["kind"] != "other-building":
+        return whole, whole
+    if "item" in about:
+        return whole, other_buildings(split.removesuffix(DRAWN))[about["set"], about["item"]]
+    first, _, second = whole.rpartition(" + ")  # of a drawing; storeys of one building are joined so, too
+    return first, second
+
+
+def places_of(names: tuple[str, str], sources: tuple[str, str] | None = None) -> dict[str, str]:
+    """What a row of results tells of where its maps are from: names, sources and physical buildings of a and of b.
+
+    Args:
+        sources: None: as the names of cached pairs tell them.
+    """
+    sources = sources or (_source_of(names[0]), _source_of(names[1]))
+    physical = [physical_building(*of) for of in zip(sources, names, strict=True)]
+    out = {"source": sources[0], "building": names[0], "physical": physical[0]}
+    return out | {"other_source": sources[1], "other": names[1], "physical_other": physical[1]}
+
+
+def _source_of(name: str) -> str:
+    """procedural, campus or r2v: what `grid_pairs.WEIGHTS` draws from."""
+    if re.fullmatch(r"[a-z]+-\d+-\d+", name):
+        return "procedural"
+    return "campus" if name.startswith(("school/", "office/")) else "r2v"
+
+
+def _settings(split: str, words: tuple[str, ...] = ()) -> Any:
     from topomerge.training.tasks import settings_of
 
-    settings = settings_of(["task=merge_belief", f"data={SETS[split]}", *words])
+    return settings_of(["task=merge_belief", f"data={SETS[split]}", *words])
+
+
+def main(split: str, *words: str) -> None:
+    """Make what is missing of a split."""
+    settings = _settings(split, words)
     for build in (build_grids, build_drawings):
         print(build(settings.data, settings, lambda text: print(text, flush=True))[1])
 

@@ -7,8 +7,8 @@ TOPOMERGE_DATA. Methods: ours, kiss02, kiss03, fpfh, fgr (comma-separated; defau
 method in ``cache/merge/results_<split>.jsonl``; the first `limit` pairs are run (0: none, only the table). Peers get the means
 of the points of 0.1 m cells and a voxel size; `peers.py` compares them with more care.
 
-Right: within 0.5 m and 5 degrees (fine: 0.1 m, 1 degree) in the middle of what both maps saw; of slices, horizontally. Seconds
-are of the processor, so that other jobs on the machine do not count.
+Right: within 0.5 m and 5 degrees (fine: 0.1 m, 1 degree) in the middle of what both maps saw; of slices and drawings horizontally
+and on the right storey. Seconds are of the processor, so that other jobs on the machine do not count.
 """
 
 from __future__ import annotations
@@ -26,13 +26,15 @@ from topomerge.datasets.pairs.grid_pairs import GridPair, common_area, free_of, 
 from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.real.sources import iter_real_pairs
 
-from benchmarks.merging.cached_pairs import pair_files
+from benchmarks.merging.cached_pairs import buildings_of, pair_files, places_of
 from topomerge.fusion.cell_means import cell_middles
 from topomerge.fusion.registration import register
+from topomerge.metrics import on_storey
 from topomerge.training.belief_hypotheses import error, kind_of, right
 from topomerge.types import Array, Sim3, VoxelGrid
 
 SCALELESS = ("halmstad",)  # no metres per pixel are known
+FINE = (0.1, 1.0)  # m, degrees
 Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, how much
 
 
@@ -145,13 +147,30 @@ def run(split: str, limit: int, methods: list[str], target: Path) -> None:
             except Exception as failure:  # a peer that fails has not merged
                 print(f"{pair.name} {method}: {failure}", flush=True)
                 pose, believed, how = None, False, 0.0
-            about = {k: pair.about.get(k) for k in ("sensors", "kind", "building", "source", "overlap", "differs", "scaled")}
-            row = {"name": pair.name, "method": method, "common": pair.common, **about, "seconds": time.process_time() - began}
-            row |= {"believed": believed, "probability": how, "err": None if pose is None else error(pose, pair)}
-            row["scale"] = None if pose is None or pair.truth is None else pose.scale / pair.truth.scale
-            row["answered"] = pose is not None
+            about = {k: pair.about.get(k) for k in ("sensors", "kind", "overlap", "differs", "scaled")}
+            row = {"name": pair.name, "method": method, "common": pair.common, **about, **where_from(pair, split)}
+            row |= {"seconds": time.process_time() - began, "believed": believed, "probability": how}
+            row |= {"answered": pose is not None, **outcome(pose, pair)}
             with target.open("a") as out:
                 out.write(json.dumps(row) + "\n")
+
+
+def where_from(pair: GridPair, split: str) -> dict[str, str]:
+    """Source and buildings of a pair (`places_of`)."""
+    if split == "real":
+        name, source = str(pair.about["building"]), str(pair.about["source"])
+        return places_of((name, name), (source, source))
+    return places_of(buildings_of(pair, split))
+
+
+def outcome(pose: Sim3 | None, pair: GridPair) -> dict[str, Any]:
+    """How far a pose is off (``err``: horizontal and vertical, m, and degrees; ``scale``: by a factor), and what that makes it:
+    ``right`` and ``fine`` within 0.5 m and 5 degrees, 0.1 m and 1 degree, ``wrong_storey`` on another floor."""
+    off = None if pose is None else error(pose, pair)
+    sensors: Any = pair.about["sensors"]
+    judged = {"right": right(off, sensors), "fine": right(off, sensors, FINE)}
+    scale = None if pose is None or pair.truth is None else pose.scale / pair.truth.scale
+    return {"err": off, "scale": scale, **judged, "wrong_storey": off is not None and not on_storey(off[1])}
 
 
 def table(rows: list[dict[str, Any]], key: Callable[[dict[str, Any]], str]) -> None:
@@ -160,8 +179,7 @@ def table(rows: list[dict[str, Any]], key: Callable[[dict[str, Any]], str]) -> N
         for method in REGISTRATIONS:
             mine = [r for r in rows if key(r) == group and r["method"] == method]
             if mine:
-                good = np.array([right(r["err"], r["sensors"]) for r in mine])
-                fine = np.array([right(r["err"], r["sensors"], (0.1, 1.0)) for r in mine])
+                good, fine = (np.array([r[key] for r in mine]) for key in ("right", "fine"))
                 believed = np.array([r["believed"] and r["answered"] for r in mine])
                 seconds = np.median([r["seconds"] for r in mine])
                 print(

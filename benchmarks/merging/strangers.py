@@ -13,30 +13,45 @@ import json
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import chain, combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from topomerge.datasets.core.physical import physical_building
 from topomerge.datasets.pairs.grid_pairs import load_grids
 
-from benchmarks.merging.cached_pairs import pair_files
+from benchmarks.merging.cached_pairs import buildings_of, pair_files, places_of
 from benchmarks.merging.register import SCALELESS, real_pairs
 from topomerge.fusion.registration import Prepared, Registration, prepare, register
 from topomerge.types import VoxelGrid
 
 Row = dict[str, Any]
-STOREYS = "utexas"  # all maps of this source are of one building
+STOREYS = ("campus", "rmf", "mall", "utexas")  # sources whose plans of one building are storeys of it
 STRIDE = 7  # pairs are laid out in blocks of so many pairs, so that few maps are in memory at once
 
 
+@dataclass(frozen=True, eq=False)
+class Side:
+    """A map that is tried with maps of other places: its pair's name, source, building, sensor, and the map."""
+
+    name: str
+    source: str
+    building: str
+    sensor: str
+    map: Prepared
+
+
 @cache
-def maps(path: Path) -> tuple[str, tuple[Prepared, Prepared], list[str]]:
-    """Building, both maps and their sensors of a cached pair."""
+def maps(path: Path, split: str) -> tuple[Side, Side]:
+    """Both maps of a cached pair."""
     pair = load_grids(path)
+    names = buildings_of(pair, split)
+    sources, (one, other) = places_of(names), list(pair.about["sensors"])  # type: ignore[call-overload]
     a, b = (prepare(g, f) for g, f in zip((pair.a, pair.b), pair.free, strict=True))
-    return str(pair.about["building"]), (a, b), list(pair.about["sensors"])  # type: ignore[call-overload]
+    return Side(path.stem, sources["source"], names[0], one, a), Side(path.stem, sources["other_source"], names[1], other, b)
 
 
 def strangers(split: str) -> Iterator[tuple[Path, Path]]:
@@ -50,42 +65,52 @@ def strangers(split: str) -> Iterator[tuple[Path, Path]]:
 
 
 def of_strangers(split: str, many: int, done: Collection[str]) -> Iterator[Row]:
-    """Maps of two buildings."""
+    """Maps of two buildings, or of two storeys of one."""
     for count, (first, second) in enumerate(strangers(split)):
         name = f"{first.stem}+{second.stem}"
         if count >= many:
             return
-        if name in done:
-            continue
-        (where, (a, _), seen), (other, (_, b), by) = maps(first), maps(second)
-        if where != other:
-            about = {"name": name, "kind": "strangers", "building": where, "sensors": [seen[0], by[1]]}
-            yield _row(about, partial(register, a, b, refined=False))
+        if name not in done:
+            a, b = maps(first, split)[0], maps(second, split)[1]
+            kind = kind_of_two(a, b)
+            if kind:
+                yield _row({**about_two(a, b), "name": name, "kind": kind}, partial(register, a.map, b.map, refined=False))
+
+
+def about_two(a: Side, b: Side) -> Row:
+    """What a row tells of two maps."""
+    return {**places_of((a.building, b.building), (a.source, b.source)), "sensors": [a.sensor, b.sensor]}
+
+
+def kind_of_two(a: Side, b: Side) -> str:
+    """strangers; other-storey of one physical building; nothing where the maps may show one place."""
+    if physical_building(a.source, a.building) != physical_building(b.source, b.building):
+        return "strangers"
+    storeys = [set(side.building.split(" + ")) for side in (a, b)]
+    return "other-storey" if a.source in STOREYS and storeys[0].isdisjoint(storeys[1]) else ""
 
 
 def of_real(many: int, done: Collection[str]) -> Iterator[Row]:
     """Real maps of two places, so that each place meets each other one before any does so again."""
-    places: dict[str, list[tuple[str, str, str, Prepared]]] = {}
+    places: dict[str, list[Side]] = {}
     for pair in real_pairs():
         source = str(pair.about["source"])
-        place = pair.name.split("/")[1].split("-")[0] if source == STOREYS else str(pair.about["building"])
+        place = pair.name.split("/")[1].split("-")[0] if source == "utexas" else str(pair.about["building"])
         for grid, free, sensor, side in zip((pair.a, pair.b), pair.free, pair.about["sensors"], "ab", strict=True):  # type: ignore[call-overload]
             cells = VoxelGrid(grid.cells, grid.origin, grid.edge, grid.shape)
-            places.setdefault(place, []).append((f"{pair.name}:{side}", source, sensor, prepare(cells, free)))
+            places.setdefault(place, []).append(Side(f"{pair.name}:{side}", source, place, sensor, prepare(cells, free)))
     rng, count = np.random.default_rng(0), 0
     while True:
         for where, other in combinations(sorted(places), 2):
-            i, j = (int(rng.integers(len(places[k]))) for k in (where, other))
-            (one, source, seen, a), (two, origin, by, b) = places[where][i], places[other][j]
+            a, b = (places[k][int(rng.integers(len(places[k])))] for k in (where, other))
             count += 1
             if count > many:
                 return
-            name = f"{one}+{two}"
+            name = f"{a.name}+{b.name}"
             if name not in done:
-                kind = "other-storey" if source == origin == STOREYS else "other-building"
-                about = {"name": name, "kind": kind, "building": where, "sensors": [seen, by]}
-                scale = "free" if {source, origin} & set(SCALELESS) else "fixed"
-                yield _row(about, partial(register, a, b, scale=scale, refined=False))
+                scale = "free" if {a.source, b.source} & set(SCALELESS) else "fixed"
+                about = {**about_two(a, b), "name": name, "kind": kind_of_two(a, b)}
+                yield _row(about, partial(register, a.map, b.map, scale=scale, refined=False))
 
 
 def of_drawings(split: str, done: Collection[str]) -> Iterator[Row]:
@@ -96,8 +121,8 @@ def of_drawings(split: str, done: Collection[str]) -> Iterator[Row]:
         pair = load_grids(path)
         if pair.about["kind"] == "overlap":
             continue
-        keys = ("kind", "building", "sensors", "differs", "walls_differ", "scaled")
-        about = {k: pair.about[k] for k in keys if k in pair.about}
+        keys = ("kind", "sensors", "differs", "walls_differ", "scaled")
+        about = {k: pair.about[k] for k in keys if k in pair.about} | places_of(buildings_of(pair, split))
         scale = "free" if pair.about["scaled"] else "fixed"
         run = partial(register, pair.a, pair.b, free=pair.free, scale=scale, refined=False)
         yield _row({"name": path.stem, **about}, run)

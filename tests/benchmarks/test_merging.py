@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,3 +46,49 @@ def test_a_slice_or_a_drawing_on_the_wrong_storey_is_wrong() -> None:
     for sensors in (("tls", "laser2d"), ("drawing", "tls"), ("laser2d", "laser2d")):
         assert not right([0.05, 2.9, 0.1], sensors) and not right([0.05, -2.9, 0.1], sensors)
         assert right([0.05, 0.45, 0.1], sensors) and right([0.05, -0.45, 0.1], sensors)
+
+
+def cached(**about: object) -> SimpleNamespace:
+    """Of a cached pair what tells where its maps are from."""
+    return SimpleNamespace(about=about)
+
+
+def test_where_both_maps_are_from(module, monkeypatch) -> None:
+    pairs = module("cached_pairs")
+    monkeypatch.setattr(pairs, "other_buildings", lambda split: {(0, 7): "school/Sabadell3"})
+    one = cached(building="office-900001-2", kind="overlap", sensors=["tls", "depth"], set=0, item=3)
+    assert pairs.buildings_of(one, "test") == ("office-900001-2", "office-900001-2")
+    two = cached(building="school/Sabadell1", kind="other-building", sensors=["tls", "depth"], set=0, item=7)
+    names = pairs.buildings_of(two, "test")
+    assert names == ("school/Sabadell1", "school/Sabadell3")
+    assert pairs.places_of(names)["physical"] == pairs.places_of(names)["physical_other"] == "campus/school/sabadell"
+    drawn = cached(
+        building="school/Sabadell1 + school/Sabadell2 + lab-900002-1", kind="other-building", sensors=["tls", "drawing"]
+    )
+    place = pairs.places_of(pairs.buildings_of(drawn, "test_drawings"))
+    assert place["physical"] == "campus/school/sabadell" and place["other_source"] == "procedural"
+
+
+def test_two_maps_of_one_building_are_no_strangers(module) -> None:
+    strangers = module("strangers")
+
+    def kind(source: str, *names: str, other: str = "") -> str:
+        a, b = (strangers.Side("x", s, name, "tls", None) for s, name in zip((source, other or source), names, strict=True))
+        return strangers.kind_of_two(a, b)
+
+    assert kind("campus", "school/Sabadell1", "school/Franch1") == "strangers"
+    assert kind("campus", "school/Sabadell1", "school/Sabadell2") == "other-storey"
+    assert kind("campus", "school/Sabadell1 + school/Sabadell2", "school/Sabadell2") == ""  # both may show storey 2
+    assert kind("campus", "school/Sabadell1", "school/Sabadell1") == kind("r2v", "a/b/1", "a/b/2") == ""
+    assert kind("utexas", "gdc1", "gdc3") == "other-storey"
+    assert kind("carmen", "freiburg-101", "Freiburg101_scan", other="ipa") == ""
+
+
+def test_what_a_row_tells_of_a_pose(module) -> None:
+    truth, outcome = Sim3(0.3, (1.0, 2.0, 0.0)), module("register").outcome
+    pair = SimpleNamespace(truth=truth, anchor=np.zeros(3), about={"sensors": ["tls", "laser2d"], "kind": "overlap"})
+    near, far = (outcome(Sim3(0.3, (1.2, 2.0, z)), pair) for z in (0.3, 3.1))
+    assert (near["right"], near["fine"], near["wrong_storey"]) == (True, False, False)
+    assert (far["right"], far["fine"], far["wrong_storey"]) == (False, False, True)
+    assert outcome(truth, pair)["fine"] and outcome(truth, pair)["scale"] == 1
+    assert outcome(None, pair) == {"err": None, "scale": None, "right": False, "fine": False, "wrong_storey": False}
