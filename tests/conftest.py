@@ -1,11 +1,22 @@
-"""Fixtures for all tests."""
+"""Fixtures for all tests, and what was skipped, told in the last lines."""
 
 from __future__ import annotations
 
 import os
+import re
+from collections import Counter
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+
+LACKS = {  # what a test says that it lacks, in the reason of its skip -> what the last lines call it
+    r"TOPOMERGE_DATA": "real data (TOPOMERGE_DATA)",
+    r"Chromium": "a browser (Chromium)",
+    r"git checkout": "a git checkout, for the wheel",
+    r"could not import|No module named": "a package that is not installed",
+}
+UNCHOSEN = pytest.StashKey[int]()  # tests that need real data and are not among the chosen ones
 
 
 @pytest.fixture(scope="session")
@@ -18,3 +29,44 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"TOPOMERGE_DATA={name} is not a folder")
     return folder
+
+
+def skips_told(reasons: list[str], unchosen: int = 0) -> list[str]:
+    """How many tests were skipped for want of what, all that can be lacking also when none was; other reasons word for word.
+
+    Args:
+        reasons: one a skipped test, or a skipped file.
+        unchosen: tests that need real data and were not chosen.
+    """
+    lacking = [next((what for pattern, what in LACKS.items() if re.search(pattern, reason)), "") for reason in reasons]
+    needs = Counter(lacking)
+    lines = [f"{needs[what]} tests that need {what} were skipped" for what in LACKS.values()]
+    lines[0] += f"; {unchosen} more are slow and not of this run" if unchosen else ""
+    others = Counter(reason for reason, what in zip(reasons, lacking, strict=True) if not what)
+    return [*lines, *(f"{count} tests were skipped: {reason}" for reason, count in sorted(others.items()))]
+
+
+def pytest_deselected(items: list[pytest.Item]) -> None:
+    if items:
+        stash = items[0].config.stash
+        stash[UNCHOSEN] = stash.get(UNCHOSEN, 0) + sum(item.get_closest_marker("data") is not None for item in items)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if hasattr(session.config, "workeroutput"):  # a worker of xdist tells the process that prints
+        session.config.workeroutput["unchosen"] = session.config.stash.get(UNCHOSEN, 0)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: object) -> None:
+    config, said = getattr(node, "config"), getattr(node, "workeroutput", {})  # noqa: B009 (types of xdist, which may be absent)
+    config.stash[UNCHOSEN] = max(config.stash.get(UNCHOSEN, 0), said.get("unchosen", 0))  # each worker collects all
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Generator[None, None, None]:
+    yield  # after all that others have to say
+    skipped = terminalreporter.stats.get("skipped", [])
+    reasons = [report.longrepr[2].removeprefix("Skipped: ") for report in skipped]
+    for line in skips_told(reasons, terminalreporter.config.stash.get(UNCHOSEN, 0)):
+        terminalreporter.write_line(line)

@@ -116,6 +116,15 @@ def iter_plans(folder: str | Path, among: Collection[str] | None = None) -> Iter
             yield name, Refusal(name, result.reason) if isinstance(result, Refusal) else result
 
 
+def plan_names(folder: str | Path) -> list[str]:
+    """Names (as of `iter_plans`) of all plans of a folder, also of those that would be refused; no plan is read.
+
+    Raises:
+        InputError: no such folder.
+    """
+    return [_full(file, root, name) for file, root in _files(Path(folder)) for name in _names(file)]
+
+
 def _files(folder: Path) -> list[tuple[Path, Path]]:
     """Files with plans, and the folder that their names count from."""
     if not folder.exists():
