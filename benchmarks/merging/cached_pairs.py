@@ -76,6 +76,13 @@ def places_of(names: tuple[str, str], sources: tuple[str, str] | None = None) ->
     return out | {"other_source": sources[1], "other": names[1], "physical_other": physical[1]}
 
 
+def hard_of(pair: GridPair) -> list[str]:
+    """What makes a cached pair hard beside its kind (`grid_pairs`: every sixth, every eighth)."""
+    difficulty: dict[str, float] = pair.about.get("difficulty", {})  # type: ignore[assignment]
+    limits = {"much moved furniture": ("moved", 0.6), "glass walls": ("glass", 0.5)}
+    return [title for title, (name, least) in limits.items() if difficulty.get(name, 0.0) >= least]
+
+
 def _source_of(name: str) -> str:
     """procedural, campus or r2v: what `grid_pairs.WEIGHTS` draws from."""
     if re.fullmatch(r"[a-z]+-\d+-\d+", name):

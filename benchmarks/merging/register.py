@@ -26,7 +26,7 @@ from topomerge.datasets.pairs.grid_pairs import GridPair, common_area, free_of, 
 from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.real.sources import iter_real_pairs
 
-from benchmarks.merging.cached_pairs import buildings_of, pair_files, places_of
+from benchmarks.merging.cached_pairs import buildings_of, hard_of, pair_files, places_of
 from topomerge.fusion.cell_means import cell_middles
 from topomerge.fusion.registration import register
 from topomerge.metrics import on_storey
@@ -148,7 +148,14 @@ def run(split: str, limit: int, methods: list[str], target: Path) -> None:
                 print(f"{pair.name} {method}: {failure}", flush=True)
                 pose, believed, how = None, False, 0.0
             about = {k: pair.about.get(k) for k in ("sensors", "kind", "overlap", "differs", "scaled")}
-            row = {"name": pair.name, "method": method, "common": pair.common, **about, **where_from(pair, split)}
+            row = {
+                "name": pair.name,
+                "method": method,
+                "common": pair.common,
+                **about,
+                **where_from(pair, split),
+                "hard": hard_of(pair),
+            }
             row |= {"seconds": time.process_time() - began, "believed": believed, "probability": how}
             row |= {"answered": pose is not None, **outcome(pose, pair)}
             with target.open("a") as out:

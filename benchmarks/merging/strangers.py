@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import chain, combinations
@@ -23,7 +23,7 @@ import numpy as np
 from topomerge.datasets.core.physical import physical_building
 from topomerge.datasets.pairs.grid_pairs import load_grids
 
-from benchmarks.merging.cached_pairs import buildings_of, pair_files, places_of
+from benchmarks.merging.cached_pairs import buildings_of, hard_of, pair_files, places_of
 from benchmarks.merging.register import SCALELESS, real_pairs
 from topomerge.fusion.registration import Prepared, Registration, prepare, register
 from topomerge.types import VoxelGrid
@@ -35,13 +35,19 @@ STRIDE = 7  # pairs are laid out in blocks of so many pairs, so that few maps ar
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """A map that is tried with maps of other places: its pair's name, source, building, sensor, and the map."""
+    """A map that is tried with maps of other places.
+
+    Args:
+        name: of its pair.
+        hard: what makes that hard (`hard_of`).
+    """
 
     name: str
     source: str
     building: str
     sensor: str
     map: Prepared
+    hard: Sequence[str] = ()
 
 
 @cache
@@ -51,7 +57,8 @@ def maps(path: Path, split: str) -> tuple[Side, Side]:
     names = buildings_of(pair, split)
     sources, (one, other) = places_of(names), list(pair.about["sensors"])  # type: ignore[call-overload]
     a, b = (prepare(g, f) for g, f in zip((pair.a, pair.b), pair.free, strict=True))
-    return Side(path.stem, sources["source"], names[0], one, a), Side(path.stem, sources["other_source"], names[1], other, b)
+    first = Side(path.stem, sources["source"], names[0], one, a, hard_of(pair))
+    return first, Side(path.stem, sources["other_source"], names[1], other, b, hard_of(pair))
 
 
 def strangers(split: str) -> Iterator[tuple[Path, Path]]:
@@ -79,7 +86,8 @@ def of_strangers(split: str, many: int, done: Collection[str]) -> Iterator[Row]:
 
 def about_two(a: Side, b: Side) -> Row:
     """What a row tells of two maps."""
-    return {**places_of((a.building, b.building), (a.source, b.source)), "sensors": [a.sensor, b.sensor]}
+    places = places_of((a.building, b.building), (a.source, b.source))
+    return {**places, "sensors": [a.sensor, b.sensor], "hard": sorted({*a.hard, *b.hard})}
 
 
 def kind_of_two(a: Side, b: Side) -> str:
@@ -122,10 +130,10 @@ def of_drawings(split: str, done: Collection[str]) -> Iterator[Row]:
         if pair.about["kind"] == "overlap":
             continue
         keys = ("kind", "sensors", "differs", "walls_differ", "scaled")
-        about = {k: pair.about[k] for k in keys if k in pair.about} | places_of(buildings_of(pair, split))
+        about = {k: pair.about[k] for k in keys if k in pair.about} | {"hard": hard_of(pair)}
         scale = "free" if pair.about["scaled"] else "fixed"
         run = partial(register, pair.a, pair.b, free=pair.free, scale=scale, refined=False)
-        yield _row({"name": path.stem, **about}, run)
+        yield _row({"name": path.stem, **about, **places_of(buildings_of(pair, split))}, run)
 
 
 def _row(about: Row, run: Callable[[], Registration]) -> Row:

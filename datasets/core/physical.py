@@ -38,9 +38,8 @@ def physical_building(source: str, name: str) -> str:
     source = source.removesuffix("-plan")
     if source in OF_ONE_PLACE:
         return OF_ONE_PLACE[source]
-    if source == "procedural":  # kind-seed-storeys
-        kind, _, rest = name.partition("-")
-        return f"procedural/{kind}-{rest.split('-')[0]}"
+    if source == "procedural":  # kind-seed-storeys; kinds may have hyphens
+        return f"procedural/{re.sub(r'(?<=[0-9])-.*$', '', name)}"
     if source == "r2v":  # the plans of one property
         return f"r2v/{name.rpartition('/')[0] or name}"
     if source == "halmstad":

@@ -69,6 +69,12 @@ def test_where_both_maps_are_from(module, monkeypatch) -> None:
     assert place["physical"] == "campus/school/sabadell" and place["other_source"] == "procedural"
 
 
+def test_what_makes_a_pair_hard(module) -> None:
+    hard = module("cached_pairs").hard_of
+    assert hard(cached(difficulty={"moved": 0.6, "gone": 0.25, "glass": 0.1})) == ["much moved furniture"]
+    assert hard(cached(difficulty={"moved": 0.3, "glass": 0.5})) == ["glass walls"] and hard(cached()) == []
+
+
 def test_two_maps_of_one_building_are_no_strangers(module) -> None:
     strangers = module("strangers")
 

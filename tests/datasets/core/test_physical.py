@@ -45,7 +45,7 @@ def test_names_of_one_building(source, names) -> None:
             ["school/Franch1", "school/Sabadell1", "office/ED21", "school/scuolasconosciuta", "school/scuolasconosciuta2"],
         ),
         ("mall", ["data/site1/F1", "data/site2/F1"]),
-        ("procedural", ["hotel-994098-2", "hotel-994099-2", "office-994098-2"]),
+        ("procedural", ["hotel-994098-2", "hotel-994099-2", "office-994098-2", "shifted-row-900001", "shifted-row-900002"]),
         ("r2v", ["00/00/abc/0001", "00/00/abd/0001"]),
         ("halmstad", ["HIH", "KPT4A", "F5"]),
         ("ipa", ["lab_a_scan", "lab_b_scan", "lab_ipa", "Freiburg101_scan", "Freiburg52_scan"]),
