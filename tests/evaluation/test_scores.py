@@ -10,18 +10,20 @@ import pytest
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, twins
 
 from topomerge.errors import InputError
-from topomerge.evaluation.groups import calibration, draws, gain, value
+from topomerge.evaluation.groups import draws, gain, hit_buildings, value
 from topomerge.evaluation.predict import mutual
 from topomerge.evaluation.score import (
     after_counts,
     match_counts,
     merge_counts,
+    modality,
     overlap_bin,
     pose_error,
     rank_counts,
     ranks_of,
     within,
 )
+from topomerge.evaluation.tables import cell
 from topomerge.types import Sim3, TrueRoom
 
 
@@ -122,10 +124,31 @@ def test_merges(pose: Sim3 | None, believed: bool, expected: dict[str, int]) -> 
     assert counts["good"] == [True]
 
 
+def test_a_merge_in_rooms() -> None:
+    """The pose of the second row is 0.3 m off in each room; that of the first is right in the near one and not in the far one."""
+    near, far = np.array([(5.0, 0.0, 0.0), (5.5, 0.5, 0.0)]), np.array([(90.0, 0.0, 0.0), (100.0, 0.0, 0.0)])
+    turned = Sim3(0.3 + np.radians(0.5), (1.0, 2.0, 0.0))  # 5 cm at 5.5 m, 0.87 m at 100 m
+    counts = merge_counts(hand_made_pair(), verdict(turned, True), [near, far])
+    assert (counts["with_rooms"], counts["every_room"], counts["rooms_shared"], counts["rooms_near"]) == (1, 0, 2, 1)
+    assert counts["farthest_room"] == pytest.approx(2 * 100 * np.sin(np.radians(0.25))) and counts["fine"] == 1
+    moved = merge_counts(hand_made_pair(), verdict(Sim3(0.3, (1.3, 2.0, 0.0)), True), [near, far])
+    assert (moved["every_room"], moved["rooms_near"]) == (0, 0) and moved["farthest_room"] == pytest.approx(0.3)
+    assert merge_counts(hand_made_pair(), verdict(turned, True), [near])["every_room"] == 1
+    none = merge_counts(hand_made_pair(), verdict(None, False), [near, far])
+    assert (none["with_rooms"], none["every_room"], none["rooms_near"]) == (1, 0, 0)
+    assert merge_counts(hand_made_pair(), verdict(turned, True))["with_rooms"] == 0
+
+
 def test_whatever_is_believed_of_two_places_is_false() -> None:
     hard = hand_made_pair(about={"kind": "other-storey", "common": 0.0, "sensors": ["tls", "tls"], "rooms": "labelled"})
     counts = merge_counts(hard, verdict(Sim3(0.3, (1.0, 2.0, 0.0)), True))
     assert (counts["mergeable"], counts["near"], counts["false"]) == (0, 0, 1)
+
+
+def test_kinds_of_maps() -> None:
+    assert modality(["tls", "depth"]) == modality(["model", "tls"]) == "3D scans"
+    assert modality(["laser2d", "tls"]) == modality(["phone", "phone"]) == "with a slice"
+    assert modality(["laser2d", "drawing"]) == modality(["phone", "drawing"]) == "with a floor plan"
 
 
 def test_bins() -> None:
@@ -150,32 +173,44 @@ def test_ratios_are_of_sums() -> None:
 
 
 def test_the_interval_draws_whole_buildings() -> None:
-    recall = value(ROWS, "recall@1", 4000)
-    assert (recall.low, recall.high) == (0.0, 0.5)  # only building b, only building a
-    one = value(ROWS[:2], "recall@1", 100)
-    assert one.low == one.high == one.value
-    assert draws(3, 50).sum(axis=1).tolist() == [3] * 50
     many = [{"building": str(i), "pair": str(i), "first": i % 2, "queries": 1} for i in range(400)]
     wide = value(many, "recall@1", 2000)
-    assert wide.high - wide.low == pytest.approx(2 * 1.96 * np.sqrt(0.25 / 400), rel=0.1)
+    assert wide.high - wide.low == pytest.approx(2 * 1.96 * np.sqrt(0.25 / 400), rel=0.1) and not wide.ranged
+    assert draws(3, 50).sum(axis=1).tolist() == [3] * 50
+    twice = value([*many, *many], "recall@1", 2000)  # more pairs of the same buildings tell nothing more
+    assert (twice.low, twice.high, twice.pairs, twice.buildings) == (wide.low, wide.high, 400, 400)
+
+
+def test_few_buildings_have_a_range_and_no_interval() -> None:
+    recall = value(ROWS, "recall@1")
+    assert (recall.low, recall.high, recall.ranged) == (0.0, 0.5, True)  # building b, building a
+    assert cell(recall) == "0.25, 0.00–0.50 (2 buildings)" and cell(recall, False) == "0.25"
+    one = value(ROWS[:2], "recall@1")
+    assert one.low == one.high == one.value and cell(one) == "0.50"
+    empty = [{"building": str(i), "pair": f"e{i}", "first": 0, "queries": 0} for i in range(20)]
+    with_empty = value([*ROWS, *empty], "recall@1")  # buildings without a query say nothing of it
+    assert (with_empty.low, with_empty.high, with_empty.counted, with_empty.buildings) == (0.0, 0.5, 2, 22)
+    eight = [{"building": str(i), "pair": str(i), "first": 1, "queries": 1} for i in range(8)]
+    assert cell(value(eight, "recall@1")) == "1.00 [1.00, 1.00]" and "(7 buildings)" in cell(value(eight[:7], "recall@1"))
 
 
 def test_a_gain_is_paired() -> None:
     better = [{**r, "first": r["first"] + 1} for r in ROWS]
     recall_gain = gain(better, ROWS, "recall@1", 500)
-    assert recall_gain.value == 3 / 8 and 0 < recall_gain.low <= recall_gain.high
+    assert recall_gain.value == 3 / 8 and (recall_gain.low, recall_gain.high) == (0.25, 0.5)  # 1 of 4 more, 2 of 4 more
     assert gain(ROWS, ROWS, "recall@1", 500).high == 0
+    many = [{"building": str(i), "pair": str(i), "first": i % 2, "queries": 2} for i in range(40)]
+    more = gain([{**r, "first": r["first"] + 1} for r in many], many, "recall@1", 500)
+    assert (more.value, more.low, more.high) == pytest.approx(
+        (0.5, 0.5, 0.5)
+    )  # drawn alike, so that what differs between buildings goes
 
 
-def test_calibration_by_hand() -> None:
-    probabilities = [0.05, 0.05, 0.95, 0.95, 0.95, 1.0]
-    right = [False, True, True, True, False, True]
-    bins = calibration(probabilities, right)
-    assert bins.count.tolist() == [2, 4]
-    assert bins.probability == pytest.approx([0.05, (3 * 0.95 + 1) / 4]) and bins.right == pytest.approx([0.5, 0.75])
-    assert bins.error == pytest.approx((2 * 0.45 + 4 * abs(0.9625 - 0.75)) / 6)
-    exact = np.random.default_rng(0).random(20_000)
-    assert calibration(exact, np.random.default_rng(1).random(20_000) < exact).error < 0.02
+def test_wrong_merges_by_building() -> None:
+    rows = [{"building": str(i // 2), "false": int(i in (0, 1))} for i in range(20)]  # two in one building
+    hit, buildings, low, high = hit_buildings(rows, "false")
+    assert (hit, buildings) == (1, 10)
+    assert (low, high) == pytest.approx((0.00253, 0.44502), abs=1e-4)  # Clopper & Pearson of 1 in 10
 
 
 def test_twins() -> None:

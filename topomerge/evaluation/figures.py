@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.evaluation.groups import calibration, value
+from topomerge.evaluation.groups import value
+from topomerge.evaluation.merge_tables import chosen
 from topomerge.evaluation.score import OVERLAPS, Row
 from topomerge.io.atomic import replacing
+from topomerge.statistics import calibration
 
 ROUNDS = 500
 
@@ -57,8 +59,9 @@ def _all(rows: Sequence[Row], key: str) -> list[Any]:
 
 
 def _reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row]) -> Any:
-    """Share that was right against the probability that was told, with the number in each bin."""
-    sets = [("merges", {n: ([r["probability"] for r in s], [r["near"] for r in s]) for n, s in _of(merges, "variant").items()})]
+    """Share that was right against the probability that was told, over bins of equal mass; merges by where the maps come from."""
+    by_origin = _of(chosen(merges), "origin")
+    sets = [("merges", {n: ([r["probability"] for r in s], [r["near"] for r in s]) for n, s in by_origin.items()})]
     rows_with_probability = [m for m in matches if m["k"] == 0 and m["method"] in ("consistent", "mutual")]
     named = _of([{**m, "title": f"{m['variant']} {m['method']}"} for m in rows_with_probability], "title")
     sets.append(("matches of rooms", {n: (_all(s, "chance"), _all(s, "good")) for n, s in named.items()}))

@@ -1,14 +1,17 @@
-"""Sums of counts over groups of pairs, as ratios with intervals: whole buildings are drawn again and again."""
+"""Sums of counts over groups of pairs, as ratios with intervals: whole physical buildings are drawn again and again; of fewer
+than eight their range stands there instead, and shares of rare events have exact intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from topomerge.evaluation.score import GROUPS, WHOLE, Row
+from topomerge.statistics import FEWEST_GROUPS, exact_interval
 from topomerge.types import Array
 
 LEVELS = [2.5, 97.5]  # percent
@@ -17,13 +20,25 @@ Ratio = tuple[str, str]  # names of two counts
 
 @dataclass(frozen=True)
 class Value:
-    """A ratio of counts with its 95 % interval, and how many pairs and buildings it is of; nan where nothing was counted."""
+    """A ratio of counts with its 95 % interval, and what it is of; nan where nothing was counted.
+
+    Args:
+        low, high: ends of the interval; of fewer than eight buildings the least and the largest of a building.
+        buildings: those of the rows.
+        counted: those of them in which anything was counted: what the interval is over.
+    """
 
     value: float
     low: float
     high: float
     pairs: int
     buildings: int
+    counted: int = 0
+
+    @property
+    def ranged(self) -> bool:
+        """Is the interval the range of the buildings?"""
+        return self.counted < FEWEST_GROUPS
 
 
 def _f1(precision: Array, recall: Array) -> Array:
@@ -43,6 +58,9 @@ RATIOS: dict[str, Ratio] = {
     "recall@5_after": ("five_after", "queries"),
     "strict recall": ("strict_right", "strict_units"),
     "right poses": ("near", "mergeable"),
+    "right finely": ("fine", "mergeable"),
+    "every room": ("every_room", "with_rooms"),
+    "rooms": ("rooms_near", "rooms_shared"),
     "merged": ("merged", "mergeable"),
     "merged finely": ("merged_fine", "mergeable"),
     "refused": ("refused", "mergeable"),
@@ -93,8 +111,8 @@ def value(rows: Sequence[Row], metric: str, rounds: int = 2000) -> Value:
         return Value(np.nan, np.nan, np.nan, 0, 0)
     counts = summed(rows, needed(metric), buildings)
     ratio = float(measure(metric, {n: c.sum() for n, c in counts.items()}))
-    low, high = _interval(measure(metric, {n: draws(len(buildings), rounds) @ c for n, c in counts.items()}))
-    return Value(ratio, low, high, len({r["pair"] for r in rows}), len(buildings))
+    held, low, high = _interval(counts, rounds, lambda c: measure(metric, c))
+    return Value(ratio, low, high, len({r["pair"] for r in rows}), len(buildings), held)
 
 
 def gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds: int = 2000) -> Value:
@@ -102,41 +120,43 @@ def gain(rows: Sequence[Row], others: Sequence[Row], metric: str, rounds: int = 
     buildings = sorted({r["building"] for r in rows} | {r["building"] for r in others})
     if not rows or not others:
         return Value(np.nan, np.nan, np.nan, 0, 0)
-    drawn = draws(len(buildings), rounds)
-    ratios, drawn_ratios = [], []
-    for compared_rows in (rows, others):
-        counts = summed(compared_rows, needed(metric), buildings)
-        ratios.append(float(measure(metric, {n: c.sum() for n, c in counts.items()})))
-        drawn_ratios.append(measure(metric, {n: drawn @ c for n, c in counts.items()}))
-    low, high = _interval(drawn_ratios[0] - drawn_ratios[1])
-    return Value(ratios[0] - ratios[1], low, high, len({r["pair"] for r in rows}), len(buildings))
+    both = [summed(compared_rows, needed(metric), buildings) for compared_rows in (rows, others)]
+    counts = {(side, name): c for side, of in enumerate(both) for name, c in of.items()}
+
+    def better(c: Mapping[tuple[int, str], Array]) -> Array:
+        first, second = (measure(metric, {name: v for (s, name), v in c.items() if s == side}) for side in (0, 1))
+        return first - second
+
+    held, low, high = _interval(counts, rounds, better)
+    ratio = float(better({key: c.sum() for key, c in counts.items()}))
+    return Value(ratio, low, high, len({r["pair"] for r in rows}), len(buildings), held)
 
 
-def _interval(values: Array) -> tuple[float, float]:
+def _interval(counts: Mapping[Any, Array], rounds: int, measured: Callable[[Any], Array]) -> tuple[int, float, float]:
+    """Buildings in which anything was counted, and the ends of the interval over them: of draws, or of fewer than eight their
+    range.
+
+    Args:
+        counts: (buildings,) each.
+        measured: the metric of such counts, element by element.
+    """
+    held = np.any([c != 0 for c in counts.values()], axis=0)
+    by_building = {key: c[held] for key, c in counts.items()}
+    number = int(held.sum())
+    if number >= FEWEST_GROUPS:
+        drawn = draws(number, rounds)
+        by_building = {key: drawn @ c for key, c in by_building.items()}
+    values = measured(by_building)
     finite = values[np.isfinite(values)]
     if not len(finite):
-        return float("nan"), float("nan")
-    low, high = np.percentile(finite, LEVELS).tolist()
-    return low, high
+        return number, float("nan"), float("nan")
+    low, high = np.percentile(finite, LEVELS if number >= FEWEST_GROUPS else [0, 100]).tolist()
+    return number, low, high
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """Reliability: of each bin (B,) of predicted probabilities their mean, the share that was right, and how many; and the
-    expected calibration error, the mean over all of the difference."""
-
-    probability: Array
-    right: Array
-    count: Array
-    error: float
-
-
-def calibration(probabilities: Sequence[float], right: Sequence[bool], bins: int = 10) -> Calibration:
-    """Probabilities against what came true, in bins of equal width; empty bins are left out."""
-    p, y = np.asarray(probabilities, float), np.asarray(right, float)
-    which = np.minimum((p * bins).astype(int), bins - 1)
-    count = np.bincount(which, minlength=bins)
-    held = count > 0
-    mean = [np.bincount(which, v, bins)[held] / count[held] for v in (p, y)]
-    error = float((count[held] * abs(mean[0] - mean[1])).sum() / len(p)) if len(p) else float("nan")
-    return Calibration(mean[0], mean[1], count[held], error)
+def hit_buildings(rows: Sequence[Row], count: str) -> tuple[int, int, float, float]:
+    """Buildings with a row that has any of a count, all buildings, and the ends of the exact 95 % interval of their share: for
+    what is rare, as wrong merges are."""
+    buildings = {r["building"] for r in rows}
+    hit = {r["building"] for r in rows if r[count]}
+    return len(hit), len(buildings), *exact_interval(len(hit), len(buildings))

@@ -21,6 +21,8 @@ from topomerge.errors import InputError
 from topomerge.evaluation.describe import Inputs, Maps, described, trained
 from topomerge.evaluation.settings import Evaluation, Variant, variants
 from topomerge.fusion.merge import merge
+from topomerge.fusion.registration import Registration, register
+from topomerge.fusion.result import RoomMatch
 from topomerge.fusion.verify import model
 from topomerge.io import archive
 from topomerge.io.listing import plain
@@ -28,6 +30,7 @@ from topomerge.matching.costs import descriptor_costs
 from topomerge.matching.match import match
 from topomerge.types import Array
 
+WALLS_ALONE = "walls alone"  # way of merging
 CODE = tuple(f"topomerge.{name}" for name in ("embedding.embedders", "matching.costs", "matching.match", "fusion.merge"))
 
 
@@ -54,8 +57,9 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
                 f"{v.name}/{method}/{key}": value
                 for key, value in matched(v, method, maps, (a, b), pair.about["scale_free"]).items()
             }
+    record["merge"] = {WALLS_ALONE: by_walls_alone(maps, pair)} if settings.merge and settings.walls_alone else {}
     mergers = [v for v in evaluated_variants if merges(v, settings)]
-    record["merge"] = {v.name: merged(maps, rows[v.name][0], pair, settings.poses) for v in mergers}
+    record["merge"] |= {v.name: merged(maps, rows[v.name][0], pair, settings.poses) for v in mergers}
     arrays["told"] = np.frombuffer(json.dumps(plain(record)).encode(), np.uint8)
     archive.write(arrays, target)
     return pair.name
@@ -103,30 +107,35 @@ def mutual(learned: Any, maps: Maps) -> tuple[Array, Array]:
 
 def merged(maps: Maps, rows: tuple[Array, Array], pair: EvaluationPair, poses: str) -> dict[str, Any]:
     """What the merge of both maps says: as plain values."""
-    scale = "free" if pair.about["scale_free"] else "fixed"
     began = time.process_time()
     try:
-        result = merge(maps, scale=scale, embedder=given(maps, rows), poses=poses)
+        result = merge(maps, scale=_scale(pair), embedder=given(maps, rows), poses=poses)
     except InputError as error:
-        return {
-            "refused": str(error),
-            "probability": 0.0,
-            "believed": False,
-            "pose": None,
-            "rooms": [],
-            "chance": [],
-            "seconds": 0.0,
-        }
-    registration = result.registration
-    pose = None if registration is None or registration.transform is None else registration.transform.matrix.tolist()
+        return {"refused": str(error), **_verdict(None, False, (), 0.0)}
+    return _verdict(result.registration, result.merged, result.matches, time.process_time() - began)
+
+
+def by_walls_alone(maps: Maps, pair: EvaluationPair) -> dict[str, Any]:
+    """The same without the rooms: registration of walls and free space, to which no descriptor proposes a pose."""
+    began = time.process_time()
+    registration = register(*maps, scale=_scale(pair))
+    return _verdict(registration, registration.accepted, (), time.process_time() - began)
+
+
+def _scale(pair: EvaluationPair) -> str:
+    return "free" if pair.about["scale_free"] else "fixed"
+
+
+def _verdict(registration: Registration | None, believed: bool, matches: Sequence[RoomMatch], seconds: float) -> dict[str, Any]:
+    transform = None if registration is None else registration.transform
     return {
-        "probability": float(result.probability),
-        "believed": result.merged,
+        "probability": float(registration.probability) if registration else 0.0,
+        "believed": believed,
         "threshold": float(model()["threshold"]),
-        "pose": pose,
-        "rooms": [list(m.rooms) for m in result.matches],
-        "chance": [m.probability for m in result.matches],
-        "seconds": time.process_time() - began,
+        "pose": None if transform is None else transform.matrix.tolist(),
+        "rooms": [list(m.rooms) for m in matches],
+        "chance": [m.probability for m in matches],
+        "seconds": seconds,
     }
 
 

@@ -14,7 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair
+from topomerge.datasets.core.physical import physical_building
+from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair, sim3_of
+from topomerge.datasets.real.captures import captures
+from topomerge.datasets.real.sources import REAL_SOURCES
+from topomerge.evaluation.room_errors import ROOM_NEAR, displacements, floors_of_rooms
 from topomerge.evaluation.settings import Evaluation, variants
 from topomerge.io import archive
 from topomerge.metrics import pose_right
@@ -51,23 +55,36 @@ def score_all(pairs: Sequence[Path], predictions: Sequence[Path], settings: Eval
                 seconds = float(data[f"{v.name}/{method}/seconds"])
                 row = {**head, "method": method, "seconds": seconds, **match_counts(pair, rooms)}
                 matches.append({**row, "chance": chance.tolist(), "good": right_matches(pair, rooms).tolist()})
-        merges += [{**about, "variant": name, **merge_counts(pair, verdict)} for name, verdict in record["merge"].items()]
+        if record["merge"]:
+            floors = floors_of_rooms(pair.maps()[1], shared_rooms(pair).values())
+            merges += [{**about, "variant": n, **merge_counts(pair, verdict, floors)} for n, verdict in record["merge"].items()]
     return matches, ranks, merges
 
 
 def group_of(pair: EvaluationPair, settings: Evaluation) -> Row:
-    """What a pair is counted under."""
+    """What a pair is counted under.
+
+    `building` is the physical one; the maps are `independent` where they come from two captures.
+    """
     about = pair.about
     source, common, kind = about["source"], float(about["common"]), about["kind"]
+    real = source in REAL_SOURCES
+    origins = captures(source, about["title"]) if real else (f"{pair.name}a", f"{pair.name}b")
     size = next(name for name, limit in AREAS if common < limit) if kind == "overlap" and common >= 1 else "none"
     change = about.get("change") or ("", 0.0)
     change = ("", 0.0) if change[0] == "plan" else change  # another sensor, no curve
     return {
         "pair": pair.name,
-        "building": f"{source}/{about['building']}",
+        "title": about["title"] if real else pair.name,
+        "building": physical_building(source, about["building"]),
+        "capture_a": origins[0],
+        "capture_b": origins[1],
+        "independent": origins[0] != origins[1],
         "source": source,
+        "origin": "real maps" if real else "procedural" if source == "procedural" else "real plans",
         "seen": "trained" if source in settings.data.trained else "unseen",
         "sensors": "-".join(sorted(about["sensors"])),
+        "modality": modality(about["sensors"]),
         "kind": kind,
         "overlap": overlap_bin(float(about["overlap"]), kind),
         "common": common,
@@ -77,6 +94,13 @@ def group_of(pair: EvaluationPair, settings: Evaluation) -> Row:
         "change": change[0],
         "value": float(change[1]),
     }
+
+
+def modality(sensors: Sequence[str]) -> str:
+    """The kind of a pair by what its maps show: two scans in 3D, one with a slice, or one with a floor plan."""
+    if "drawing" in sensors:
+        return "with a floor plan"
+    return "with a slice" if any(s in SLICED_SENSORS for s in sensors) else "3D scans"
 
 
 def overlap_bin(share: float, kind: str = "overlap") -> str:
@@ -100,7 +124,7 @@ def match_counts(pair: EvaluationPair, rooms: Array) -> Row:
     good = right_matches(pair, rooms)
     i, j = rooms.T if len(rooms) else (np.zeros(0, int), np.zeros(0, int))
     twin = pair.twin[0][i] | pair.twin[1][j]
-    units = _units(pair)
+    units = shared_rooms(pair)
     hit = {_unit(pair, *m) for m in rooms[good].tolist()}
     of_twins = {u for u, pieces in units.items() if any(pair.twin[0][a] or pair.twin[1][b] for a, b in pieces)}
     strict = {u for u, pieces in units.items() if any(pair.one[0][a] and pair.one[1][b] for a, b in pieces)}
@@ -117,7 +141,7 @@ def _unit(pair: EvaluationPair, i: int, j: int) -> tuple[int, int]:
     return int(pair.true[0][i]), int(pair.true[1][j])
 
 
-def _units(pair: EvaluationPair) -> dict[tuple[int, int], list[tuple[int, int]]]:
+def shared_rooms(pair: EvaluationPair) -> dict[tuple[int, int], list[tuple[int, int]]]:
     """True rooms that both maps have -> matches of their pieces."""
     out: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j in pair.matches.tolist():
@@ -188,22 +212,27 @@ def within(error: tuple[float, float, float], flat: bool, limits: tuple[float, f
     return pose_right(error, flat, limits)
 
 
-def merge_counts(pair: EvaluationPair, verdict: Mapping[str, Any]) -> Row:
-    """`near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed and
-    near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common."""
+def merge_counts(pair: EvaluationPair, verdict: Mapping[str, Any], floors: Sequence[Array] = ()) -> Row:
+    """Of a pair: `near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed and
+    near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common;
+    `every_room`: it puts every shared room within 0.1 m of its true place; `rooms_near`: so many of the `rooms_shared`.
+
+    Args:
+        floors: (n, 3) points of b on the floor of each shared room.
+    """
     mergeable = pair.transform is not None and pair.about["kind"] == "overlap" and pair.about["common"] >= 1
     near = fine = False
-    error: tuple[float, float, float] | None = None
+    error = (np.nan,) * 3
+    off = np.full(len(floors) if mergeable else 0, np.inf)
     if mergeable and verdict["pose"] is not None:
-        assert pair.transform is not None
-        m = np.array(verdict["pose"])
-        pose = Sim3(float(np.arctan2(m[1, 0], m[0, 0])), tuple(m[:3, 3].tolist()), float(m[2, 2]))  # type: ignore[arg-type]
+        pose = sim3_of(np.array(verdict["pose"]))
+        assert pair.transform is not None and pose is not None
         error = pose_error(pose, pair.transform, pair.anchor)
         flat = any(s in FLAT_SENSORS for s in pair.about["sensors"])
         near, fine = within(error, flat, NEAR_POSE), within(error, flat, FINE_POSE)
+        off = displacements(pose, pair.transform, floors, flat)
     believed = bool(verdict["believed"])
     rooms = np.array(verdict["rooms"], np.int64).reshape(-1, 2)
-    counted = match_counts(pair, rooms)
     return {
         "mergeable": int(mergeable),
         "near": int(near),
@@ -213,13 +242,20 @@ def merge_counts(pair: EvaluationPair, verdict: Mapping[str, Any]) -> Row:
         "merged_fine": int(believed and fine),
         "false": int(believed and not near),
         "refused": int(near and not believed),
+        "with_rooms": int(len(off) > 0),
+        "every_room": int(len(off) > 0 and bool((off <= ROOM_NEAR).all())),
+        "rooms_shared": len(off),
+        "rooms_near": int((off <= ROOM_NEAR).sum()),
+        "farthest_room": float(off.max(initial=0.0)) if len(off) else np.nan,
         "probability": verdict["probability"],
         "seconds": verdict["seconds"],
-        "error": error,
-        **counted,
+        **dict(zip(("off", "off_above", "turned"), error, strict=True)),
+        **match_counts(pair, rooms),
+        "pose": verdict["pose"] or [],
         "chance": list(verdict["chance"]),
         "good": right_matches(pair, rooms).tolist(),
     }
 
 
 FLAT_SENSORS = ("laser2d", "drawing")  # sensors whose maps have no height
+SLICED_SENSORS = ("laser2d", "phone")  # whose maps are of one height, or were drawn from above

@@ -18,8 +18,11 @@ from topomerge.fusion.inputs import POSE_SOURCES
 from topomerge.io.listing import plain
 
 EVALUATED_METHODS = ("full", "assignment", "growing", "consistent", "mutual")
-TABLES = ("ranking", "matching", "merging", "overlap", "area", "sensors", "source", "seen")
-PREDICTIONS_FORMAT = 1  # raised when predictions on disk change what they hold
+TABLES = (
+    *("ranking", "matching", "merging", "decides", "sites", "independence", "reliability"),
+    *("overlap", "area", "sensors", "modality", "source", "seen"),
+)
+PREDICTIONS_FORMAT = 2  # raised when predictions on disk change what they hold
 
 
 @dataclass
@@ -53,6 +56,7 @@ class Evaluation:
             likeliest, by the probabilities of a trained embedder).
         slow_k: "consistent" is run for these k only.
         merge: merge the maps, too, with each of the `mergers` among the descriptors, at k = 0, and each run.
+        walls_alone: and by registration of walls and free space alone, without descriptors of rooms.
         poses: of the merges: "search", or "rooms" (of matched rooms alone, as the thesis fuses).
         baseline: variant that the others are compared with.
         titles: call runs by what they are made of and not by their folders: "scalars, gat, infonce".
@@ -77,11 +81,12 @@ class Evaluation:
     methods: list[str] = field(default_factory=lambda: ["full", "assignment", "growing", "consistent"])
     slow_k: list[int] = field(default_factory=lambda: [0])
     merge: bool = True
+    walls_alone: bool = True
     mergers: list[str] = field(default_factory=lambda: ["engineered"])
     poses: str = "search"
     baseline: str = "engineered"
     titles: bool = False
-    tables: list[str] = field(default_factory=lambda: ["ranking", "matching", "seen", "merging"])
+    tables: list[str] = field(default_factory=lambda: ["ranking", "matching", "seen", "merging", "decides"])
     rounds: int = 2000
     write: str = ""
     section: str = "evaluation"
@@ -174,7 +179,7 @@ def folder_of(settings: Evaluation) -> Path:
 
 def prediction_settings(settings: Evaluation) -> dict[str, Any]:
     """What the predictions depend on, as plain values; the weights of runs as a digest."""
-    keys = ("data", "limit", "descriptors", "k", "context", "methods", "slow_k", "merge", "mergers")
+    keys = ("data", "limit", "descriptors", "k", "context", "methods", "slow_k", "merge", "walls_alone", "mergers")
     options = {k: v for k, v in asdict(settings).items() if k in keys}
     options["data"].pop("trained")
     options["data"].pop("folder")

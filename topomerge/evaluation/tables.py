@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from topomerge.evaluation.groups import Value, calibration, gain, value
+from topomerge.evaluation.groups import Value, gain, value
 from topomerge.evaluation.score import Row
 from topomerge.evaluation.settings import Evaluation
 from topomerge.io.atomic import replacing
@@ -19,20 +19,22 @@ BY = {
     "overlap": "Share of rooms in common, or kind of hard negative",
     "area": "m² that both maps saw",
     "sensors": "Sensors",
+    "modality": "Kind of maps",
     "source": "Source",
     "seen": "Sources that trained something, and those that did not",
 }
 RANKING = ("recall@1", "recall@1_single", "recall@1_twin", "recall@1_whole", "recall@5", "MRR")
 AFTER = ("recall@1_after", "recall@1_single_after", "recall@5_after")
 MATCHING = ("precision", "recall", "F1", "F1_single", "F1_twin", "strict recall")
-MERGING = ("right poses", "merged", "merged finely", "refused")
+MERGING = ("right poses", "right finely", "every room", "rooms", "merged", "merged finely", "refused")
 METRIC_NAMES = {
     "recall@1": "recall@1", "recall@1_single": "without twin", "recall@1_twin": "with twin",
     "recall@1_whole": "entered", "recall@5": "recall@5", "MRR": "MRR",
     "recall@1_after": "after consensus: recall@1", "recall@1_single_after": "without twin", "recall@5_after": "recall@5",
     "precision": "precision", "recall": "recall", "F1": "F1", "F1_single": "F1 without twin", "F1_twin": "F1 with twin",
     "strict recall": "recall one to one", "right poses": "best pose right", "merged": "merged right", "refused": "right, refused",
-    "merged finely": "within 0.1 m, 1°",
+    "right finely": "within 0.1 m, 1°", "every room": "every room within 0.1 m", "rooms": "of the rooms",
+    "merged finely": "and within 0.1 m, 1°",
 }  # fmt: skip
 
 
@@ -74,10 +76,14 @@ def _escaped(text: str) -> str:
 
 
 def cell(v: Value, interval: bool = True) -> str:
-    """0.52 [0.47, 0.58]; – where nothing was counted."""
+    """0.52 [0.47, 0.58], or of fewer than eight buildings 0.52, 0.47–0.58 (4 buildings); – where nothing was counted."""
     if not np.isfinite(v.value):
         return "–"
-    return f"{v.value:.2f}" + (f" [{v.low:.2f}, {v.high:.2f}]" if interval and v.buildings > 1 else "")
+    if not interval or v.counted < 2:
+        return f"{v.value:.2f}"
+    return f"{v.value:.2f}" + (
+        f", {v.low:.2f}–{v.high:.2f} ({v.counted} buildings)" if v.ranged else f" [{v.low:.2f}, {v.high:.2f}]"
+    )
 
 
 def by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
@@ -93,7 +99,7 @@ def ranking(ranks: Sequence[Row], settings: Evaluation) -> Table:
     """How high the true partner of a room ranks among all rooms of the other map."""
     first = [r for r in ranks if r["variant"] == settings.baseline]
     rows, after = [], AFTER if any(np.isfinite(r["first_after"]) for r in ranks) else ()
-    for name, variant_rows in _variants(ranks).items():
+    for name, variant_rows in by_variant(ranks).items():
         better = gain(variant_rows, first, "recall@1", settings.rounds) if name != settings.baseline else None
         cells = [cell(value(variant_rows, m, settings.rounds), m in ("recall@1", "recall@5")) for m in RANKING]
         took = np.median([r["seconds"] for r in variant_rows])
@@ -105,10 +111,13 @@ def ranking(ranks: Sequence[Row], settings: Evaluation) -> Table:
 
 
 def _signed(v: Value | None) -> str:
-    return "" if v is None or not np.isfinite(v.value) else f"{v.value:+.2f} [{v.low:+.2f}, {v.high:+.2f}]"
+    if v is None or not np.isfinite(v.value):
+        return ""
+    ends = f", {v.low:+.2f} to {v.high:+.2f} ({v.counted} buildings)" if v.ranged else f" [{v.low:+.2f}, {v.high:+.2f}]"
+    return f"{v.value:+.2f}{ends}"
 
 
-def _variants(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: r["variant"]) -> dict[str, list[Row]]:
+def by_variant(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: r["variant"]) -> dict[str, list[Row]]:
     out: dict[str, list[Row]] = {}
     for row in rows:
         out.setdefault(key(row), []).append(row)
@@ -118,8 +127,8 @@ def _variants(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: r["vari
 def matching(matches: Sequence[Row], settings: Evaluation) -> Table:
     """Precision, recall and F1 of each descriptor and method where maps share rooms; how many matches there are where not."""
     rows = []
-    for name, variant_rows in _variants(matches).items():
-        for method, these in _variants(variant_rows, lambda r: r["method"]).items():
+    for name, variant_rows in by_variant(matches).items():
+        for method, these in by_variant(variant_rows, lambda r: r["method"]).items():
             sharing, apart = shares(these)
             cells = [cell(value(sharing, m, settings.rounds), m == "F1") for m in MATCHING]
             large = cell(value([r for r in these if r["large"]], "F1", settings.rounds))
@@ -134,7 +143,7 @@ def beside(matches: Sequence[Row], settings: Evaluation) -> Table:
     """Precision, recall and F1 of the methods beside each other, a line a descriptor: the thesis' table, with recall."""
     methods = list(dict.fromkeys(m["method"] for m in matches))
     rows = []
-    for name, variant_rows in _variants(shares(matches)[0]).items():
+    for name, variant_rows in by_variant(shares(matches)[0]).items():
         cells = []
         for method in methods:
             these = [r for r in variant_rows if r["method"] == method]
@@ -155,9 +164,9 @@ def grouped(ranks: Sequence[Row], matches: Sequence[Row], key: str, settings: Ev
     rows = []
     matches_by_group = by(matches, key)
     for group, group_rows in by(ranks, key).items():
-        for name, these in _variants([r for r in group_rows if r["k"] == 0]).items():
+        for name, these in by_variant([r for r in group_rows if r["k"] == 0]).items():
             sharing = shares([m for m in matches_by_group.get(group, []) if m["variant"] == name])[0]
-            matches_by_method = _variants(sharing, lambda r: r["method"])
+            matches_by_method = by_variant(sharing, lambda r: r["method"])
             cells = [cell(value(matches_by_method.get(m, []), "F1", settings.rounds)) for m in _methods(matches)]
             pairs = value(these, "recall@1", settings.rounds)
             rows.append([group, str(pairs.pairs), str(pairs.buildings), name, cell(pairs), *cells])
@@ -169,55 +178,12 @@ def _methods(matches: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(m["method"] for m in matches if m["k"] == 0))
 
 
-def merging(merges: Sequence[Row], key: str, settings: Evaluation) -> Table:
-    """Share of pairs merged right, refused and merged wrongly, by group."""
-    rows = []
-    for name, variant_rows in _variants(merges).items():
-        groups = {"all": variant_rows, **(by(variant_rows, key) if key else {})}
-        if key == "area":
-            groups["≥ 80"] = [r for r in variant_rows if r["large"]]
-        for group, these in groups.items():
-            pairs, able = len({r["pair"] for r in these}), sum(r["mergeable"] for r in these)
-            cells = [cell(value(these, m, settings.rounds), m == "merged") for m in MERGING]
-            false, took = sum(r["false"] for r in these), np.median([r["seconds"] for r in these] or [0.0])
-            rows.append([name, group, str(pairs), str(able), *cells, str(false), f"{took:.1f}"])
-    head = ["descriptor", key or "pairs", "pairs", "mergeable", *(METRIC_NAMES[m] for m in MERGING), "merged wrong", "s a pair"]
-    title = "Merges: of the pairs that have something in common, within 0.5 m and 5°"
-    return Table(title + (f", by {BY[key][0].lower()}{BY[key][1:]}" if key else ""), head, rows, 2)
-
-
-def reliability(matches: Sequence[Row], merges: Sequence[Row]) -> Table:
-    """How far predicted probabilities are from what came true."""
-    rows = []
-    for name, method_rows in _variants(matches, lambda r: f"{r['variant']} {r['method']}").items():
-        if method_rows[0]["k"] == 0 and method_rows[0]["method"] in ("consistent", "mutual"):
-            rows.append(_calibrated(f"match, {name}", *_of_matches(method_rows)))
-    for name, variant_rows in _variants(merges).items():
-        near = [bool(r["near"]) for r in variant_rows]
-        rows.append(_calibrated(f"merge, {name}", [r["probability"] for r in variant_rows], near))
-        rows.append(_calibrated(f"match of believed merges, {name}", *_of_matches(variant_rows)))
-    head = ["probability of", "number", "told, mean", "right", "expected calibration error"]
-    return Table("Calibration", head, [r for r in rows if r])
-
-
-def _of_matches(rows: Sequence[Row]) -> tuple[list[float], list[bool]]:
-    """Probability of each match of rows, and whether it is right."""
-    return [p for r in rows for p in r["chance"]], [g for r in rows for g in r["good"]]
-
-
-def _calibrated(what: str, probabilities: Sequence[float], right: Sequence[bool]) -> list[str]:
-    if not len(probabilities):
-        return []
-    error = calibration(probabilities, right).error
-    return [what, str(len(probabilities)), f"{np.mean(probabilities):.2f}", f"{np.mean(right):.2f}", f"{error:.3f}"]
-
-
 def curves(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[Row], settings: Evaluation) -> Table:
     """recall@1, F1 and merges against what was changed."""
     rows = []
     for change, changed in by([m for m in matches if m["change"]], "change").items():
         for v in sorted({m["value"] for m in changed}):
-            for name in _variants([m for m in changed if m["k"] == 0]):
+            for name in by_variant([m for m in changed if m["k"] == 0]):
                 these = [m for m in changed if m["value"] == v and m["variant"] == name]
                 cells = [cell(value([m for m in these if m["method"] == k], "F1", settings.rounds)) for k in _methods(matches)]
                 there = [r for r in ranks if (r["change"], r["value"], r["variant"]) == (change, v, name)]

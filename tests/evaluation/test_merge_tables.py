@@ -1,0 +1,92 @@
+"""Tables of merges of a handful of pairs, cell by cell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from topomerge.evaluation.merge_tables import chosen, decides, independence, merging, reliability, sites
+from topomerge.evaluation.settings import Evaluation
+from topomerge.types import Sim3
+
+SETTINGS = Evaluation(rounds=50)
+
+
+def merge_row(pair: str, site: str, captures: tuple[str, str] = ("1", "2"), **changes: Any) -> dict[str, Any]:
+    """A row of a pair that is merged right, to a decimetre, in every one of its two rooms."""
+    row = {
+        "pair": pair, "variant": "walls alone", "building": site, "capture_a": captures[0], "capture_b": captures[1],
+        "independent": captures[0] != captures[1], "origin": "real maps", "large": True, "area": ">200", "mergeable": 1,
+        "near": 1, "fine": 1, "believed": 1, "merged": 1, "merged_fine": 1, "false": 0, "refused": 0, "with_rooms": 1,
+        "every_room": 1, "rooms_shared": 2, "rooms_near": 2, "probability": 0.9, "seconds": 1.0, "chance": [], "good": [],
+        "pose": Sim3(0.2, (1.0, 2.0, 0.0)).matrix.tolist(),
+    }  # fmt: skip
+    return row | changes
+
+
+REFUSED = {"believed": 0, "merged": 0, "merged_fine": 0, "refused": 1, "probability": 0.4}
+WRONG = {"near": 0, "fine": 0, "merged": 0, "merged_fine": 0, "false": 1, "every_room": 0, "rooms_near": 0}
+ROWS = [
+    merge_row("p", "flat", ("walk 1", "walk 2")),
+    merge_row("q", "flat", ("walk 1", "drawing"), fine=0, merged_fine=0, every_room=0, rooms_near=1),
+    merge_row("r", "hall", ("log", "log"), **REFUSED),
+    merge_row("s", "hall", ("log", "other log"), **WRONG),
+]
+
+
+def test_sites_in_numbers_of_pairs() -> None:
+    table = sites(ROWS)
+    assert table.head[:4] == ["site", "the maps of a pair are", "captures", "pairs"]
+    assert [list(row) for row in table.rows] == [
+        ["flat", "two captures", "3", "2", "2", "1", "1", "2", "0", "0"],
+        ["hall", "two captures", "2", "1", "0", "0", "0", "0", "1", "0"],
+        ["hall", "parts or copies of one", "1", "1", "1", "1", "1", "0", "0", "1"],
+    ]
+
+
+def test_independence_over_sites() -> None:
+    table = independence(ROWS, SETTINGS)
+    cells = {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}
+    independent = cells["two captures"]
+    assert (independent["pairs"], independent["sites"]) == ("3", "2")
+    assert independent["merged right"] == "0.67, 0.00–1.00 (2 buildings)" and independent["merged, mean of the sites"] == "0.50"
+    assert (independent["sites with a merge"], independent["with all merged"]) == ("1 of 2", "1 of 2")
+    assert independent["merged wrong"] == "1; 1 of 2 buildings [1.3, 98.7] %"
+    assert independent["of the rooms"] == "0.50"  # 2 + 1 + 0 of 6
+    assert cells["parts or copies of one"]["merged right"] == "0.00" and cells["all"]["pairs"] == "4"
+
+
+def test_what_decides() -> None:
+    moved = Sim3(0.2, (1.02, 2.0, 0.0)).matrix.tolist()
+    learned = [{**r, "variant": "learned"} for r in ROWS]
+    learned[0]["pose"] = moved
+    learned[2] |= {"believed": 1, "merged": 1, "refused": 0}
+    table = decides([*ROWS, *learned])
+    assert table.head[-2:] == ["verdict of walls alone", "pose of walls alone"]
+    assert table.rows[0] == ["walls alone", "4", "3", "2", "1", "4", "4"]
+    assert table.rows[1] == ["learned", "4", "3", "3", "1", "3", "3"]
+    assert {r["variant"] for r in chosen([*ROWS, *learned])} == {"learned"} and chosen([]) == []
+
+
+def test_ways_that_merge_alike_share_their_rows() -> None:
+    alike = [{**r, "variant": "learned", "seconds": 3.0} for r in ROWS]
+    other = [{**r, "variant": "shape", **REFUSED} for r in ROWS]
+    table = merging([*ROWS, *alike, *other], "", SETTINGS)
+    assert [row[0] for row in table.rows] == ["walls alone = learned", "shape"]
+    assert table.rows[0][-1] == "3.0"
+
+
+def test_calibration_by_origin() -> None:
+    plans = [{**r, "origin": "procedural", "probability": p} for r in ROWS for p in (0.0, 0.75)]
+    table = reliability([], [*ROWS, *plans])
+    rows = {row[1]: row[2:] for row in table.rows}
+    assert list(rows) == ["procedural", "real maps"]
+    assert rows["real maps"][:4] == ["4", "0.78", "0.75", "0.325"]  # .9 against 2 of 3, .4 against 1 of 1
+    assert rows["procedural"][:4] == ["8", "0.38", "0.75", "0.375"]
+    assert rows["procedural"][5:9] == ["4", "0.75", "0.75", "0.000"]
+
+
+@pytest.mark.parametrize("table", [sites([]), decides([]), reliability([], []), merging([], "", SETTINGS)])
+def test_no_merge_at_all(table: Any) -> None:
+    assert table.rows == []

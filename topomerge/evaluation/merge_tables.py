@@ -1,0 +1,164 @@
+"""Tables of merges: by group, by site, what decides them, and how far their probabilities can be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from topomerge.evaluation.groups import hit_buildings, value
+from topomerge.evaluation.score import Row
+from topomerge.evaluation.settings import Evaluation
+from topomerge.evaluation.tables import BY, MERGING, METRIC_NAMES, Table, by, by_variant, cell
+from topomerge.statistics import Calibration, calibration
+
+ORIGINS = ("procedural", "real plans", "real maps")  # of the places that maps are of
+SAME_PLACE, SAME_TURN = 0.001, 0.01  # m, degrees: poses that differ by less are one
+Predictions = Callable[[Sequence[Row]], tuple[list[float], list[bool]]]  # probabilities of rows, and what came true
+INDEPENDENCE = {True: "two captures", False: "parts or copies of one"}
+
+
+def merging(merges: Sequence[Row], key: str, settings: Evaluation) -> Table:
+    """Share of pairs merged right, refused and merged wrongly, by group."""
+    rows = []
+    for name, variant_rows in _distinct(merges).items():
+        groups = {"all": variant_rows, **(by(variant_rows, key) if key else {})}
+        if key == "area":
+            groups["≥ 80"] = [r for r in variant_rows if r["large"]]
+        for group, these in groups.items():
+            pairs, able = len({r["pair"] for r in these}), sum(r["mergeable"] for r in these)
+            cells = [cell(value(these, m, settings.rounds), m in ("every room", "merged")) for m in MERGING]
+            took = np.median([r["seconds"] for r in these] or [0.0])
+            rows.append([name, group, str(pairs), str(able), *cells, _wrong(these), f"{took:.1f}"])
+    head = ["merged by", key or "pairs", "pairs", "mergeable", *(METRIC_NAMES[m] for m in MERGING), "merged wrong", "s a pair"]
+    title = "Merges: of the pairs that have something in common, within 0.5 m and 5° but where another measure is named"
+    return Table(title + (f", by {BY[key][0].lower()}{BY[key][1:]}" if key else ""), head, rows, 2)
+
+
+def _distinct(merges: Sequence[Row]) -> dict[str, list[Row]]:
+    """Rows by way of merging; ways whose merges come out alike are one, with the seconds of the last of them."""
+    names: dict[object, list[str]] = {}
+    rows: dict[object, list[Row]] = {}
+    for name, these in by_variant(merges).items():
+        outcome = tuple(sorted((r["pair"], r["believed"], r["near"], r["fine"], r["every_room"], r["rooms_near"]) for r in these))
+        names.setdefault(outcome, []).append(name)
+        rows[outcome] = these
+    return {" = ".join(names[outcome]): these for outcome, these in rows.items()}
+
+
+def _wrong(rows: Sequence[Row]) -> str:
+    """Merges that are wrong, and in how many buildings, with the exact interval in per cent."""
+    hit, buildings, low, high = hit_buildings(rows, "false")
+    count = str(sum(r["false"] for r in rows))
+    return f"{count}; {hit} of {buildings} buildings [{100 * low:.1f}, {100 * high:.1f}] %" if buildings > 1 else count
+
+
+def sites(merges: Sequence[Row]) -> Table:
+    """Real pairs by physical building, in numbers of pairs."""
+    rows = []
+    for site, these in by(merges, "building").items():
+        for independent, title in INDEPENDENCE.items():
+            some = [r for r in these if r["independent"] == independent]
+            if some:
+                counts = (sum(r[k] for r in some) for k in ("near", "fine", "every_room", "merged", "false", "refused"))
+                names = {r[k] for r in some for k in ("capture_a", "capture_b")}
+                rows.append([site, title, str(len(names)), str(len(some)), *map(str, counts)])
+    head = ["site", "the maps of a pair are", "captures", "pairs", *NUMBERS]
+    return Table("Real pairs by site, in pairs: right within 0.5 m and 5°", head, rows, 2)
+
+
+NUMBERS = (
+    "right",
+    "within 0.1 m, 1°",
+    "every room within 0.1 m",
+    "believed and right",
+    "believed and wrong",
+    "right and refused",
+)
+
+
+def independence(merges: Sequence[Row], settings: Evaluation) -> Table:
+    """The same over sites: independent pairs apart from those of one capture."""
+    groups = {title: [r for r in merges if r["independent"] == so] for so, title in INDEPENDENCE.items()}
+    rows = []
+    for title, these in {**groups, "all": merges}.items():
+        if these:
+            cells = [cell(value(these, m, settings.rounds), m in ("right poses", "merged")) for m in MERGING]
+            by_site = [np.mean([r["merged"] for r in some]) for some in by(these, "building").values()]
+            some, every = sum(s > 0 for s in by_site), sum(s == 1 for s in by_site)
+            shares = [f"{np.mean(by_site):.2f}", f"{some} of {len(by_site)}", f"{every} of {len(by_site)}"]
+            rows.append([title, str(len(these)), str(len(by_site)), *cells, *shares, _wrong(these)])
+    over = ["merged, mean of the sites", "sites with a merge", "with all merged"]
+    head = ["the maps of a pair are", "pairs", "sites", *(METRIC_NAMES[m] for m in MERGING), *over, "merged wrong"]
+    return Table("Real pairs by independence: shares of pairs, over sites", head, rows)
+
+
+def chosen(merges: Sequence[Row]) -> list[Row]:
+    """Rows of the last way of merging: that with the trained descriptor, where there is one."""
+    last = merges[-1]["variant"] if merges else ""
+    return [r for r in merges if r["variant"] == last]
+
+
+def decides(merges: Sequence[Row]) -> Table:
+    """Verdicts and poses beside those of the first way of merging, on the same pairs."""
+    ways = by_variant(merges)
+    first = {r["pair"]: r for r in next(iter(ways.values()), [])}
+    rows = []
+    for name, these in ways.items():
+        same = [_same(r, first[r["pair"]]) for r in these if r["pair"] in first]
+        alike = [sum(column) for column in zip(*same, strict=True)] if same else [0, 0]
+        counts = [sum(r[k] for r in these) for k in ("near", "merged", "false")]
+        rows.append([name, str(len(these)), *map(str, (*counts, *alike))])
+    beside = next(iter(ways), "")
+    head = ["merged by", "pairs", "best pose right", "merged right", "merged wrong", f"verdict of {beside}", f"pose of {beside}"]
+    return Table("What decides: the same pairs, merged with and without descriptors of rooms", head, rows)
+
+
+def _same(row: Row, other: Row) -> tuple[bool, bool]:
+    """Are verdict and pose the same?"""
+    if not row["pose"] or not other["pose"]:
+        return row["believed"] == other["believed"], row["pose"] == other["pose"]
+    a, b = np.array(row["pose"]), np.array(other["pose"])
+    turn = np.degrees(np.arctan2(a[1, 0], a[0, 0]) - np.arctan2(b[1, 0], b[0, 0]))
+    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < SAME_PLACE and abs((turn + 180) % 360 - 180) < SAME_TURN
+    return row["believed"] == other["believed"], bool(near)
+
+
+def reliability(matches: Sequence[Row], merges: Sequence[Row]) -> Table:
+    """How far predicted probabilities are from what came true, by where the maps come from."""
+    rows = []
+    for name, method_rows in by_variant(matches, lambda r: f"{r['variant']} {r['method']}").items():
+        if method_rows[0]["k"] == 0 and method_rows[0]["method"] in ("consistent", "mutual"):
+            rows += _calibrated(f"match, {name}", method_rows, _of_matches)
+    for name, variant_rows in by_variant(merges).items():
+        rows += _calibrated(f"merge, {name}", variant_rows, _of_merges)
+        rows += _calibrated(f"match of believed merges, {name}", variant_rows, _of_matches)
+    more = ("by chance", "number from 0.1 on", "predicted", "right", "error", "by chance")
+    head = ["probability of", "maps from", "number", "predicted, mean", "right", "expected calibration error", *more]
+    return Table("Calibration, over ten bins of equal mass; and of the probabilities from 0.1 on alone", head, rows, 2)
+
+
+def _of_matches(rows: Sequence[Row]) -> tuple[list[float], list[bool]]:
+    """Probability of each match of rows, and whether it is right."""
+    return [p for r in rows for p in r["chance"]], [g for r in rows for g in r["good"]]
+
+
+def _of_merges(rows: Sequence[Row]) -> tuple[list[float], list[bool]]:
+    """Probability of each merge, and whether its pose is right."""
+    return [r["probability"] for r in rows], [bool(r["near"]) for r in rows]
+
+
+def _calibrated(what: str, rows: Sequence[Row], of: Predictions) -> Iterator[list[str]]:
+    """A line for each origin that there are any of."""
+    for origin in ORIGINS:
+        p, right = of([r for r in rows if r["origin"] == origin])
+        if len(p):
+            all_bins = calibration(p, right)
+            yield [what, origin, *_bins(all_bins), *(_bins(all_bins.above) if all_bins.above else ["0", *["–"] * 4])]
+
+
+def _bins(c: Calibration) -> list[str]:
+    """Number, mean probability, share that is right, expected calibration error and what chance makes of it."""
+    number = int(c.count.sum())
+    means = (float((x * c.count).sum() / number) for x in (c.probability, c.right))
+    return [str(number), *(f"{m:.2f}" for m in means), f"{c.error:.3f}", f"{c.by_chance:.3f}"]
