@@ -134,6 +134,10 @@ def test_a_merge_in_rooms() -> None:
     moved = merge_counts(hand_made_pair(), verdict(Sim3(0.3, (1.3, 2.0, 0.0)), True), [near, far])
     assert (moved["every_room"], moved["rooms_near"]) == (0, 0) and moved["farthest_room"] == pytest.approx(0.3)
     assert merge_counts(hand_made_pair(), verdict(turned, True), [near])["every_room"] == 1
+    about = {**hand_made_pair().about, "sensors": ["laser2d", "tls"]}
+    for storey, right in ((0.4, 1), (3.0, 0)):  # a slice tells no height within its storey
+        raised = merge_counts(hand_made_pair(about=about), verdict(Sim3(0.3, (1.0, 2.0, storey)), True), [near])
+        assert (raised["near"], raised["every_room"], raised["false"]) == (right, right, 1 - right)
     none = merge_counts(hand_made_pair(), verdict(None, False), [near, far])
     assert (none["with_rooms"], none["every_room"], none["rooms_near"]) == (1, 0, 0)
     assert merge_counts(hand_made_pair(), verdict(turned, True))["with_rooms"] == 0

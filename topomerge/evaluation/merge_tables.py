@@ -126,7 +126,7 @@ def _same(row: Row, other: Row) -> tuple[bool, bool]:
 
 def reliability(matches: Sequence[Row], merges: Sequence[Row]) -> Table:
     """How far predicted probabilities are from what came true, by where the maps come from."""
-    rows = []
+    rows: list[list[str]] = []
     for name, method_rows in by_variant(matches, lambda r: f"{r['variant']} {r['method']}").items():
         if method_rows[0]["k"] == 0 and method_rows[0]["method"] in ("consistent", "mutual"):
             rows += _calibrated(f"match, {name}", method_rows, _of_matches)

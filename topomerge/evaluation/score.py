@@ -21,7 +21,7 @@ from topomerge.datasets.real.sources import REAL_SOURCES
 from topomerge.evaluation.room_errors import ROOM_NEAR, displacements, floors_of_rooms
 from topomerge.evaluation.settings import Evaluation, variants
 from topomerge.io import archive
-from topomerge.metrics import pose_right
+from topomerge.metrics import on_storey, pose_right
 from topomerge.types import Array, Sim3
 
 Row = dict[str, Any]
@@ -230,7 +230,7 @@ def merge_counts(pair: EvaluationPair, verdict: Mapping[str, Any], floors: Seque
         error = pose_error(pose, pair.transform, pair.anchor)
         flat = any(s in FLAT_SENSORS for s in pair.about["sensors"])
         near, fine = within(error, flat, NEAR_POSE), within(error, flat, FINE_POSE)
-        off = displacements(pose, pair.transform, floors, flat)
+        off = displacements(pose, pair.transform, floors, flat and on_storey(error[1]))
     believed = bool(verdict["believed"])
     rooms = np.array(verdict["rooms"], np.int64).reshape(-1, 2)
     return {
