@@ -40,7 +40,7 @@ def test_two_rooms_and_a_door(noise, ceiling):
     np.testing.assert_allclose(result.rooms["lo"].min(axis=0), (-0.2, -0.2, 0), atol=0.15)
     (door,) = doors_between(result, left, right)
     np.testing.assert_allclose(door["centre"], (4, 2, 0), atol=0.15)
-    assert door["width"] == pytest.approx(scenes.DOOR[0], abs=0.25)
+    assert scenes.DOOR[0] - 0.2 <= door["width"] <= scenes.DOOR[0]  # the cells of both jambs are not free
     assert door["height"] == pytest.approx(scenes.DOOR[1], abs=0.2)
     assert min(door["direction"], np.pi - door["direction"]) < 0.1
     assert door["kind"] == "door"

@@ -31,3 +31,43 @@ def test_align_is_exact():
     true = Sim3(2.5, (3.0, -1.0, 0.5), 1.4)
     found, error = align(true.apply(points), points, scale=True)
     assert np.allclose(found.matrix, true.matrix) and error < 1e-9
+
+
+def test_a_part_grows_into_its_rooms_of_the_whole():
+    """Of five rooms the other map has three, in another order; costs tell them, the corridor leads from one to the next."""
+    whole, part = building(2), building(1)
+    order = (4, 1, 0)  # rooms 0, 1 and the corridor of the whole are rooms 2, 1 and 0 of the part
+    rooms, edges = whole.rooms[list(order)], part.edges.copy()
+    edges["rooms"] = np.array([2, 1, 0])[part.edges["rooms"]]
+    part = replace(part, rooms=rooms, edges=edges, room=_renamed(part.room), navigable_room=_renamed(part.navigable_room))
+    cost = np.full((5, 3), 1.0)
+    for j, i in enumerate(order):
+        cost[i, j] = 0.1
+    assert grow(whole, part, cost, c_max=0.5) == [((0, 2), (1, 1), (4, 0))]
+    assert grow(part, whole, cost.T, c_max=0.5) == [((0, 4), (1, 1), (2, 0))]
+
+
+def _renamed(room: np.ndarray) -> np.ndarray:
+    return np.where(room >= 0, 2 - room, -1).astype(np.int32)
+
+
+def test_the_largest_hypothesis_comes_first_and_of_equal_ones_the_cheapest():
+    a = building(2)
+    cost = np.full((5, 5), 1.0)
+    np.fill_diagonal(cost, (0.3, 0.2, 0.9, 0.8, 0.1))  # rooms 2 and 3 are too dear but as seeds
+    rest = ((0, 0), (1, 1), (4, 4))
+    assert grow(a, replace(a), cost, c_max=0.5) == [(*rest[:2], (3, 3), rest[2]), (*rest[:2], (2, 2), rest[2]), rest]
+    alone = grow(a, replace(a), np.diag([0.4, 0.2, 0.3, 0.1, 0.05]) + 1 - np.eye(5), c_max=0.01)
+    assert alone == [((4, 4),), ((3, 3),), ((1, 1),), ((2, 2),), ((0, 0),)]
+
+
+def test_weights_of_an_alignment():
+    """A point of no weight changes nothing; the error is the weighted root mean square of what is left."""
+    points = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [7, 7, 7]])
+    true = Sim3(-1.0, (2.0, 5.0, 1.0))
+    to = true.apply(points)
+    to[3] += 9.0
+    pose, error = align(to, points, weight=np.array([1.0, 1.0, 1.0, 0.0]))
+    assert np.allclose(pose.matrix, true.matrix) and error < 1e-9
+    level, off = align(np.array([[0.0, 0, 1], [0, 0, 5]]), np.zeros((2, 3)), weight=np.array([3.0, 1.0]))
+    assert level.yaw == 0 and level.translation == (0.0, 0.0, 2.0) and np.isclose(off, np.sqrt(0.75 * 1 + 0.25 * 9))

@@ -11,7 +11,10 @@ from tests.embedding.test_descriptors import permuted
 from tests.matching.turned_maps import turned, uneven
 from tests.scenes_map import building
 from topomerge.errors import InputError
-from topomerge.matching.match import match
+from topomerge.matching.match import GrowingLimits, marginal, match
+from topomerge.matching.odds import match_probability
+from topomerge.matching.poses import PoseHypothesis
+from topomerge.types import Sim3
 
 
 def test_transform_and_rooms_are_found_exactly():
@@ -53,6 +56,51 @@ def test_other_methods_run(method: str):
     b, _ = turned(uneven(), (7.0, -3.0, 1.5))
     found = match(uneven(), b, method=method)
     assert len(found.rooms) and ((found.probability >= 0) & (found.probability <= 1)).all()
+
+
+def _numbered(m):
+    """Descriptors that tell rooms by their number."""
+    return 10.0 * np.arange(len(m.rooms))[:, None]
+
+
+def test_growing_gives_the_pose_of_b_in_a():
+    b, true = turned(uneven(), (7.0, -3.0, 1.5))
+    grown = match(uneven(), b, _numbered, "growing")
+    assert grown.rooms.tolist() == [[k, k] for k in range(4)]
+    places = b.rooms["centroid"]
+    assert np.allclose(grown.transform.apply(places), true.apply(places), atol=0.05)
+    assert sum(h.probability for h in grown.alternatives) == pytest.approx(1.0)
+
+
+def test_larger_hypotheses_of_growing_are_likelier_by_the_square():
+    ranked = match(
+        uneven(), turned(uneven(), (7.0, -3.0, 1.5))[0], _numbered, "growing", growing=GrowingLimits(cost=-1.0)
+    ).alternatives
+    assert [h.probability for h in ranked] == pytest.approx([0.25] * 4)  # nothing is cheap enough: each seed is alone
+
+
+def test_the_assignment_leaves_alone_what_costs_too_much():
+    b, _ = turned(uneven(), (7.0, -3.0, 1.5))
+
+    def moved(m):  # the last room of b looks 4 times as unlike its partner as the others
+        return _numbered(m) + (np.array([[1.0], [1.0], [1.0], [4.0]]) if m is b else 0.0)
+
+    assert match(uneven(), b, moved, "assignment").rooms.tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert match(uneven(), b, moved, "assignment", largest_cost=5.0).rooms.tolist() == [[k, k] for k in range(4)]
+
+
+def test_probabilities_of_matches_sum_over_hypotheses():
+    """A match that the best hypothesis lacks is taken if most of the others have it and it excludes none of the best one's."""
+    a, b = building(2), building(2)
+    sets = ([[0, 0]], [[0, 0], [1, 1], [2, 3]], [[1, 1], [0, 2]])
+    ranked = tuple(
+        PoseHypothesis(Sim3(), probability=p, rooms=np.array(r), fit=np.ones(len(r)))
+        for p, r in zip((0.4, 0.35, 0.25), sets, strict=True)
+    )
+    rooms, probability = marginal(a, b, ranked)
+    one = match_probability(a, b, np.array([[0, 0]]), np.ones(1))[0]  # alike for all: rooms of one size that fit
+    assert rooms.tolist() == [[0, 0], [1, 1]] and probability == pytest.approx([0.75 * one, 0.6 * one], rel=0.02)
+    assert marginal(a, b, ())[0].shape == (0, 2)
 
 
 def test_bad_input():

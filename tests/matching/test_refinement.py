@@ -17,7 +17,7 @@ def test_near_poses_end_as_one_and_a_wrong_height_is_left_out():
     a, b = ([PlanFields(p) for p in plans(grid)] for grid in (grid_of(points), grid_of(points, MOVE)))
     true = MOVE.inverse()
     x, y, z = true.translation
-    near = [Sim3(true.yaw + turn, (x + step, y, z)) for turn, step in ((0.01, 0.1), (-0.01, -0.1))]
+    near = [Sim3(true.yaw + turn, (x + step, y, z)) for turn, step in ((0.02, 0.25), (-0.02, -0.25))]
     moved = refine(a, b, [PoseHypothesis(pose, from_rooms=True) for pose in (*near, Sim3(true.yaw, (x, y, z + 5.0)))])
     middle = tuple(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0])
     assert len(moved) == 1 and moved[0].from_rooms and 0.5 < moved[0].score <= 1

@@ -182,7 +182,7 @@ def test_passages_measure_the_door() -> None:
     at_the_door = [p for p in passages.values() if abs(x + p.place[0] * grid.edge - 4.0) < 0.3]
     assert len(at_the_door) == 1
     values = dict(zip(DOOR_FEATURES, door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0)), strict=True))
-    assert values["width"] == pytest.approx(scenes.DOOR[0], abs=0.25)
+    assert values["width"] == pytest.approx(scenes.DOOR[0], abs=0.11)
     assert values["lintel"] == pytest.approx(scenes.HEIGHT - scenes.DOOR[1], abs=0.15) and values["lintel_cover"] > 0.8
     assert values["jamb"] > 0.8 and values["opens"] > 1.0 and values["length"] < 0.5
     assert door_probability(door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
