@@ -1,0 +1,181 @@
+"""Where look-alikes are taken: two places made to be alike, the rooms that are visited in each, and the poses at which one lies
+on the other.
+
+Kinds (`LOOKALIKES`): ``shifted-row``, parts of a row of equal rooms, some rooms apart; ``modules``, parts of two of the equal
+modules of a building, two rooms or more each; ``hotel-corridors``, two corridors of one hotel or ward; ``same-room``, two rooms
+of one size; ``mirror``, a part of a building and its own mirror image.
+
+Furniture (`FURNISHED`): ``same``, thing by thing; ``clutter``, the same but for what lies on the floor; ``other``, furnished
+anew; ``empty``, none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from scipy.signal import fftconvolve
+from topomerge.datasets.buildings.drafting import Draft
+from topomerge.datasets.buildings.erect import erect
+from topomerge.datasets.buildings.modules import EQUAL, ROOM_KINDS, ModuleRow, draw_module, make_row, rooms_of
+from topomerge.datasets.buildings.procedural import make_building
+from topomerge.datasets.buildings.refurnish import copied, refurnished, restrewn
+from topomerge.datasets.core.building import Building
+from topomerge.datasets.core.difficulty import Difficulty
+from topomerge.datasets.pairs.parts import CONNECTING
+from topomerge.datasets.simulation.floors import fill
+from topomerge.datasets.simulation.twin_wing import bent
+from topomerge.datasets.simulation.walk import part
+
+from topomerge.types import Array, Sim3
+
+LOOKALIKES = ("shifted-row", "hotel-corridors", "same-room", "mirror", "modules")
+FURNISHED = ("same", "clutter", "other", "empty")
+MOST_ROOMS_SEEN = 12  # rooms of a map of a row
+INNER_SHARE = 0.6  # of the rows: neither map visits an end
+MIRROR_CELL = 0.2  # m, raster on which a mirror image is laid
+CORRIDOR_KINDS = ("hotel", "hotel", "hospital")  # of buildings with corridors that look alike
+ROOMS_MIRRORED = (1, 1, 1, 2, 3, 4)  # of a map
+LEAST_AREA = 8.0  # m2 of a room to start from
+MIRRORED_KINDS = ("office", "hotel", "hospital", "school", "lab", "apartment", "house")  # of buildings
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Two places made to be alike.
+
+    Args:
+        buildings: of a and of b; one and the same, or two of one plan.
+        visited: rooms of each.
+        poses: b's coordinates -> a's, such that one lies on the other where it should not; with what is true among them they are
+            all that look right.
+        same: are both in one building, in one frame, so that the identity is true?
+        repeats: does each map show two equal modules or more, so that the repetition can be seen in a map by itself?
+    """
+
+    buildings: tuple[Building, Building]
+    visited: tuple[Array, Array]
+    poses: tuple[Sim3, ...]
+    same: bool = False
+    repeats: bool = False
+
+
+def draw_places(kind: str, furniture: str, seed: int) -> Places:
+    """The places of a pair of a kind of `LOOKALIKES`; the same arguments give the same buildings."""
+    rng = np.random.default_rng([seed, LOOKALIKES.index(kind), FURNISHED.index(furniture)])
+    difficulty = Difficulty(
+        furniture=0.0 if furniture == "empty" else float(rng.uniform(0.8, 1.6)),
+        clutter=0.0 if furniture == "empty" else float(rng.uniform(0.3, 1.2)),
+        lintels=float(rng.random() < 0.7),
+        open=float(rng.uniform(0.5, 0.8)),
+    )
+    return PLACES_OF[kind](kind, furniture, seed, difficulty, rng)
+
+
+def _row(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+    """Parts of a row: of a row of rooms (at most half of it) or of one of modules."""
+    layout = str(rng.choice(["room", "ensuite"] if kind == "shifted-row" else ["pair", "suite"]))
+    count = int(rng.integers(6, 11)) if kind == "shifted-row" else 9
+    row = make_row(draw_module(layout, rng), count, difficulty, seed, f"{kind}-{seed}")
+    most = max(MOST_ROOMS_SEEN // len(rooms_of(row.module, 0)), 1)
+    seen = min(int(rng.integers(2, 5)) if kind == "shifted-row" else 1 + int(rng.random() < 0.3), most, count // 2)
+    ends = int(rng.random() < INNER_SHARE)  # modules at each end that neither map visits
+    apart = int(rng.integers(1 if kind == "shifted-row" else seen, count - seen - 2 * ends + 1))
+    first = int(rng.integers(ends, count - seen - apart - ends + 1))
+    starts = [first, first + apart] if rng.random() < 0.5 else [first + apart, first]
+    building = _furnished_row(row, furniture, difficulty, rng)
+    visited = [np.flatnonzero((row.module >= s) & (row.module < s + seen)) for s in starts]
+    poses = row_poses(row, starts[0], starts[1], seen)
+    return Places((building, building), (visited[0], visited[1]), poses, same=True, repeats=seen > 1)
+
+
+def row_poses(row: ModuleRow, first: int, second: int, seen: int) -> tuple[Sim3, ...]:
+    """Poses by whole periods, but the true one, that lay a module of b on one of a: each shows `seen`, from `first` and from
+    `second` on."""
+    shifts = [first - second + k for k in range(1 - seen, seen)]
+    return tuple(Sim3(0.0, (k * row.period, 0.0, 0.0)) for k in shifts if k)
+
+
+def _furnished_row(row: ModuleRow, furniture: str, difficulty: Difficulty, rng: np.random.Generator) -> Building:
+    """The row with things; an inner module is furnished and copied, as those at the ends are longer."""
+    building, density, clutter = row.building, difficulty.furniture, difficulty.clutter
+    if furniture == "other":
+        return refurnished(building, range(len(building.rooms)), density, clutter, rng)
+    building = refurnished(building, rooms_of(row.module, 1), density, clutter, rng)
+    for k in (k for k in range(row.count) if k != 1):
+        building = copied(building, rooms_of(row.module, 1), rooms_of(row.module, k), np.array([(k - 1) * row.period, 0.0]))
+    return restrewn(building, range(len(building.rooms)), clutter, rng) if furniture == "clutter" else building
+
+
+def _corridors(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+    """A corridor with rooms beside it, and another one like it elsewhere: the same plan a second time."""
+    a = make_building(str(rng.choice(CORRIDOR_KINDS)), seed, 1, difficulty, str(rng.choice(["single", "double"])))
+    areas = [shapely.Polygon(r.polygon).area if r.kind == "corridor" else 0.0 for r in a.rooms]
+    rooms = part(a, int(rng.integers(4, 8)), rng, start=int(np.argmax(areas)))
+    return Places((a, _again(a, furniture, rooms, difficulty, rng)), (rooms, rooms), (Sim3(),))
+
+
+def _same_room(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+    """One room of a size, and another one."""
+    wide, deep = np.round(rng.uniform([4.0, 3.6], [9.0, 7.5]), 2).tolist()
+    draft = Draft(round(float(rng.uniform(0.1, 0.2)), 2), rng)
+    room = draft.box((0.0, 0.0), (wide, deep), str(rng.choice([*ROOM_KINDS, "openplan", "storage"])))
+    sides = shapely.box(0.0, 0.0, wide, deep).exterior
+    door = shapely.LineString(np.asarray(sides.coords)[[1, 2]])
+    draft.cut(door, 0.95, "door", round(float(rng.uniform(0.2, 0.8)), 2))
+    draft.windows(room, 1.4, 0.9, 2.4)
+    height = round(float(rng.uniform(3.0, 3.6)), 2)
+    equal = replace(EQUAL, furniture=difficulty.furniture, clutter=difficulty.clutter)
+    a = erect([draft.plan(height, round(height - 0.5, 2))], equal, rng, f"{kind}-{seed}", "room")
+    a, rooms = replace(a, seed=seed), np.array([0])
+    b = _again(a, furniture, rooms, difficulty, rng)
+    return Places((a, b), (rooms, rooms), (Sim3(), Sim3(np.pi, (wide, deep, 0.0))))
+
+
+def _mirror(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+    """A part of a building and its mirror image."""
+    a = make_building(str(rng.choice(MIRRORED_KINDS)), seed, 1, difficulty)
+    rooms = part(a, int(rng.choice(ROOMS_MIRRORED)), rng, start=_a_room(a, rng))
+    b = bent(_again(a, furniture, rooms, difficulty, rng), 0, lambda x: x, mirrored=True)
+    return Places((a, b), (rooms, rooms), tuple(laid(a, b, rooms, yaw) for yaw in (0.0, np.pi)))
+
+
+PLACES_OF: dict[str, Callable[[str, str, int, Difficulty, np.random.Generator], Places]] = {
+    "shifted-row": _row, "modules": _row, "hotel-corridors": _corridors, "same-room": _same_room, "mirror": _mirror,
+}  # fmt: skip
+
+
+def _again(a: Building, furniture: str, rooms: Array, difficulty: Difficulty, rng: np.random.Generator) -> Building:
+    """The same plan a second time."""
+    every = range(len(a.rooms)) if furniture == "clutter" else rooms
+    if furniture == "other":
+        return refurnished(a, every, difficulty.furniture, difficulty.clutter, rng)
+    return restrewn(a, every, difficulty.clutter, rng) if furniture == "clutter" else a
+
+
+def _a_room(building: Building, rng: np.random.Generator) -> int:
+    """A room that is no corridor and not tiny."""
+    fits = [i for i, r in enumerate(building.rooms) if r.kind not in CONNECTING and shapely.Polygon(r.polygon).area > LEAST_AREA]
+    return int(rng.choice(fits))
+
+
+def laid(a: Building, b: Building, rooms: Array, yaw: float) -> Sim3:
+    """The pose b -> a of a turn at which the floors of these rooms lie on each other the most."""
+    turn = Sim3(yaw)
+    floors = []
+    for building, pose in ((a, Sim3()), (b, turn)):
+        floors.append([pose.apply(np.pad(building.rooms[i].polygon, ((0, 0), (0, 1))))[:, :2] for i in rooms.tolist()])
+    lows = [np.concatenate(f).min(axis=0) for f in floors]
+    masks = []
+    for low, polygons in zip(lows, floors, strict=True):
+        size = np.ceil((np.concatenate(polygons).max(axis=0) - low) / MIRROR_CELL).astype(int) + 1
+        masks.append(np.zeros(size[::-1].tolist(), np.float32))
+        for polygon in polygons:
+            fill(masks[-1], (polygon - low) / MIRROR_CELL, 1)
+    both = fftconvolve(masks[0], masks[1][::-1, ::-1])
+    row, column = np.unravel_index(int(np.round(both, 3).argmax()), both.shape)
+    offset = (np.array([column, row]) - np.array(masks[1].shape[::-1]) + 1) * MIRROR_CELL
+    x, y = (lows[0] + offset - lows[1]).tolist()
+    return Sim3(yaw, (x, y, 0.0))
