@@ -1,0 +1,82 @@
+"""What a user reads of a verdict: numbers and words by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row, why
+from topomerge.fusion.registration import Registration
+from topomerge.matching.poses import PoseHypothesis
+from topomerge.types import Sim3
+
+FEATURES = {
+    "walls": 20.4, "ratio": 0.83, "opposed": 0.05, "conflict": 1.26, "conflict_share": 0.062, "worst_conflict": 0.11,
+    "free": 151.0, "clutter": 8.0, "met": 0.6, "chance": 0.15, "level": 0.04, "margin": 1.0, "ceiling_area": 30.0,
+    "ceilings": 0.07, "rmse": 0.021, "moved_walls": 0.02, "worst_ratio": 0.71, "squares": 22.0, "bad_squares": 0.1,
+    "tall_conflict": 0.5, "hanging": 4.0, "hanging_met": 3.0,
+}  # fmt: skip
+
+
+def registration(probability: float, **features: float) -> Registration:
+    best, other = PoseHypothesis(Sim3(), 2.0, features=FEATURES), PoseHypothesis(Sim3(), 1.0, features=FEATURES)
+    return Registration(Sim3(), probability, False, {**FEATURES, **features}, (best, other))
+
+
+def test_the_sentence_says_verdict_evidence_and_rival():
+    believed, refused = why(registration(0.91), 0.9), why(registration(0.89), 0.9)
+    evidence = "20 m2 of walls agree, 151 m2 of free floor seen by both; 6.2 % of the walls stand on free floor of the other map"
+    assert believed == f"merged: probability 0.91 reaches 0.90; {evidence}"
+    assert refused == f"not merged: probability 0.89 is below 0.90; {evidence}; another place explains the maps as well"
+    assert "another place" not in why(registration(0.5, margin=2.0), 0.9)
+    assert why(registration(0.9), 0.9, force=True) == f"merged: probability 0.90 reaches 0.90; {evidence}"
+    assert why(registration(0.5), 0.9, force=True).endswith("joined all the same, as was asked for (--force)")
+    assert why(Registration(None, 0.0, False, reason="no walls"), 0.9) == "not merged: no walls"
+
+
+def test_nothing_is_certain():
+    assert [chance(p) for p in (1.0, 0.991, 0.99, 0.5, 0.01, 0.009)] == [
+        "over 0.99",
+        "over 0.99",
+        "0.99",
+        "0.50",
+        "0.01",
+        "below 0.01",
+    ]
+
+
+def test_the_evidence_row_by_row():
+    rows = {what: (much, says) for what, much, says in evidence_rows(registration(0.9))}
+    assert rows["walls on walls"][0] == "20.4 m²" and rows["walls on walls"][1].startswith("83 %")
+    assert rows["free floor in common"][0] == "151 m²" and rows["walls on free floor"][0] == "1.3 m²"
+    assert rows["walls on free floor"][1] == "6 % of the walls that meet anything, 11 % of one map's; speaks against"
+    assert rows["walls back to back"][0] == "5 %" and rows["furniture"][0] == "8.0 m²" and rows["floors"][0] == "0.04 m"
+    assert rows["furniture"][1].startswith("60 %") and rows["furniture"][1].endswith("15 %")
+    assert rows["ceilings"][0] == "0.07 m" and "30 m²" in rows["ceilings"][1] and rows["surfaces"][0] == "2.1 cm"
+    assert (
+        rows["walls one way"][0] == "71 %"
+        and rows["squares of 3 m"][0] == "22"
+        and rows["high walls on free floor"][0] == "0.5 m²"
+    )
+    assert rows["parts that fit better elsewhere"][0] == "2 %" and "10 %" in rows["squares of 3 m"][1]
+    assert rows["under the ceiling"][0] == "3" and rows["under the ceiling"][1].startswith("of 4 pieces")
+    assert rows["next best place"][0] == f"{np.exp(1.0):.0f} times as probable"
+
+
+def test_what_was_not_seen_has_no_row():
+    few = registration(0.9, ceiling_area=0.0, rmse=float("nan"), tall_conflict=0.0, hanging=0.0, margin=0.1)
+    rows = {what: much for what, much, _ in evidence_rows(few)}
+    assert not {"ceilings", "surfaces", "high walls on free floor", "under the ceiling"} & set(rows)
+    assert rows["next best place"] == "about as probable" and evidence_rows(Registration(None, 0.0, False)) == []
+
+
+def test_a_hypothesis_beside_the_best_one():
+    best, other = (
+        PoseHypothesis(Sim3(), 3.0, features=FEATURES),
+        PoseHypothesis(Sim3(-3.0, (0.0, 4.0, 3.0)), 1.0, features=FEATURES),
+    )
+    row = hypothesis_row(2, other, best, np.zeros(3))
+    assert row == ["2", f"{np.degrees(-3.0):.1f}", "5.0", f"{np.exp(-2.0):.2g}", "20.4", "151", "6.2 %"]
+    assert float(hypothesis_row(2, other, best, np.array([3.0, 0.0, 0.0]))[2]) == pytest.approx(
+        np.hypot(np.hypot(3 * np.cos(3) - 3, 4 - 3 * np.sin(3)), 3), abs=0.05
+    )

@@ -1,0 +1,86 @@
+"""Maps in other units, one map twice, storeys that are too high: what is refused, and what a user is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.scenes_map import building
+from topomerge.errors import InputError
+from topomerge.fusion.inputs import check_different, check_pair, check_units, checked_threshold, pair_warnings
+from topomerge.fusion.verify import model
+from topomerge.types import TopometricMap
+
+
+def scaled(map: TopometricMap, times: float, name: str = "large.ply") -> TopometricMap:
+    """The same map in a smaller unit."""
+    return replace(map, grid=replace(map.grid, edge=map.grid.edge * times), source=name)
+
+
+def with_storeys(map: TopometricMap, *heights: float) -> TopometricMap:
+    storeys = np.zeros(len(heights), map.storeys.dtype)
+    storeys["ceiling"] = storeys["floor"] + heights
+    return replace(map, storeys=storeys)
+
+
+@pytest.mark.parametrize(("times", "unit"), [(100.0, "cm"), (1000.0, "mm")])
+def test_the_unit_of_the_larger_map_is_named_whichever_comes_first(times, unit):
+    small, large = building(1), scaled(building(2), times)
+    for pair in ((small, large), (large, small)):
+        with pytest.raises(InputError, match=rf"large.ply: spans .* building.ply .*--unit {unit}$"):
+            check_units(*pair)
+
+
+def test_the_span_that_is_told_is_the_diagonal_from_above():
+    map = building(1)
+    with pytest.raises(InputError) as error:
+        check_units(map, scaled(map, 1000.0))
+    spans = np.hypot(*(np.ptp(map.grid.cells[:, :2], axis=0))) * map.grid.edge
+    assert f"spans {1000 * spans:,.0f} m, building.ply {spans:,.0f} m" in str(error.value)
+
+
+def test_large_buildings_are_no_other_unit():
+    check_units(building(1), scaled(building(1), 25.0))  # 350 m beside 14 m
+    check_units(scaled(building(1), 0.1), scaled(building(1), 10.0))  # 140 m beside 1.4 m
+    check_pair(building(1), scaled(building(2), 100.0), "free")  # the scale is looked for
+
+
+def test_one_map_is_not_merged_with_itself():
+    map = building(1)
+    for other in (map, replace(map, source="copy")):
+        with pytest.raises(InputError, match="is the same map as building.ply"):
+            check_different(map, other)
+    moved = replace(map, grid=replace(map.grid, origin=map.grid.origin + (1.0, 0.0, 0.0)))
+    for other in (moved, scaled(map, 2.0), building(2)):
+        check_different(map, other)
+
+
+def test_storeys_twice_as_high_are_told_of_with_the_unit_in_mind():
+    low, high = with_storeys(building(1), 2.5, 2.7, 9.0), with_storeys(building(2), 6.2)
+    high = replace(high, source="hall.ply")
+    said = "hall.ply: storeys are 6.2 m high, in building.ply 2.7 m: the units may differ"
+    assert list(pair_warnings(low, high, "fixed")) == list(pair_warnings(high, low, "fixed")) == [said]
+    assert not list(pair_warnings(low, high, "free"))
+    assert not list(pair_warnings(low, with_storeys(building(2), 5.8), "fixed"))
+    assert not list(pair_warnings(low, with_storeys(building(2), np.nan), "fixed"))
+
+
+def test_few_rooms_are_told_of():
+    map = building(1)
+    labels = {"room": map.room * 0, "navigable_room": map.navigable_room * 0}
+    one = replace(map, rooms=map.rooms[:1], edges=map.edges[:0], **labels)
+    none = replace(map, rooms=map.rooms[:0], edges=map.edges[:0], source="", **{k: v - 1 for k, v in labels.items()})
+    said = [
+        "building.ply: has one room: little can be compared",
+        "the second map: has no rooms: only walls and empty space can be compared",
+    ]
+    assert list(pair_warnings(one, none, "fixed")) == said
+
+
+def test_a_threshold_is_a_probability():
+    assert checked_threshold(None) == model()["threshold"] and checked_threshold(0) == 0.0 and checked_threshold(1) == 1.0
+    for wrong in (-0.1, 1.01, float("nan")):
+        with pytest.raises(InputError, match="between 0 and 1"):
+            checked_threshold(wrong)
