@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.merging.peers import AREA_BINS, ITERATIONS, TARGETS, VOXEL, bin_of, kind_of
-from benchmarks.merging.results import METHOD_TITLES, Row, by, good, put, share
+from benchmarks.merging.tables import METHOD_TITLES, Row, by, good, put, share
 
 FINE = (0.1, 1.0)  # m, degrees
 TEXT = (

@@ -1,0 +1,136 @@
+"""Pairs that must not merge, every one counted: what was believed, by kind, over physical buildings, and at a stated prior."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from benchmarks.merging.tables import Row, good, physical_of, table
+from topomerge.statistics import exact_interval
+from topomerge.training.belief_hypotheses import fair, kind_of
+
+# Of the pairs that somebody would try and that must not merge, how many are of each kind: an assumption, not a measurement.
+# Most are of other buildings; in one building the next storey comes first. What was made to be alike is rarer.
+PRIOR = {
+    "stranger": 0.4,
+    "no room in common": 0.1,
+    "other storey": 0.2,
+    "twin wing": 0.1,
+    "repeated modules": 0.1,
+    "own mirror image": 0.05,
+    "other look-alikes": 0.05,
+}
+MADE_ALIKE = {"modules": "repeated modules", "shifted-row": "repeated modules", "mirror": "own mirror image"}
+PRIOR_ROUNDS = 20_000
+NEGATIVE_HEADS = (
+    "kind", "pairs", "believed", "physical buildings", "with a false merge: exact 95 %", "of the pairs, nobody can tell",
+    "of these, believed", "highest probabilities",
+)  # fmt: skip
+
+
+def negative_kind(row: Row) -> str:
+    """What makes a pair one that must not merge: a key of `PRIOR`; empty where its maps share a room.
+
+    Look-alikes are all in, as those that share rooms must not merge a period away.
+    """
+    if row.get("lookalike"):
+        return MADE_ALIKE.get(row["lookalike"], "other look-alikes")
+    if row["kind"] == "overlap":
+        return "no room in common" if kind_of(row).startswith("none") else ""
+    if row["kind"] in ("strangers", "other-building"):
+        return "other storey" if row["physical"] == row.get("physical_other") else "stranger"
+    return {"other-storey": "other storey", "twin-wing": "twin wing"}[row["kind"]]
+
+
+def broken(row: Row) -> bool:
+    """Is what is called true known to be wrong? Of a drawing of a map's own building of which the map shows nothing the
+    generator gave a twin's frame."""
+    return bool(row["kind"] == "overlap" and row.get("common", 1) < 1 and "drawing" in row["sensors"])
+
+
+def tellable(row: Row) -> bool:
+    """Could anybody tell the two places apart by what the maps show? Else the right answer is to abstain."""
+    return bool(row["tellable"]) if "tellable" in row else bool(fair(row))
+
+
+def false_merge(row: Row) -> bool:
+    """Believed, and not at a right pose."""
+    return bool(row["believed"]) and not good(row)
+
+
+def buildings_hit(rows: Sequence[Row]) -> dict[str, float]:
+    """Physical building of map a -> share of its pairs that were merged falsely."""
+    of: dict[str, list[bool]] = {}
+    for r in rows:
+        of.setdefault(physical_of(r), []).append(false_merge(r))
+    return {name: float(np.mean(hits)) for name, hits in of.items()}
+
+
+def tally(name: str, rows: Sequence[Row]) -> list[object]:
+    """A line of the table: under `NEGATIVE_HEADS`."""
+    shares = buildings_hit(rows)
+    hit = sum(share > 0 for share in shares.values())
+    low, high = exact_interval(hit, len(shares))
+    alike = [r for r in rows if not tellable(r)]
+    most = np.round(sorted((r["probability"] for r in rows), reverse=True)[:3], 2).tolist()
+    interval = f"{hit}: {100 * low:.1f} to {100 * high:.1f} %"
+    believed = sum(map(false_merge, rows))
+    return [name, len(rows), believed, len(shares), interval, len(alike), sum(map(false_merge, alike)), ", ".join(map(str, most))]
+
+
+def properties(row: Row) -> Iterator[str]:
+    """What is difficult beside the kind."""
+    yield from row.get("hard", ())
+    for sensor, name in (("laser2d", "a 2D slice"), ("drawing", "a floor plan")):
+        if sensor in row["sensors"]:
+            yield name
+
+
+def negatives(rows: Sequence[Row]) -> list[Row]:
+    """The pairs that must not merge, each with its `negative`."""
+    return [{**r, "negative": kind} for r in rows if not broken(r) and (kind := negative_kind(r))]
+
+
+def false_merges(rows: Sequence[Row]) -> str:
+    """The table of `negatives`: kinds, all, those that nobody can tell apart, and what is difficult."""
+    out = [tally(kind, mine) for kind in PRIOR if (mine := [r for r in rows if r["negative"] == kind])]
+    out.append(tally("**all**", rows))
+    alike = [r for r in rows if not tellable(r)]
+    if alike:
+        out.append(tally("**nobody can tell apart** (of all; right: to abstain)", alike))
+    for name in sorted({name for r in rows for name in properties(r)}):
+        out.append(tally(f"of all, with {name}", [r for r in rows if name in properties(r)]))
+    return table(NEGATIVE_HEADS, out)
+
+
+def rate_at(rows: Sequence[Row], prior: Mapping[str, float] = PRIOR) -> tuple[float, float, float]:
+    """Share of false merges at a prior of kinds, and the ends of its 95 % interval; nan where there is no row.
+
+    Of each kind the mean over its physical buildings of the share of their pairs. What of a kind is not sure is drawn as of k of
+    n buildings, Beta(k + 1/2, n - k + 1/2) (Jeffreys' prior). Kinds without a row are left out, and the others' shares raised.
+    """
+    total = sum(weight for kind, weight in prior.items() if any(r["negative"] == kind for r in rows))
+    if not total:
+        return float("nan"), float("nan"), float("nan")
+    rng = np.random.default_rng(0)
+    rate, drawn = 0.0, np.zeros(PRIOR_ROUNDS)
+    for kind, weight in prior.items():
+        shares = list(buildings_hit([r for r in rows if r["negative"] == kind]).values())
+        if shares:
+            hits = sum(shares)
+            rate += weight / total * hits / len(shares)
+            drawn += weight / total * rng.beta(hits + 0.5, len(shares) - hits + 0.5, PRIOR_ROUNDS)
+    low, high = np.quantile(drawn, [0.025, 0.975]).tolist()
+    return rate, low, high
+
+
+def headline(rows: Sequence[Row]) -> str:
+    """The rate at `PRIOR` with every pair in, and without what nobody can tell apart, in words."""
+    shares = ", ".join(f"{kind} {weight:g}" for kind, weight in PRIOR.items())
+    missing = [kind for kind in PRIOR if not any(r["negative"] == kind for r in rows)]
+    rate, low, high = (100 * v for v in rate_at(rows))
+    apart, least, most = (100 * v for v in rate_at([r for r in rows if tellable(r)]))
+    text = f"**{rate:.1f} % [{low:.1f}, {high:.1f}] of the pairs that must not merge are believed**, every pair in, at this "
+    text += f"prior of kinds: {shares}. Without the pairs that nobody can tell apart {apart:.1f} % [{least:.1f}, {most:.1f}]."
+    return text + (f" Not measured, so that the other shares are raised: {', '.join(missing)}." if missing else "")
