@@ -59,6 +59,11 @@ def test_eight_buildings_are_drawn_again_and_again() -> None:
     assert interval_text(eight, range(8)) == f"{mean:.2f} [{low:.2f}, {high:.2f}]" and low < 0.5 < high
 
 
+def test_a_share_of_all_or_nothing_is_not_certain() -> None:
+    assert interval_text(np.ones(20), np.arange(20) // 2) == "1.00 [0.69, 1.00]"  # ten buildings: 0.025 ** 0.1
+    assert interval_text(np.zeros(10), range(10), 0, 100) == "0 [0, 31]"
+
+
 def test_calibration_by_hand() -> None:
     result = calibration([0.0, 0.05, 0.2, 0.4, 0.8, 0.9], [False, False, True, False, True, True], bins=3)
     assert result.count.tolist() == [2, 2, 2]

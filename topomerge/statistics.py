@@ -52,7 +52,8 @@ def bootstrap(values: Array, groups: Array, rounds: int = 2000, seed: int = 0) -
 
 def interval_text(values: Array, groups: Array, digits: int = 2, unit: float = 1.0) -> str:
     """A mean with its interval by `bootstrap`, `0.62 [0.50, 0.71]`; of fewer than eight groups with the range of the groups'
-    means instead, `0.71, 0.62–0.91 (4 buildings)`; a dash where there is no value.
+    means instead, `0.71, 0.62–0.91 (4 buildings)`; a dash where there is no value. A share that is 0 or 1 throughout has the
+    `exact_interval` over groups: drawing equal values again says nothing.
 
     Args:
         values, groups: as of `bootstrap`.
@@ -62,7 +63,9 @@ def interval_text(values: Array, groups: Array, digits: int = 2, unit: float = 1
     total, count = _sums(values, groups)
     if not len(total):
         return "–"
-    mean, low, high = (f"{unit * v:.{digits}f}" for v in bootstrap(values, groups))
+    share = float(total.sum() / count.sum())
+    ends = exact_interval(int(share) * len(total), len(total)) if share in (0.0, 1.0) else bootstrap(values, groups)[1:]
+    mean, low, high = (f"{unit * v:.{digits}f}" for v in (share, *ends))
     if len(total) >= FEWEST_GROUPS:
         return f"{mean} [{low}, {high}]"
     if len(total) == 1:

@@ -16,7 +16,7 @@ ABOUT = (
     "the middle of what both maps saw; of slices and floor plans horizontally, and on the right storey (within 1.4 m in "
     f"height). Believed: probability {THRESHOLD} or more. Intervals are over physical buildings: in brackets 95 % by "
     "bootstrap; of fewer than eight the range of the buildings. Storeys, stacks and wings of one building are one "
-    "(`datasets/core/physical.py`). Seconds of processor, median."
+    "(`datasets/core/physical.py`). Seconds of processor, median, on a machine with other jobs (speed: docs/benchmarks.md)."
 )
 MUST_NOT = (
     "Through registration and its verdict, on cells alone; every pair is in. Believed: at a pose that is not right. The "
