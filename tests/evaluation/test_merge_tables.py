@@ -8,7 +8,6 @@ import pytest
 
 from topomerge.evaluation.merge_tables import chosen, decides, independence, merging, reliability, sites
 from topomerge.evaluation.settings import Evaluation
-from topomerge.types import Sim3
 
 SETTINGS = Evaluation(rounds=50)
 
@@ -20,7 +19,7 @@ def merge_row(pair: str, site: str, captures: tuple[str, str] = ("1", "2"), **ch
         "independent": captures[0] != captures[1], "origin": "real maps", "large": True, "area": ">200", "mergeable": 1,
         "near": 1, "fine": 1, "believed": 1, "merged": 1, "merged_fine": 1, "false": 0, "refused": 0, "with_rooms": 1,
         "every_room": 1, "rooms_shared": 2, "rooms_near": 2, "probability": 0.9, "seconds": 1.0, "chance": [], "good": [],
-        "pose": Sim3(0.2, (1.0, 2.0, 0.0)).matrix.tolist(),
+        "place": [1.0, 2.0, 0.0, 179.9],
     }  # fmt: skip
     return row | changes
 
@@ -58,14 +57,19 @@ def test_independence_over_sites() -> None:
 
 
 def test_what_decides() -> None:
-    moved = Sim3(0.2, (1.02, 2.0, 0.0)).matrix.tolist()
     learned = [{**r, "variant": "learned"} for r in ROWS]
-    learned[0]["pose"] = moved
-    learned[2] |= {"believed": 1, "merged": 1, "refused": 0}
-    table = decides([*ROWS, *learned])
-    assert table.head[-2:] == ["verdict of walls alone", "pose of walls alone"]
-    assert table.rows[0] == ["walls alone", "4", "3", "2", "1", "4", "4"]
-    assert table.rows[1] == ["learned", "4", "3", "3", "1", "3", "3"]
+    learned[0]["place"] = [1.02, 2.0, 0.0, -179.9]  # 2 cm and 0.2 degrees: the same
+    learned[1]["place"] = [1.0, 3.0, 0.0, 179.9]
+    learned[2] |= {"believed": 1, "merged": 1, "refused": 0, "probability": 0.85}
+    again = [{**r, "variant": "again"} for r in learned]
+    table = decides([*ROWS, *learned, *again])
+    assert [list(row) for row in table.rows] == [
+        ["walls alone", "learned", "4", "3", "3", "1.000", "0.450"],
+        ["walls alone", "again", "4", "3", "3", "1.000", "0.450"],
+        ["learned", "again", "4", "4", "4", "0.000", "0.000"],
+    ]
+    without = decides([*ROWS, *({**r, "variant": "none", "place": []} for r in ROWS)])
+    assert without.rows[0][4:6] == ["0", "inf"]
     assert {r["variant"] for r in chosen([*ROWS, *learned])} == {"learned"} and chosen([]) == []
 
 

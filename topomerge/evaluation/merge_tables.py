@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from topomerge.evaluation.tables import BY, MERGING, METRIC_NAMES, Table, by, by
 from topomerge.statistics import Calibration, calibration
 
 ORIGINS = ("procedural", "real plans", "real maps")  # of the places that maps are of
-SAME_PLACE, SAME_TURN = 0.001, 0.01  # m, degrees: poses that differ by less are one
+SAME_POSE = (0.05, 0.5)  # m, degrees: poses that differ by less are one; the truth of real pairs is no finer
 Predictions = Callable[[Sequence[Row]], tuple[list[float], list[bool]]]  # probabilities of rows, and what came true
 INDEPENDENCE = {True: "two captures", False: "parts or copies of one"}
 
@@ -100,28 +101,27 @@ def chosen(merges: Sequence[Row]) -> list[Row]:
 
 
 def decides(merges: Sequence[Row]) -> Table:
-    """Verdicts and poses beside those of the first way of merging, on the same pairs."""
-    ways = by_variant(merges)
-    first = {r["pair"]: r for r in next(iter(ways.values()), [])}
+    """How alike two ways of merging come out on the same pairs: with and without descriptors of rooms, with these or those."""
+    ways = {name: {r["pair"]: r for r in rows} for name, rows in by_variant(merges).items()}
     rows = []
-    for name, these in ways.items():
-        same = [_same(r, first[r["pair"]]) for r in these if r["pair"] in first]
-        alike = [sum(column) for column in zip(*same, strict=True)] if same else [0, 0]
-        counts = [sum(r[k] for r in these) for k in ("near", "merged", "false")]
-        rows.append([name, str(len(these)), *map(str, (*counts, *alike))])
-    beside = next(iter(ways), "")
-    head = ["merged by", "pairs", "best pose right", "merged right", "merged wrong", f"verdict of {beside}", f"pose of {beside}"]
-    return Table("What decides: the same pairs, merged with and without descriptors of rooms", head, rows)
+    for first, second in combinations(ways, 2):
+        both = [(row, ways[second][pair]) for pair, row in ways[first].items() if pair in ways[second]]
+        verdicts = sum(a["believed"] == b["believed"] for a, b in both)
+        apart = np.array([_apart(a["place"], b["place"]) for a, b in both]).reshape(-1, 2)
+        poses = int((apart < SAME_POSE).all(axis=1).sum())
+        chance = max((abs(a["probability"] - b["probability"]) for a, b in both), default=0.0)
+        counts = map(str, (len(both), verdicts, poses))
+        rows.append([first, second, *counts, f"{np.max(apart[:, 0], initial=0.0):.3f}", f"{chance:.3f}"])
+    same = f"same pose ({SAME_POSE[0]:g} m, {SAME_POSE[1]:g}°)"
+    head = ["merged by", "and by", "pairs", "same verdict", same, "farthest apart, m", "probabilities differ by at most"]
+    return Table("What decides: the same pairs, merged with and without descriptors of rooms", head, rows, 2)
 
 
-def _same(row: Row, other: Row) -> tuple[bool, bool]:
-    """Are verdict and pose the same?"""
-    if not row["pose"] or not other["pose"]:
-        return row["believed"] == other["believed"], row["pose"] == other["pose"]
-    a, b = np.array(row["pose"]), np.array(other["pose"])
-    turn = np.degrees(np.arctan2(a[1, 0], a[0, 0]) - np.arctan2(b[1, 0], b[0, 0]))
-    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < SAME_PLACE and abs((turn + 180) % 360 - 180) < SAME_TURN
-    return row["believed"] == other["believed"], bool(near)
+def _apart(a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:
+    """m and degrees between two places; where only one way has a pose, they are infinitely far apart."""
+    if not a or not b:
+        return (0.0, 0.0) if a == b else (np.inf, np.inf)
+    return float(np.linalg.norm(np.subtract(a[:3], b[:3]))), abs((a[3] - b[3] + 180) % 360 - 180)
 
 
 def reliability(matches: Sequence[Row], merges: Sequence[Row]) -> Table:

@@ -215,18 +215,20 @@ def within(error: tuple[float, float, float], flat: bool, limits: tuple[float, f
 def merge_counts(pair: EvaluationPair, verdict: Mapping[str, Any], floors: Sequence[Array] = ()) -> Row:
     """Of a pair: `near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed and
     near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common;
-    `every_room`: it puts every shared room within 0.1 m of its true place; `rooms_near`: so many of the `rooms_shared`.
+    `every_room`: it puts every shared room within 0.1 m of its true place; `rooms_near`: so many of the `rooms_shared`;
+    `place`: where it puts the middle of what both saw, m, and its yaw, degrees.
 
     Args:
         floors: (n, 3) points of b on the floor of each shared room.
     """
+    pose = None if verdict["pose"] is None else sim3_of(np.array(verdict["pose"]))
+    place = [] if pose is None else [*pose.apply(pair.anchor[None])[0].tolist(), float(np.degrees(pose.yaw))]
     mergeable = pair.transform is not None and pair.about["kind"] == "overlap" and pair.about["common"] >= 1
     near = fine = False
     error = (np.nan,) * 3
     off = np.full(len(floors) if mergeable else 0, np.inf)
-    if mergeable and verdict["pose"] is not None:
-        pose = sim3_of(np.array(verdict["pose"]))
-        assert pair.transform is not None and pose is not None
+    if mergeable and pose is not None:
+        assert pair.transform is not None
         error = pose_error(pose, pair.transform, pair.anchor)
         flat = any(s in FLAT_SENSORS for s in pair.about["sensors"])
         near, fine = within(error, flat, NEAR_POSE), within(error, flat, FINE_POSE)
@@ -251,7 +253,7 @@ def merge_counts(pair: EvaluationPair, verdict: Mapping[str, Any], floors: Seque
         "seconds": verdict["seconds"],
         **dict(zip(("off", "off_above", "turned"), error, strict=True)),
         **match_counts(pair, rooms),
-        "pose": verdict["pose"] or [],
+        "place": place,
         "chance": list(verdict["chance"]),
         "good": right_matches(pair, rooms).tolist(),
     }
