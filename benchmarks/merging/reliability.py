@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks.merging.tables import Row, good, table
-from topomerge.statistics import Calibration, calibration
+from topomerge.statistics import NEAR_ZERO, Calibration, calibration
 
 ORIGINS = ("procedural buildings", "simulated scans of real plans", "real maps")
+PER_BIN = 8  # pairs
 REAL_MAPS = ("carmen", "halmstad", "strands", "utexas", "ipad", "libpointmatcher", "octomap")
 
 
@@ -22,8 +23,10 @@ def origin(row: Row) -> str:
 
 
 def calibrated(rows: Sequence[Row]) -> Calibration:
-    """`calibration` of what was told of pairs."""
-    return calibration([r["probability"] for r in rows], [good(r) for r in rows])
+    """`calibration` of what was told of pairs, in ten bins, or fewer where a bin of those above the mass near zero would have
+    fewer than `PER_BIN`."""
+    above = sum(r["probability"] >= NEAR_ZERO for r in rows)
+    return calibration([r["probability"] for r in rows], [good(r) for r in rows], min(max(above // PER_BIN, 1), 10))
 
 
 def errors(groups: dict[str, Sequence[Row]]) -> str:
