@@ -7,7 +7,7 @@ TORCH_INDEX ?=
 export TOPOMERGE_DATA ?= $(wildcard ../shared/data)
 export MPLBACKEND := Agg
 
-.PHONY: setup demo test test-slow lint docs bench weights clean
+.PHONY: setup demo test test-slow lint docs bench sealed weights clean
 setup: .venv/ready
 
 .venv/ready: pyproject.toml constraints.txt
@@ -51,6 +51,10 @@ docs: setup
 # All benchmarks of speed, about half an hour; what measures rooms and merges takes hours: see docs/benchmarks.md.
 bench: setup
 	$(BIN)/python -m benchmarks.speed
+
+# Once a release: measures the sealed set and appends to docs/results/sealed.md, about 25 minutes. Nothing else can read it.
+sealed: setup
+	$(BIN)/python -m benchmarks.sealed --jobs 2
 
 # All learned parts that ship, in their order; what has ended is left as it is. It says how long is left: hours on two cores.
 weights: setup

@@ -1,4 +1,4 @@
-"""The extraction against the truth: rooms, doors, graph, storeys, consistency and seconds, on maps that nobody tuned it to.
+"""The extraction against the truth: rooms, doors, graph, storeys, consistency and seconds, on maps that set no weight.
 
 ``python -m benchmarks.extraction.run --dev`` runs the small set for development (training buildings only), ``--set all``
 everything

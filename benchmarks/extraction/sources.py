@@ -14,6 +14,7 @@ from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.pairs.pairs import draw_frames
 from topomerge.datasets.pairs.parts import two_parts
+from topomerge.datasets.plans.sealed import refuse_file
 from topomerge.datasets.simulation.floor_truth import in_frame, truth_of
 from topomerge.datasets.simulation.scanner import moved, scan
 from topomerge.datasets.simulation.sensors import get_sensor
@@ -53,6 +54,7 @@ def make(case: Case, data: Path | None) -> Scan:
         return raised(case, folder / f"{case.building}.yaml", folder / "locations.yaml")
     if case.source == "file":
         path = data / case.building
+        refuse_file(path)
         grid = path.suffix == ".png"
         return Scan(read_points(path, resolution=IPA_CELL if grid else None), None, ())
     if case.source == "ifc":

@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.merging.atlas_maps test 8 4`` makes four sets of eight maps in ``cache/atlas/test``, unless they are there.
 Sensors and kinds of building are mixed; in every second set of four or more maps the last map is of another building of the same
-kind, which must stay apart. Buildings of the test split train and tune nothing.
+kind, which must stay apart. Buildings of the test split set no weight.
 """
 
 from __future__ import annotations

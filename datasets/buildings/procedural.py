@@ -18,6 +18,7 @@ from topomerge.datasets.buildings.row_rooms import fill_row
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.plans.sealed import refuse_building
 
 from topomerge.errors import InputError
 
@@ -36,8 +37,9 @@ def make_building(
         stairs: straight, dogleg, spiral or ramp; empty: drawn.
 
     Raises:
-        InputError: an unknown kind, shape or kind of stairs, or a number of storeys out of range.
+        InputError: an unknown kind, shape or kind of stairs, a number of storeys out of range, or a sealed seed.
     """
+    refuse_building("procedural", str(seed))
     difficulty = difficulty or Difficulty()
     if kind not in PROFILES:
         raise InputError(f"building kind {kind!r}: {', '.join(BUILDING_KINDS)} are possible")

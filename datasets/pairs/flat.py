@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 from topomerge.datasets.pairs.pairs import Pair, draw_frames, seen_by_both
+from topomerge.datasets.plans.sealed import refuse_file
 from topomerge.datasets.simulation.floors import fill
 
 from topomerge.errors import InputError
@@ -73,8 +74,9 @@ def read_flat(path: Path, resolution: float | None = None, rays: bool = True) ->
     """A robot grid: a map_server yaml, or an image whose pixels are so many metres wide.
 
     Raises:
-        InputError: missing or damaged file.
+        InputError: missing or damaged file, or a sealed one.
     """
+    refuse_file(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the folder")
     plan = grid.read_yaml(path) if resolution is None else grid.Plan(path, resolution)

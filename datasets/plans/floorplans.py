@@ -12,7 +12,7 @@
 
 Reasons of refusals start with: not closed, crosses itself, overlapping rooms, zero-width doors, no doors, no walls, absurd
 scale, no scale, too few rooms, disconnected, missing file, wrong version, bad line, damaged ..., absurd size, not read, not a
-... plan.
+... plan, sealed.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ import numpy as np
 import shapely
 from topomerge.datasets.core.physical import STRANGERS, named_storey
 from topomerge.datasets.core.plan import Flight, Plan, PlanRoom
+from topomerge.datasets.plans.sealed import refuse_file
 from topomerge.datasets.plans.sketch import Sketch, finish
 
 from topomerge.errors import InputError
@@ -180,6 +181,7 @@ def frame_of(folder: str | Path) -> dict[str, str]:
 
 def _names(file: Path) -> list[str]:
     try:
+        refuse_file(file)
         return [name for name, _ in import_module(f"topomerge.datasets.plans.{_reader(file)}").sketches(file)]
     except Exception:  # refused by `iter_plans`, with the reason
         return []
@@ -205,6 +207,11 @@ def _read(path: Path, wanted: Callable[[str], bool] = lambda name: True) -> Iter
     module = _reader(path)
     if not module:
         yield path.stem, Refusal(path.stem, f"not a known format: {path.name}")
+        return
+    try:
+        refuse_file(path)
+    except InputError as error:
+        yield path.stem, Refusal(path.stem, str(error))
         return
     items: Iterator[tuple[str, Maker]] = import_module(f"topomerge.datasets.plans.{module}").sketches(path)
     while True:

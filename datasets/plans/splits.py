@@ -2,7 +2,8 @@
 
 A line names a building as `source/name` (name as of `floorplans.iter_plans`), all of a source as `source/*`, or seeds of
 procedural buildings as `procedural/first..last`. Sources that evaluation stands on are in the test as a whole. Storeys of one
-building, and plans of one property, are never apart. The lists were written by ``python -m topomerge.datasets.plans.splits
+building, and plans of one property, are never apart. A fourth list, `sealed.txt`, is opened by the sealed run alone and goes
+before all others (`plans.sealed`). The other lists were written by ``python -m topomerge.datasets.plans.splits
 FOLDER``,
 FOLDER being that of the real data; what came into the world since then is in no split until they are written again.
 """
@@ -10,16 +11,14 @@ FOLDER being that of the real data; what came into the world since then is in no
 from __future__ import annotations
 
 import hashlib
-import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from functools import cache
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import shapely
 from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.plans.sealed import SEALED, is_sealed, read_list, refuse_split
 
 from topomerge.errors import InputError
 
@@ -47,6 +46,8 @@ SHARES = {"validation": 0.1, "test": 0.1}  # of the plans of a source; the rest 
 
 def split_of(source: str, name: str) -> str | None:
     """The split of a building, or None where no list names it. `name` is the seed of a procedural building."""
+    if is_sealed(source, name):
+        return SEALED
     for split in SPLITS:
         names, whole, seeds = _read(split)
         if source in whole or f"{source}/{name}" in names:
@@ -60,7 +61,7 @@ def members(split: str, source: str) -> list[str]:
     """Names of the buildings of a source in a split, ascending.
 
     Raises:
-        InputError: unknown split.
+        InputError: unknown split, or the sealed one.
     """
     names, _, _ = _read(split)
     return sorted(n.removeprefix(f"{source}/") for n in names if n.startswith(f"{source}/"))
@@ -70,24 +71,17 @@ def seeds(split: str) -> tuple[int, int]:
     """First and last seed of the procedural buildings of a split.
 
     Raises:
-        InputError: unknown split.
+        InputError: unknown split, or the sealed one.
     """
     return _read(split)[2]
 
 
-@cache
 def _read(split: str) -> tuple[frozenset[str], frozenset[str], tuple[int, int]]:
     """Buildings, whole sources and seeds of a split."""
-    if split not in SPLITS:
+    refuse_split(split)
+    if split not in (*SPLITS, SEALED):
         raise InputError(f"split {split!r}: {', '.join(SPLITS)} are possible")
-    text = resources.files("topomerge.datasets.plans").joinpath("splits", f"{split}.txt").read_text(encoding="utf-8")
-    lines = {line.strip() for line in text.splitlines()} - {""}
-    lines = {line for line in lines if not line.startswith("#")}
-    whole = {line.removesuffix("/*") for line in lines if line.endswith("/*")}
-    ranges = [m for line in lines if (m := re.fullmatch(r"procedural/(\d+)\.\.(\d+)", line))]
-    first, last = (int(ranges[0][1]), int(ranges[0][2])) if ranges else (0, -1)
-    names = lines - {f"{w}/*" for w in whole} - {m[0] for m in ranges}
-    return frozenset(names), frozenset(whole), (first, last)
+    return read_list(split)
 
 
 def groups(names: Iterable[str], together: Iterable[Iterable[str]]) -> list[list[str]]:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.pairs.pairs import Pair
+from topomerge.datasets.plans.sealed import refuse_building
 from topomerge.datasets.public.sources import hull, join_rooms, part_pairs
 
 from topomerge.errors import InputError
@@ -50,8 +51,9 @@ def read_area(area: Path) -> PointCloud:
     """All rooms of an area. A room that can't be read is left out, with a warning; the outlines are the points' convex hulls.
 
     Raises:
-        InputError: none of them can be read.
+        InputError: none of them can be read, or the area is sealed.
     """
+    refuse_building("s3dis", area.name)
     parts, lost = [], []
     for folder in sorted(p for p in area.iterdir() if p.is_dir()):
         try:

@@ -30,6 +30,7 @@ from topomerge.datasets.pairs.flat import floor_overlap, thin
 from topomerge.datasets.pairs.pairs import Pair, draw_frames, seen_by_both
 from topomerge.datasets.pairs.parts import share
 from topomerge.datasets.plans.floorplans import Refusal
+from topomerge.datasets.plans.sealed import refuse_building
 from topomerge.datasets.real.sources import collect
 from topomerge.datasets.simulation.scanner import moved
 
@@ -46,7 +47,7 @@ LEAST_ROOMS_TO_CUT = 4  # rooms that can be cut into two parts
 
 
 def iter_public_pairs(folder: str | Path, source: str) -> Iterator[tuple[str, Pair | Refusal]]:
-    """Every pair of a set; what is missing or damaged is a `Refusal`, and the rest goes on.
+    """Every pair of a set; what is missing, damaged or sealed is a `Refusal`, and the rest goes on.
 
     Raises:
         InputError: no such folder or source.
@@ -55,7 +56,18 @@ def iter_public_pairs(folder: str | Path, source: str) -> Iterator[tuple[str, Pa
         raise InputError(f"source {source!r}: {', '.join(PUBLIC_SOURCES)} are possible")
     if not Path(folder).is_dir():
         raise InputError(f"{folder}: no such folder; give the one that holds the data set")
-    return collect(source, import_module(f"topomerge.datasets.public.{source}").pairs(Path(folder)))
+    return collect(source, _unsealed(source, import_module(f"topomerge.datasets.public.{source}").pairs(Path(folder))))
+
+
+def _unsealed(source: str, makers: Iterator[tuple[str, Callable[[], Pair]]]) -> Iterator[tuple[str, Callable[[], Pair]]]:
+    """The makers, of which those of sealed buildings refuse."""
+    for name, make in makers:
+        yield name, partial(_made_unsealed, source, name, make)
+
+
+def _made_unsealed(source: str, name: str, make: Callable[[], Pair]) -> Pair:
+    refuse_building(source, name)
+    return make()
 
 
 def read_json(path: Path) -> Any:

@@ -1,0 +1,285 @@
+"""What the sealed run measures, an item a call, and the tables of it. Of what split the items are is up to who calls.
+
+Rooms: procedural buildings by five sensors, and sealed plans of real buildings, scanned. Merges: pairs of grids as those that the
+belief in merges is judged on (`datasets.pairs.grid_pairs`), two scans of each sealed plan, both halves of each sealed robot grid
+(one capture: what it shows is less than two), robot grids of two places, and sealed buildings of published sets.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from topomerge.datasets.buildings.erect import erect
+from topomerge.datasets.buildings.profiles import BUILDING_KINDS
+from topomerge.datasets.core.builder import one_thread, time_limit
+from topomerge.datasets.core.difficulty import Difficulty
+from topomerge.datasets.core.physical import physical_building
+from topomerge.datasets.pairs.flat import Flat, flat_pair, read_flat
+from topomerge.datasets.pairs.grid_pairs import (
+    GridItem,
+    GridPair,
+    GridRecipe,
+    common_area,
+    free_of,
+    grid_items,
+    grid_of,
+    load_grids,
+    make_grids,
+)
+from topomerge.datasets.pairs.pairs import Pair, PairSettings, make_pair
+from topomerge.datasets.plans import splits
+from topomerge.datasets.plans.floorplans import Refusal, iter_plans, plan_names
+from topomerge.datasets.plans.sealed import SEALED_FOLDERS, is_sealed, is_sealed_file
+from topomerge.datasets.public.sources import iter_public_pairs
+from topomerge.datasets.simulation.floor_truth import judge
+
+from benchmarks.extraction.scans import Case
+from benchmarks.extraction.sources import simulated
+from benchmarks.merging.register import ours, outcome
+from topomerge.errors import InputError
+from topomerge.extraction.extract import extract
+from topomerge.statistics import exact_interval, interval_text
+from topomerge.training.belief_hypotheses import fair
+from topomerge.types import Array, Sim3
+
+Row = dict[str, Any]
+SENSORS_OF_ROOMS = ("tls", "lidar", "depth", "tablet", "laser2d")
+VISITED_ROOMS = {"procedural": 8, "plan": 12}  # rooms a map
+VAST = 500.0  # m2; a plan with such a hall is not furnished: it takes minutes
+LONGEST_ITEM = 240.0  # s
+HALF = 0.65  # share of a robot's grid that each of its halves shows
+FULL_SETS, SMALL_SETS = [60, 20, 30], [2]  # pairs of grids of each set
+LEAST_COMMON = 40.0  # m2 in common: with less nobody asks for a merge
+
+
+@dataclass(frozen=True)
+class SealedItem:
+    """One thing to measure.
+
+    Args:
+        part: rooms or merges.
+        group: the row of the tables that it belongs to.
+        make: what gives its rows; it can be sent to another process.
+        arguments: of `make`.
+    """
+
+    part: str
+    group: str
+    make: Callable[..., list[Row]]
+    arguments: tuple[Any, ...]
+
+
+def items_of(split: str, data: Path | None, public: Sequence[tuple[str, Path]], small: bool) -> list[SealedItem]:
+    """All that is measured, the longest first.
+
+    Args:
+        split: of the procedural buildings.
+        data: folder of the real data, or None.
+        public: sources and folders of published sets.
+        small: two or three items only.
+    """
+    recipe = GridRecipe(name="sealed", split=split, sets=list(SMALL_SETS if small else FULL_SETS), drawings=[], rooms=[4, 15])
+    out = [SealedItem("merges", "procedural", grid_rows, (item,)) for item in grid_items(recipe)[0]]
+    out += [SealedItem("merges", f"published: {source}", public_rows, (source, folder)) for source, folder in public]
+    if data is not None:
+        for folder, name in sealed_plans(data):
+            out.append(SealedItem("merges", "real plans", plan_pair_rows, (folder, name)))
+            out.append(SealedItem("rooms", "real plans", plan_room_rows, (folder, name)))
+        out.append(SealedItem("merges", "robots' grids", robot_rows, (data,)))
+    first = splits.seeds(split)[0]
+    kinds, sensors = (BUILDING_KINDS[-1:], SENSORS_OF_ROOMS[:1]) if small else (BUILDING_KINDS, SENSORS_OF_ROOMS)
+    for i, sensor in enumerate(sensors):
+        for k, kind in enumerate(kinds):
+            case = Case(sensor, "procedural", kind, sensor, first + 100 + 10 * i + k, rooms=VISITED_ROOMS["procedural"])
+            out.append(SealedItem("rooms", sensor, room_rows, (case,)))
+    return out
+
+
+def measured(item: SealedItem) -> list[Row]:
+    """The rows of an item; of one that fails, one that says why."""
+    about = {"part": item.part, "group": item.group}
+    try:
+        with one_thread(), time_limit(LONGEST_ITEM * (8 if item.make in (robot_rows, public_rows) else 1)):
+            return [about | row for row in item.make(*item.arguments)]
+    except Exception as error:  # one bad item never ends a run
+        text = " ".join(str(error).split())[:150]
+        return [about | {"failed": text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"}]
+
+
+def room_rows(case: Case) -> list[Row]:
+    """Rooms of a procedural building."""
+    from benchmarks.extraction.sources import make
+
+    return [_room_row(make(case, None), f"procedural/{case.building}-{case.seed}")]
+
+
+def plan_room_rows(folder: Path, name: str) -> list[Row]:
+    """Rooms of a plan that is erected and scanned."""
+    source, building = _plan(folder, name)
+    case = Case("real plans", source, name, "tls", 1, rooms=min(VISITED_ROOMS["plan"], len(building.rooms)))
+    return [_room_row(simulated(case, building), physical_building(source, name))]
+
+
+def _room_row(scan: Any, place: str) -> Row:
+    rooms = judge(extract(scan.cloud, voxel_size=0.1), scan.truth).rooms
+    return {"place": place, "iou": rooms.iou, "mcc": rooms.mcc, "recall": rooms.recall, "precision": rooms.precision}
+
+
+def sealed_plans(data: Path) -> list[tuple[Path, str]]:
+    """Folders and names of the sealed plans, by `SEALED_FOLDERS`."""
+    folders = {source: data / name for source, names in SEALED_FOLDERS.items() if source != "strands" for name in names}
+    return [(f, n) for source, f in folders.items() if f.is_dir() for n in plan_names(f) if is_sealed(source, n)]
+
+
+def _plan(folder: Path, name: str) -> tuple[str, Any]:
+    """Source of a plan and the building that is made of it.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    (plan,) = (plan for n, plan in iter_plans(folder, {name}) if n == name)
+    if isinstance(plan, Refusal):
+        raise InputError(f"{name}: {plan.reason}")
+    source = next(s for s, names in SEALED_FOLDERS.items() if folder.name in names)
+    vast = any(np.ptp(room.polygon, axis=0).prod() > VAST for room in plan.rooms)
+    difficulty = Difficulty(furniture=0.0, clutter=0.0) if vast else Difficulty()
+    return source, erect([plan], difficulty, 1, name=name, kind=source)
+
+
+def plan_pair_rows(folder: Path, name: str) -> list[Row]:
+    """Two scans of a plan, half of their rooms in common."""
+    source, building = _plan(folder, name)
+    settings = PairSettings(overlap=0.5, sensors=("tls", "depth"), rooms=VISITED_ROOMS["plan"])
+    return [merge_row(_grids(make_pair(building, settings, 1, source=source)), physical_building(source, name))]
+
+
+def grid_rows(item: GridItem) -> list[Row]:
+    """A pair of grids, made in a folder that goes with it."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = make_grids(item, [], folder)
+        if made.reason:
+            raise InputError(made.reason)
+        pair = load_grids(Path(folder) / f"{item.name}.npz", mean=True)
+    return [merge_row(pair, physical_building("procedural", str(pair.about["building"])))]
+
+
+def public_rows(source: str, folder: Path) -> list[Row]:
+    """The sealed pairs of a published set; of those that can't be read a row that says why."""
+    out = []
+    for name, pair in iter_public_pairs(folder, source):
+        if not is_sealed(source, name.removeprefix(f"{source}/")):
+            continue
+        if isinstance(pair, Refusal):
+            out.append({"failed": f"{name}: {pair.reason}"})
+        else:
+            out.append(merge_row(_grids(pair), f"{source}/{pair.building}"))
+    return out
+
+
+def robot_rows(data: Path) -> list[Row]:
+    """Halves of each sealed grid of known scale, and halves of grids of two places."""
+    halves, out = [], []
+    folder = data / SEALED_FOLDERS["strands"][0]
+    for number, path in enumerate(sorted(p for p in folder.rglob("*.yaml") if is_sealed_file(p))):
+        try:
+            a, b = cut(read_flat(path), number)
+        except InputError as error:
+            out.append({"failed": f"{path.stem}: {' '.join(str(error).split())[:100]}"})
+            continue
+        place = physical_building("strands", path.stem)
+        halves.append((place, a, b))
+        pair = flat_pair(path.stem, a, b, Sim3(), ("laser2d", "laser2d"), "strands", place, number)
+        out.append(merge_row(_grids(pair), place))
+    firsts = {place: (a, b) for place, a, b in reversed(halves)}
+    for number, (one, other) in enumerate(combinations(sorted(firsts), 2)):
+        flats = firsts[one][0], firsts[other][1]
+        pair = flat_pair(f"{one}+{other}", *flats, Sim3(1.0), ("laser2d", "laser2d"), "strands", one, number)
+        strangers = replace(pair, truth=None, kind="other-building", overlap=0.0, shared=())
+        out.append(merge_row(_grids(strangers), f"{one} + {other}"))
+    return out
+
+
+def cut(flat: Flat, seed: int) -> tuple[Flat, Flat]:
+    """Two parts of a floor, each `HALF` of its free floor, cut across at any angle.
+
+    Raises:
+        InputError: no free floor.
+    """
+    if not len(flat.free):
+        raise InputError("no free floor in it")
+    angle = np.random.default_rng(seed).uniform(0, np.pi)
+    across = np.array([np.cos(angle), np.sin(angle)])
+    low, high = np.quantile(flat.free @ across, [1 - HALF, HALF])
+    return _part(flat, lambda p: p @ across <= high), _part(flat, lambda p: p @ across >= low)
+
+
+def _part(flat: Flat, inside: Callable[[Array], Array]) -> Flat:
+    return replace(flat, walls=flat.walls[inside(flat.walls)], free=flat.free[inside(flat.free)], poses=None)
+
+
+def _grids(pair: Pair) -> GridPair:
+    """A pair as the registration takes it."""
+    a, b = grid_of(pair.a), grid_of(pair.b)
+    free = [c.free if c.poses is None else free_of(c, g) for c, g in ((pair.a, a), (pair.b, b))]
+    about: dict[str, object] = {key: getattr(pair, key) for key in ("kind", "building", "source", "overlap")}
+    seen = (free[0], free[1])
+    return GridPair(pair.name, a, b, seen, pair.truth, common_area(pair, a, b, seen), about | {"sensors": list(pair.sensors)})
+
+
+def merge_row(pair: GridPair, place: str) -> Row:
+    """What became of a pair."""
+    pose, believed, probability = ours(pair)
+    about = {key: pair.about.get(key) for key in ("sensors", "kind", "overlap", "differs")}
+    row = {"place": place, "common": pair.common, **about, "believed": believed, "probability": probability}
+    return row | outcome(pose, pair) | {"answered": pose is not None}
+
+
+# Tables
+
+
+def kind_of_merge(row: Row) -> str:
+    """The row of the table that a pair belongs to."""
+    if row["kind"] != "overlap":
+        alike = "" if fair(row) else ", which nobody can tell apart"
+        return f"{row['group']}: {row['kind'].replace('-', ' ')}{alike}"
+    if row["common"] < 1 or row["overlap"] == 0:
+        return f"{row['group']}: nothing in common"
+    return f"{row['group']}: {'at least' if row['common'] >= LEAST_COMMON else 'less than'} {LEAST_COMMON:g} m² in common"
+
+
+def tables(rows: Sequence[Row]) -> Iterator[str]:
+    """Lines in Markdown: rooms, merges, and what could not be measured."""
+    fine = [row for row in rows if "failed" not in row]
+    rooms = [row for row in fine if row["part"] == "rooms"]
+    yield from ("| rooms, maps of | maps | IoU | MCC | recall | precision |", "|---|---|---|---|---|---|")
+    made = [row for row in rooms if row["group"] != "real plans"]
+    for group, some in [*by_key(rooms, lambda row: row["group"]), ("all made buildings", made)]:
+        scores = [interval_text([r[k] for r in some], [r["place"] for r in some]) for k in ("iou", "mcc", "recall", "precision")]
+        yield f"| {group} | {len(some)} | {' | '.join(scores)} |"
+    yield ""
+    yield "| merges | pairs | buildings | right | 0.1 m, 1° | right and believed | believed, wrong | such buildings, 95 % |"
+    yield "|" + "---|" * 8
+    for group, some in by_key([row for row in fine if row["part"] == "merges"], kind_of_merge):
+        wrong = sum(r["believed"] and not r["right"] for r in some)
+        sums = [sum(r[k] for r in some) for k in ("right", "fine")] + [sum(r["right"] and r["believed"] for r in some)]
+        places = {r["place"] for r in some}
+        low, high = exact_interval(len({r["place"] for r in some if r["believed"] and not r["right"]}), len(places))
+        cells = (len(some), len(places), *sums, wrong, f"{100 * low:.0f}–{100 * high:.0f} %")
+        yield f"| {group} | {' | '.join(map(str, cells))} |"
+    lost = [row for row in rows if "failed" in row]
+    yield from ("", f"Not measured: {len(lost)}{'.' if not lost else ':'}")
+    yield from (f"- {row['part']}, {row['group']}: {row['failed']}" for row in lost)
+
+
+def by_key(rows: Sequence[Row], key: Callable[[Row], str]) -> list[tuple[str, list[Row]]]:
+    """Groups of rows in the order in which they come."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return list(groups.items())
