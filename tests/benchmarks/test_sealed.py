@@ -113,8 +113,7 @@ def test_a_published_set_needs_a_folder(page: Path, module: ModuleType, capsys: 
 def test_the_page_in_the_docs_is_what_the_run_goes_on_with(module: ModuleType) -> None:
     text = (Path(module.__file__).parent.parent / "docs" / "results" / "sealed.md").read_text(encoding="utf-8")
     assert text.startswith(module.HEAD)
-    told = module.blocks(text)
-    assert len(told) == text.count("\n## ")
+    assert len(module.blocks(text)) == text.count("\n## ")
 
 
 def test_what_is_counted(measures: ModuleType) -> None:
