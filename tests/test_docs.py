@@ -91,13 +91,16 @@ def test_python_examples_can_be_read(page: Path) -> None:
 def test_every_command_in_the_docs_exists() -> None:
     """Also those that are not run: the command and its options are known to the parser."""
     known = {c.name: {f for flags, _ in c.arguments for f in flags} for c in COMMANDS}
+    seen = set()
     for page in pages():
         for example in examples(page):
             for command in commands(example) if example.kind == "console" else ():
                 for words in re.findall(r"(?:^|&& |\| )topomerge ([^|&>#]*)", command):
                     name, *rest = words.split()
+                    seen.add(name)
                     flags = {w.partition("=")[0] for w in rest if w.startswith("-")} - {"-v", "--help", "-h"}
                     assert name.startswith("-") or flags <= known[name], f"{page.name}:{example.line}: {command}"
+    assert {"extract", "merge", "atlas"} <= seen
 
 
 def test_links_and_pictures_lead_somewhere() -> None:
@@ -110,7 +113,9 @@ def test_links_and_pictures_lead_somewhere() -> None:
 
 def test_the_exit_statuses_are_told_alike() -> None:
     page = (ROOT / "docs" / "cli.md").read_text()
-    for status in re.findall(r"(?m)^  (\d+) ", EXIT_STATUSES):
+    statuses = re.findall(r"(?m)^  (\d+) ", EXIT_STATUSES)
+    assert {"0", "1", "2"} <= set(statuses)
+    for status in statuses:
         assert f"| {status} |" in page
 
 

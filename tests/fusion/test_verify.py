@@ -38,8 +38,7 @@ def test_the_calibration_fits_its_features():
     assert 0.5 <= found["threshold"] < 1
 
 
-def test_little_evidence_is_no_praise():
-    """Shares of nothing are drawn to what is usual: two walls that just touch must not beat a building that agrees."""
+def test_nothing_at_all_gives_numbers():
     known = dict.fromkeys(("tall_conflict", "crossing", "squares", "bad_squares", "in_place", "pieces", "by_chance"), 0.0)
     known |= {"moved_walls": 0.0, "worst_ratio": 0.5, "hanging": 0.0, "hanging_met": 0.0, "free": 0.0}
     assert np.isfinite(winner_vector(known)).all() and len(winner_vector(known)) == len(WINNER_VECTOR)

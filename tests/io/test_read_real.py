@@ -31,7 +31,9 @@ def test_ipad_clouds_that_lie_on_their_side(data_dir: Path, name: str) -> None:
 
 
 def test_ipad_clouds_that_stand(data_dir: Path) -> None:
-    for path in sorted((data_dir / "ipad_lidar_rooms").glob("pix4d_*/*.ply")):
+    paths = sorted((data_dir / "ipad_lidar_rooms").glob("pix4d_*/*.ply"))
+    assert paths
+    for path in paths:
         cloud = read_points(path)
         assert cloud.warnings == (), path
         assert len(cloud) > 36_000 and cloud.colors is not None

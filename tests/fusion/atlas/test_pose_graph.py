@@ -89,3 +89,18 @@ def test_the_anchor_stays_and_nothing_is_needed():
     assert optimise(poses, [])[2] == poses[2]
     solved = optimise(poses, measured(poses, [(0, 1), (1, 2)], 0.05), anchor=2)
     assert solved[2] == poses[2]
+
+
+def test_measurements_count_less_the_farther_they_are_off():
+    """Two say 0, a third says 30 cm: it pulls with the Cauchy weight of its residual, by half at 15 cm."""
+    edges = [Measured((0, 1), Sim3(0.0, (x, 0.0, 0.0)), PLACE) for x in (0.0, 0.0, 0.3)]
+    x = optimise({0: Sim3(), 1: Sim3()}, edges)[1].translation[0]
+    pull = [(at - x) / (1 + ((at - x) / 0.15) ** 2) for at in (0.0, 0.0, 0.3)]
+    assert sum(pull) == pytest.approx(0.0, abs=1e-5) and 0.0 < x < 0.1
+
+
+def test_weights_of_measurements():
+    """Small residuals: the solution is the weighted mean."""
+    edges = [Measured((0, 1), Sim3(0.0, (x, 0.0, 0.0)), PLACE, weight) for x, weight in ((0.0, 3.0), (0.004, 1.0))]
+    assert optimise({0: Sim3(), 1: Sim3()}, edges)[1].translation[0] == pytest.approx(0.001, abs=1e-5)
+    assert residual(edges[1], {0: Sim3(), 1: Sim3()}) == pytest.approx(0.004)

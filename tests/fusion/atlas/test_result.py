@@ -1,0 +1,63 @@
+"""What an atlas says of itself: components, the weakest link, and words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from topomerge.fusion.atlas.assembly import Link
+from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.matching.poses import PoseHypothesis
+from topomerge.types import Sim3
+
+NAMES = ("west.ply", "east.ply", "north.ply", "south.ply", "attic.ply")
+
+
+def link(i: int, j: int, p: float, against: tuple[int, int] | None = None) -> Link:
+    return Link((i, j), PoseHypothesis(Sim3(), probability=p), float(np.log(p / (1 - p))), against)
+
+
+def atlas(*components: tuple[int, ...], **more: Any) -> AtlasResult:
+    count = sum(map(len, components))
+    return AtlasResult([None] * count, NAMES[:count], components, {k: Sim3() for k in range(count)}, **more)  # type: ignore[arg-type]
+
+
+def test_a_component_is_as_probable_as_its_weakest_link():
+    result = atlas((0, 2), (1, 3, 4), links=(link(0, 2, 0.9), link(1, 3, 0.99), link(3, 4, 0.95)))
+    assert result.probability(0) == pytest.approx(0.9) and result.probability(1) == pytest.approx(0.95)
+    assert [result.component_of(k) for k in range(5)] == [0, 1, 0, 1, 1] and atlas((0,), (1,)).probability(1) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("components", "status", "alone"),
+    [
+        (((0, 1, 2),), "merged", ()),
+        (((0, 2), (1,)), "parted", (1,)),
+        (((0,), (1,)), "abstained", (0, 1)),
+        (((0, 1), (2, 3)), "parted", ()),
+    ],
+)
+def test_the_status_and_who_stands_alone(components, status, alone):
+    assert atlas(*components).status == status and atlas(*components).alone == alone
+
+
+def test_words_name_who_belongs_together_who_stands_apart_and_what_was_thrown_out():
+    result = atlas((0, 1), (2,), links=(link(0, 1, 0.93),), rejected=(link(0, 2, 0.88, (1, 2)), link(1, 2, 0.85)))
+    assert result.words().split("; ") == [
+        "2 maps belong together (west.ply, east.ply), weakest link 0.93",
+        "north.ply stands apart: nothing connects it",
+        "west.ply, north.ply: a match of probability 0.88 by itself was thrown out, east.ply, north.ply contradict it",
+        "east.ply, north.ply: a match of probability 0.85 by itself was thrown out, other maps contradict it",
+    ]
+    assert (
+        atlas((0, 1), (2,), (3,), links=(link(0, 1, 0.93),))
+        .words()
+        .endswith("north.ply, south.ply stand apart: nothing connects them")
+    )
+
+
+def test_words_of_an_atlas_without_links():
+    assert atlas((0,), (1,)).words() == "nothing could be connected: all 2 maps stand apart"
+    assert atlas((0,)).words() == "one map, nothing to connect it with yet" and atlas().words() == "no map"
