@@ -11,6 +11,7 @@ Keys: configs/evaluate.yaml and configs/data/*.yaml; with a task configs/task/<t
 
 from __future__ import annotations
 
+import shlex
 import sys
 
 from topomerge.datasets.core.script import exit_status
@@ -30,7 +31,9 @@ def main(words: list[str]) -> int:
     if {"-h", "--help"} & set(words):
         print(__doc__)
         return 0
-    command = f"python evaluate.py {' '.join(words)}"
+    command = shlex.join(
+        ["python", "evaluate.py", *words]
+    )  # brackets and spaces in quotes, so that a shell takes it as it stands
     task = next((word[len("task=") :] for word in words if word.startswith("task=")), "embedding")
 
     def work() -> None:

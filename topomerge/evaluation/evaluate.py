@@ -35,7 +35,7 @@ from topomerge.evaluation.tables import (
 from topomerge.io.atomic import replacing
 
 Say = Callable[[str], None]
-OF_MERGES = ("merging", "decides", "sites", "independence", "reliability")  # tables that there are where maps are merged
+OF_MERGES = ("merging", "kinds", "decides", "sites", "independence", "reliability")  # tables that there are where maps are merged
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,7 @@ def short(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Eva
         "ranking": lambda: ranking(ranks, settings),
         "matching": lambda: beside(matches, settings),
         "merging": lambda: merging(merges, "area", settings),
+        "kinds": lambda: merging(merges, "modality", settings),
         "decides": lambda: decides(merges),
         "sites": lambda: sites(chosen(merges)),
         "independence": lambda: independence(chosen(merges), settings),

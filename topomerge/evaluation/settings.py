@@ -19,7 +19,7 @@ from topomerge.io.listing import plain
 
 EVALUATED_METHODS = ("full", "assignment", "growing", "consistent", "mutual")
 TABLES = (
-    *("ranking", "matching", "merging", "decides", "sites", "independence", "reliability"),
+    *("ranking", "matching", "merging", "kinds", "decides", "sites", "independence", "reliability"),
     *("overlap", "area", "sensors", "modality", "source", "seen"),
 )
 PREDICTIONS_FORMAT = 2  # raised when predictions on disk change what they hold
