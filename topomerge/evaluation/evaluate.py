@@ -167,7 +167,7 @@ def short(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Eva
         "decides": lambda: decides(merges),
         "sites": lambda: sites(chosen(merges)),
         "independence": lambda: independence(chosen(merges), settings),
-        "reliability": lambda: reliability(matches, merges),
+        "reliability": lambda: reliability(chosen(matches), chosen(merges)),
         **{key: partial(grouped, ranks, matches, key, settings) for key in BY},
     }
     return [table_makers[name]() for name in settings.tables if (merges if name in OF_MERGES else ranks)]

@@ -95,7 +95,7 @@ def independence(merges: Sequence[Row], settings: Evaluation) -> Table:
 
 
 def chosen(merges: Sequence[Row]) -> list[Row]:
-    """Rows of the last way of merging: that with the trained descriptor, where there is one."""
+    """Rows of the last way of merging, or of matching: that with the trained descriptor, where there is one."""
     last = merges[-1]["variant"] if merges else ""
     return [r for r in merges if r["variant"] == last]
 
