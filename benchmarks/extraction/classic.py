@@ -1,0 +1,190 @@
+"""The classic segmentations of grid maps into rooms: the peers of the field.
+
+Written anew from their description in Bormann, Jordan, Li, Hampp and Hägele, "Room segmentation: survey, implementation, and
+analysis", ICRA 2016; the numbers are those that the authors ship with their own implementation (`ipa_room_segmentation`), in metres
+where they count pixels of 5 cm. Each takes the free cells of a map and gives every one that it can reach a room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import ndimage
+
+from benchmarks.extraction.voronoi_graph import critical_lines
+from topomerge.types import Array
+
+DISTANCE_AREAS = (0.35, 163.0)  # m2 of a room's seed
+MORPHOLOGICAL_AREAS = (0.8, 47.0)  # m2 of a room's seed
+VORONOI_AREAS = (0.1, 1e6)  # m2 between critical lines
+DEAD_END_AREA, DEAD_END_WALL = 12.5, 0.75  # m2 and share of walls below which a piece with one neighbour joins it
+SMALL_AREA, SMALL_BORDER = 2.0, 0.2  # m2, and the share of its outline from which it joins
+PASSAGE_WALL, PASSAGE_BORDER, PASSAGE_ENDS = 0.5, 0.15, 0.95  # shares of the outline of a piece between two others
+WIDE_BORDER, WIDE_OTHER, END_BORDER, END_SLACK = 0.2, 0.1, 0.1, 0.05  # shares of an outline that no door has
+SQUARE = np.ones((3, 3), bool)
+
+
+def distance_transform(free: Array, cell: float) -> Array:
+    """Seeds are what is further from everything occupied than a threshold: the one that gives most seeds of a room's size.
+
+    Args:
+        free: (h, w) bool.
+        cell: m, edge of a cell.
+
+    Returns:
+        (h, w) int32 room of each cell, -1 none.
+    """
+    clearance = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1]
+    best, most = np.zeros(free.shape, np.int32), 0
+    for threshold in range(1, int(clearance.max()) + 1):
+        seeds, count = _pieces(clearance > threshold, cell, DISTANCE_AREAS, SQUARE)
+        if count > most:
+            best, most = seeds, count
+    return flood(best, free)
+
+
+def morphological(free: Array, cell: float) -> Array:
+    """Free space is eroded cell by cell; a piece that comes apart and has a room's size is a seed, and is taken out.
+
+    Args:
+        free: (h, w) bool.
+        cell: m, edge of a cell.
+
+    Returns:
+        (h, w) int32 room of each cell, -1 none.
+    """
+    left, seeds, total = free.copy(), np.zeros(free.shape, np.int32), 0
+    while left.any():
+        left = ndimage.binary_erosion(left, SQUARE)
+        pieces, count = _pieces(left, cell, MORPHOLOGICAL_AREAS, SQUARE)
+        seeds[pieces > 0] = pieces[pieces > 0] + total
+        left &= pieces == 0
+        total += count
+    return flood(seeds, free)
+
+
+def voronoi(free: Array, cell: float) -> Array:
+    """Critical lines of the Voronoi graph cut free space; pieces that no door parts are joined again.
+
+    Args:
+        free: (h, w) bool.
+        cell: m, edge of a cell.
+
+    Returns:
+        (h, w) int32 room of each cell, -1 none.
+    """
+    cut = free.copy()
+    for rows, columns in critical_lines(free, cell):
+        cut[rows, columns] = False
+    pieces, count = _pieces(cut, cell, VORONOI_AREAS, None)
+    labels = flood(pieces, free)
+    return joined(labels, count, cell) if count else labels
+
+
+METHODS: dict[str, Callable[[Array, float], Array]] = {
+    "voronoi": voronoi,
+    "distance": distance_transform,
+    "morphological": morphological,
+}
+
+
+def _pieces(mask: Array, cell: float, areas: tuple[float, float], structure: Array | None) -> tuple[Array, int]:
+    """(h, w) int32 connected pieces of a size between two areas (m2), numbered from 1, and how many there are."""
+    pieces, count = ndimage.label(mask, structure)
+    area = np.bincount(pieces.ravel(), minlength=count + 1) * cell**2
+    fits = (area >= areas[0]) & (area <= areas[1])
+    fits[0] = False
+    number = np.where(fits, np.cumsum(fits), 0).astype(np.int32)
+    return number[pieces], int(fits.sum())
+
+
+def flood(seeds: Array, free: Array) -> Array:
+    """(h, w) int32 free cells by the seed (from 1) whose wave front reaches them first, from 0; -1: none does."""
+    labels = np.pad(np.where(free, seeds, 0).astype(np.int32), 1)
+    open_cells = np.pad(free, 1).ravel() & (labels.ravel() == 0)
+    flat, width = labels.ravel(), labels.shape[1]
+    around = np.array([-1, 1, -width, width, -width - 1, -width + 1, width - 1, width + 1])
+    front = np.flatnonzero(flat)
+    while len(front):
+        to, source = (front[:, None] + around).ravel(), np.repeat(front, len(around))
+        inside = (to >= 0) & (to < len(flat))
+        to, source = to[inside], source[inside]
+        to, first = np.unique(np.where(open_cells[to], to, -1), return_index=True)
+        to, source = to[to >= 0], source[first[to >= 0]]
+        flat[to], open_cells[to] = flat[source], False
+        front = to
+    return labels[1:-1, 1:-1] - 1
+
+
+def contacts(labels: Array, count: int) -> Array:
+    """(count + 1, count + 1) sides that cells of two pieces share; the last is what is not free."""
+    padded = np.pad(np.where(labels < 0, count, labels), 1, constant_values=count)
+    out = np.zeros((count + 1, count + 1), np.int64)
+    for a, b in ((padded[:, 1:], padded[:, :-1]), (padded[1:], padded[:-1])):
+        apart = a != b
+        np.add.at(out, (a[apart], b[apart]), 1)
+    return out + out.T
+
+
+def joined(labels: Array, count: int, cell: float) -> Array:
+    """Pieces between critical lines joined by the survey's four rules, one after the other, the smallest piece first."""
+    touch = contacts(labels, count).astype(float)
+    area = np.bincount(labels[labels >= 0], minlength=count) * cell**2
+    name = np.arange(count)
+    for rule in (_dead_end, _small, _passage, _wide):
+        while True:
+            order = [i for i in np.argsort(area, kind="stable") if area[i] > 0]
+            pair = next(((i, j) for i in order for j in rule(touch, area, int(i))), None)
+            if pair is None:
+                break
+            _join(touch, area, name, *pair)
+    _, number = np.unique(name, return_inverse=True)
+    return np.where(labels >= 0, number[np.maximum(labels, 0)], -1).astype(np.int32)
+
+
+def _join(touch: Array, area: Array, name: Array, i: int, j: int) -> None:
+    """Piece i becomes part of piece j."""
+    touch[j] += touch[i]
+    touch[:, j] += touch[:, i]
+    touch[i] = touch[:, i] = touch[j, j] = 0
+    area[j] += area[i]
+    area[i] = 0
+    name[name == i] = j
+
+
+def _shares(touch: Array, i: int) -> tuple[Array, float, Array]:
+    """Shares of a piece's outline by neighbour, of walls, and its neighbours, the longest border first."""
+    outline = max(float(touch[i].sum()), 1.0)
+    shares = touch[i, :-1] / outline
+    order = np.argsort(-shares, kind="stable")
+    return shares, float(touch[i, -1]) / outline, order[shares[order] > 0]
+
+
+def _dead_end(touch: Array, area: Array, i: int) -> list[int]:
+    _, wall, near = _shares(touch, i)
+    return near.tolist() if len(near) == 1 and area[i] < DEAD_END_AREA and wall <= DEAD_END_WALL else []
+
+
+def _small(touch: Array, area: Array, i: int) -> list[int]:
+    shares, _, near = _shares(touch, i)
+    return near[:1].tolist() if len(near) and area[i] < SMALL_AREA and shares[near[0]] > SMALL_BORDER else []
+
+
+def _passage(touch: Array, area: Array, i: int) -> list[int]:
+    shares, wall, near = _shares(touch, i)
+    if not len(near) or len(near) > 2 or wall <= PASSAGE_WALL or shares[near[0]] <= PASSAGE_BORDER:
+        return []
+    others, other_wall, beyond = _shares(touch, int(near[0]))
+    ends = other_wall + float(others[beyond[:2]].sum())
+    return near[:1].tolist() if len(beyond) <= 2 or ends >= PASSAGE_ENDS else []
+
+
+def _wide(touch: Array, area: Array, i: int) -> list[int]:
+    shares, wall, near = _shares(touch, i)
+    out = []
+    for j in near.tolist():
+        end = shares[j] > END_BORDER and abs(wall - (1 - 2 * shares[j])) < END_SLACK
+        if (shares[j] > WIDE_BORDER or end) and _shares(touch, j)[0][i] > WIDE_OTHER:
+            out.append(j)
+    return out

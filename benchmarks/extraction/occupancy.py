@@ -1,0 +1,120 @@
+"""What a robot would draw of a scan: grids of its storeys from above, for the classic segmentations, and what those say of the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+from scipy import ndimage
+from topomerge.datasets.simulation.floor_truth import NOT_JUDGED, TRUTH_CELL, WORD_SPREAD, Truth, Verdict, judge, spread
+
+from benchmarks.extraction.classic import METHODS
+from benchmarks.extraction.scans import Scan
+from topomerge.types import Array
+
+CELL = 0.05  # m: the maps of the survey
+BAND = (0.3, 1.9)  # m above the floor, in which points are obstacles
+LEAST_POINTS = 1  # of an obstacle
+CLOSED = 0.1  # m: gaps between points of floor and ceiling that are closed
+NEAR_FLOOR = 0.3  # m below the floor and above the ceiling that belong to a storey
+
+
+@dataclass(frozen=True, eq=False)
+class FloorGrid:
+    """A storey from above, in the scan's own frame.
+
+    Args:
+        free: (h, w) bool.
+        seen: (h, w) bool, free or occupied.
+        origin: (2,) m, corner of the first cell.
+        floor: m, in the scan's frame.
+    """
+
+    free: Array
+    seen: Array
+    origin: Array
+    floor: float
+
+    def centres(self, cells: Array) -> Array:
+        """(n, 3) m, of the marked cells."""
+        rows, columns = np.nonzero(cells)
+        x, y = self.origin[0] + (columns + 0.5) * CELL, self.origin[1] + (rows + 0.5) * CELL
+        return np.column_stack([x, y, np.full(len(x), self.floor)])
+
+
+def floor_grids(scan: Scan) -> list[FloorGrid | None]:
+    """The grid of each true storey, by its true floor and ceiling; None where the scan has nothing of it.
+
+    A cell is occupied where points lie in the band, else free where others do: floor, ceiling, lamps or a lintel.
+    """
+    truth = scan.truth
+    assert truth is not None
+    points = scan.cloud.points.astype(np.float64) + scan.cloud.shift
+    height = truth.place(points)[:, 2]
+    scale = float(truth.matrix[2, 2])
+    out: list[FloorGrid | None] = []
+    for floor, room_height in zip(truth.floors.tolist(), truth.height.tolist(), strict=True):
+        above = height - floor
+        level = (above > -NEAR_FLOOR) & (above < room_height + NEAR_FLOOR)
+        if not level.any():
+            out.append(None)
+            continue
+        origin = points[level, :2].min(axis=0) - 2 * CELL
+        columns, rows = np.floor((points[level, :2] - origin) / CELL).astype(np.int64).T
+        shape = (int(rows.max()) + 3, int(columns.max()) + 3)
+        cell = rows * shape[1] + columns
+        within = (above[level] > BAND[0]) & (above[level] < min(BAND[1], room_height - NEAR_FLOOR))
+        occupied = np.bincount(cell[within], minlength=shape[0] * shape[1]).reshape(shape) >= LEAST_POINTS
+        seen = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape) > 0
+        reach = round(CLOSED / CELL)
+        if reach:
+            seen |= ndimage.binary_closing(np.pad(seen, reach), np.ones((2 * reach + 1,) * 2))[reach:-reach, reach:-reach]
+        out.append(FloorGrid(seen & ~occupied, seen, origin, (floor - float(truth.matrix[2, 3])) / scale))
+    return out
+
+
+def segmented(scan: Scan, method: str, grids: list[FloorGrid | None]) -> tuple[Array, int]:
+    """The room of each column of the truth's raster by a classic method, -1 none, and how many rooms there are.
+
+    Words are spread as those of our maps are (`floor_truth.said`): furniture has the room that is the nearest.
+    """
+    truth = scan.truth
+    assert truth is not None
+    out, total = np.full(truth.raster.shape, -1, np.int32), 0
+    for k, grid in enumerate(grids):
+        if grid is None:
+            continue
+        labels = METHODS[method](grid.free, CELL)
+        if not (labels >= 0).any():
+            continue
+        filled = np.where(grid.seen, labels[tuple(ndimage.distance_transform_edt(labels < 0, return_distances=False, return_indices=True))], -1)
+        stood, over = (_raster(truth, grid, cells) for cells in (labels, filled))
+        of_floor = np.append(truth.visited, False)[truth.raster[k]] & (truth.raster[k] >= 0)
+        wide = np.where(of_floor, spread(stood, WORD_SPREAD), spread(stood, TRUTH_CELL))
+        wide = np.where(wide >= 0, wide, np.where(of_floor, over, -1))
+        wide = np.where(of_floor, spread(wide, WORD_SPREAD), wide)
+        out[k] = np.where(wide >= 0, wide + total, -1)
+        total += int(labels.max()) + 1
+    return out, total
+
+
+def _raster(truth: Truth, grid: FloorGrid, labels: Array) -> Array:
+    """(rows, columns) int32 labels of cells on the raster of the truth, -1 none."""
+    cells = labels >= 0
+    ij, inside = truth.columns(truth.place(grid.centres(cells)))
+    out = np.full(truth.raster.shape[1:], -1, np.int32)
+    out[ij[inside, 0], ij[inside, 1]] = labels[cells][inside]
+    return out
+
+
+def judged(truth: Truth, columns: Array, count: int) -> Verdict:
+    """The scores of rooms alone. Rooms that lie mostly in true ones that were not visited are not held against the method."""
+    foreign = (truth.raster >= 0) & ~np.append(truth.visited, False)[truth.raster] & (columns >= 0)
+    every = (truth.raster != NOT_JUDGED) & (columns >= 0)
+    glimpsed = 2 * np.bincount(columns[foreign], minlength=count) > np.bincount(columns[every], minlength=count)
+    edges = np.zeros(0, [("rooms", "<i4", 2), ("kind", "<U8"), ("centre", "<f8", 3)])
+    rooms = np.zeros(count, [("glimpsed", bool)])
+    rooms["glimpsed"] = glimpsed
+    storeys = np.zeros(0, [("floor", "<f8")])
+    return judge(SimpleNamespace(rooms=rooms, edges=edges, storeys=storeys), truth, columns)
