@@ -166,15 +166,22 @@ def look() -> list[Case]:
     return [Case("by eye", "file", name) for name in LOOK]
 
 
+def peers() -> list[Case]:
+    """What the classic methods are compared on: every grid with true rooms, and scans of each sensor from above."""
+    return [*grids(), *simulated(), *(case for case in plans() if case.source == "campus")]
+
+
 GROUPS: dict[str, Callable[[], list[Case]]] = {
     f.__name__: f for f in (dev, simulated, hard, plans, grids, ifc, pairs, invariance, look)
 }
+SELECTIONS: dict[str, Callable[[], list[Case]]] = {"peers": peers}  # of the groups' cases: "all" holds them already
 
 
 def chosen(names: Iterable[str], limit: int | None = None) -> list[Case]:
     """Cases of groups ("all": all but `dev`), `limit` of each set; of a pair both."""
     wanted = list(names)
     groups: list[Any] = [g for name, g in GROUPS.items() if name in wanted or ("all" in wanted and name != "dev")]
+    groups += [g for name, g in SELECTIONS.items() if name in wanted]
     out: list[Case] = []
     for group in groups:
         count: dict[str, int] = {}

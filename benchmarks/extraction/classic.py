@@ -1,8 +1,8 @@
 """The classic segmentations of grid maps into rooms: the peers of the field.
 
 Written anew from their description in Bormann, Jordan, Li, Hampp and Hägele, "Room segmentation: survey, implementation, and
-analysis", ICRA 2016; the numbers are those that the authors ship with their own implementation (`ipa_room_segmentation`), in metres
-where they count pixels of 5 cm. Each takes the free cells of a map and gives every one that it can reach a room.
+analysis", ICRA 2016; the numbers are those that the authors ship with their own implementation (`ipa_room_segmentation`), in
+metres where they count pixels of 5 cm. Each takes the free cells of a map and gives every one that it can reach a room.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ def distance_transform(free: Array, cell: float) -> Array:
 
 
 def morphological(free: Array, cell: float) -> Array:
-    """Free space is eroded cell by cell; a piece that comes apart and has a room's size is a seed, and is taken out.
+    """Free space is eroded cell by cell; a piece that has come apart from others and has a room's size is a seed and taken out, and
+    so is one that would vanish in the next step.
 
     Args:
         free: (h, w) bool.
@@ -54,13 +55,28 @@ def morphological(free: Array, cell: float) -> Array:
     Returns:
         (h, w) int32 room of each cell, -1 none.
     """
-    left, seeds, total = free.copy(), np.zeros(free.shape, np.int32), 0
-    while left.any():
-        left = ndimage.binary_erosion(left, SQUARE)
-        pieces, count = _pieces(left, cell, MORPHOLOGICAL_AREAS, SQUARE)
-        seeds[pieces > 0] = pieces[pieces > 0] + total
-        left &= pieces == 0
-        total += count
+    low, high = (area / cell**2 for area in MORPHOLOGICAL_AREAS)
+    pieces, count = ndimage.label(free, SQUARE)
+    apart, seeds, total = np.zeros(count + 1, bool), np.zeros(free.shape, np.int32), 0
+    while count:
+        smaller, number = ndimage.label(ndimage.binary_erosion(pieces > 0, SQUARE), SQUARE)
+        whole = np.zeros(number + 1, int)  # the piece that each smaller one was of
+        whole[smaller[smaller > 0]] = pieces[smaller > 0]
+        area, before = np.bincount(smaller.ravel(), minlength=number + 1), np.bincount(pieces.ravel(), minlength=count + 1)
+        real = area >= low
+        real[0] = False
+        parts = np.bincount(whole[real], minlength=count + 1)
+        apart = real & (apart[whole] | (parts[whole] > 1))
+        vanishing = (parts == 0) & (before >= low) & (before <= high)
+        vanishing[0] = False
+        for taken, of in ((vanishing, pieces), (apart & (area <= high), smaller)):
+            seed = taken[of]
+            names = np.cumsum(taken)[of[seed]]
+            seeds[seed] = names + total
+            total += int(taken.sum())
+        left = real & ~(apart & (area <= high))
+        pieces, count = np.where(left, np.cumsum(left), 0)[smaller], int(left.sum())
+        apart = np.concatenate([[False], apart[left]])
     return flood(seeds, free)
 
 

@@ -1,4 +1,4 @@
-"""One case of the extraction's benchmark: the map is made and judged."""
+"""One case of the extraction's benchmark: the map is made and judged, by a preset or by a classic method on its grid."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from topomerge.datasets.simulation.floor_truth import Truth, Verdict
 
 from benchmarks.extraction.agree import keep
+from benchmarks.extraction.classic import METHODS
+from benchmarks.extraction.occupancy import floor_grids, judged, segmented, survey_scores
 from benchmarks.extraction.scans import Case, Scan, load
+from topomerge.types import Array
 
 Row = dict[str, Any]
 NAN = float("nan")
@@ -33,6 +37,8 @@ def measure(case: Case, preset: str, key: str, scans: Path, data: Path | None, o
         except Exception as error:
             return {**row, "key": "", "missing": f"{type(error).__name__}: {error}"}
         row["points"] = len(scan.cloud)
+        if preset in METHODS:
+            return _rounded({**row, **_peer_measured(scan, preset, case, out if picture else None)})
         return _rounded({**row, **_measured(scan, preset, case, out, picture, key)})
 
 
@@ -42,6 +48,8 @@ def warm(preset: str) -> None:
     from topomerge.errors import InputError
     from topomerge.extraction.extract import extract
 
+    if preset in METHODS:
+        return
     x, y = (a.ravel() for a in np.meshgrid(np.arange(0, 4, 0.05), np.arange(0, 4, 0.05)))
     box = [np.column_stack([x, y, np.full(len(x), z)]) for z in (0.0, 2.5)]
     box += [np.column_stack([np.full(len(x), z), x, 2.5 / 4 * y]) for z in (0.0, 4.0)]
@@ -71,6 +79,30 @@ def _measured(scan: Scan, preset: str, case: Case, out: Path, picture: bool, key
     return {**row, **_judged(scan, extracted, f"{case.name}  {preset}", path if picture else None, out / "said" / f"{key}.npz")}
 
 
+def _peer_measured(scan: Scan, method: str, case: Case, picture_to: Path | None) -> Row:
+    """A classic method on the scan's grids; it has neither doors nor storeys to be judged by."""
+    if scan.truth is None:
+        return {"missing": "nothing is true about it"}
+    began = process_time()
+    grids = floor_grids(scan)
+    columns, count = segmented(scan, method, grids)
+    row: Row = {"seconds": process_time() - began, "found": count}
+    verdict = judged(scan.truth, columns, count)
+    if picture_to is not None:
+        from benchmarks.extraction.picture import save_columns
+
+        title = f"{case.name}  {method}: IoU {verdict.rooms.iou:.2f}, rooms {count}/{verdict.true_rooms}"
+        save_columns(scan, columns, title, picture_to / "pictures" / f"{case.name}-{method}.png")
+    return row | _room_row(scan.truth, columns, verdict)
+
+
+def _room_row(truth: Truth, columns: Array, verdict: Verdict) -> Row:
+    rooms = verdict.rooms
+    row: Row = {"iou": rooms.iou, "mcc": rooms.mcc, "precision": rooms.precision, "recall": rooms.recall}
+    row["survey_precision"], row["survey_recall"] = survey_scores(truth, columns)
+    return row | {"rooms": verdict.true_rooms}
+
+
 def _judged(scan: Scan, extracted: Any, name: str, picture: Path | None, said_to: Path) -> Row:
     from topomerge.datasets.simulation.floor_truth import judge, said
 
@@ -79,10 +111,10 @@ def _judged(scan: Scan, extracted: Any, name: str, picture: Path | None, said_to
     keep(said_to, columns, scan.truth)
     verdict = judge(extracted, scan.truth, columns)
     rooms, doors, edges = verdict.rooms, verdict.doors, verdict.edges
-    row: Row = {"iou": rooms.iou, "mcc": rooms.mcc, "precision": rooms.precision, "recall": rooms.recall}
+    row = _room_row(scan.truth, columns, verdict)
     row |= {"door_precision": doors.precision, "door_recall": doors.recall}
     row |= {"edge_precision": edges.precision, "edge_recall": edges.recall, "storeys": float(verdict.storeys)}
-    row |= {"rooms": verdict.true_rooms, "doors": doors.true, "levels": verdict.true_storeys}
+    row |= {"doors": doors.true, "levels": verdict.true_storeys}
     order = [i for i in np.argsort(rooms.each, kind="stable") if scan.truth.visited[i]][:4]
     row["worst"] = {scan.rooms[i].name or str(i): round(float(rooms.each[i]), 2) for i in order}
     if picture:

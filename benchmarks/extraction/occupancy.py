@@ -1,4 +1,4 @@
-"""What a robot would draw of a scan: grids of its storeys from above, for the classic segmentations, and what those say of the truth."""
+"""What a robot would draw of a scan: its storeys from above, for the classic segmentations; and what those say of the truth."""
 
 from __future__ import annotations
 
@@ -7,10 +7,19 @@ from types import SimpleNamespace
 
 import numpy as np
 from scipy import ndimage
-from topomerge.datasets.simulation.floor_truth import NOT_JUDGED, TRUTH_CELL, WORD_SPREAD, Truth, Verdict, judge, spread
+from topomerge.datasets.simulation.floor_truth import (
+    LEAST_SEEN_AREA,
+    NOT_JUDGED,
+    TRUTH_CELL,
+    Truth,
+    Verdict,
+    column_words,
+    judge,
+)
 
 from benchmarks.extraction.classic import METHODS
 from benchmarks.extraction.scans import Scan
+from topomerge.metrics import contingency
 from topomerge.types import Array
 
 CELL = 0.05  # m: the maps of the survey
@@ -60,7 +69,7 @@ def floor_grids(scan: Scan) -> list[FloorGrid | None]:
         if not level.any():
             out.append(None)
             continue
-        origin = points[level, :2].min(axis=0) - 2 * CELL
+        origin = points[level, :2].min(axis=0) - 2.5 * CELL  # points of a robot's grid are in the middle of their cells
         columns, rows = np.floor((points[level, :2] - origin) / CELL).astype(np.int64).T
         shape = (int(rows.max()) + 3, int(columns.max()) + 3)
         cell = rows * shape[1] + columns
@@ -88,13 +97,11 @@ def segmented(scan: Scan, method: str, grids: list[FloorGrid | None]) -> tuple[A
         labels = METHODS[method](grid.free, CELL)
         if not (labels >= 0).any():
             continue
-        filled = np.where(grid.seen, labels[tuple(ndimage.distance_transform_edt(labels < 0, return_distances=False, return_indices=True))], -1)
+        nearest = ndimage.distance_transform_edt(labels < 0, return_distances=False, return_indices=True)
+        filled = np.where(grid.seen, labels[tuple(nearest)], -1)
         stood, over = (_raster(truth, grid, cells) for cells in (labels, filled))
-        of_floor = np.append(truth.visited, False)[truth.raster[k]] & (truth.raster[k] >= 0)
-        wide = np.where(of_floor, spread(stood, WORD_SPREAD), spread(stood, TRUTH_CELL))
-        wide = np.where(wide >= 0, wide, np.where(of_floor, over, -1))
-        wide = np.where(of_floor, spread(wide, WORD_SPREAD), wide)
-        out[k] = np.where(wide >= 0, wide + total, -1)
+        words = column_words(truth, k, stood, over)
+        out[k] = np.where(words >= 0, words + total, -1)
         total += int(labels.max()) + 1
     return out, total
 
@@ -118,3 +125,20 @@ def judged(truth: Truth, columns: Array, count: int) -> Verdict:
     rooms["glimpsed"] = glimpsed
     storeys = np.zeros(0, [("floor", "<f8")])
     return judge(SimpleNamespace(rooms=rooms, edges=edges, storeys=storeys), truth, columns)
+
+
+def survey_scores(truth: Truth, columns: Array) -> tuple[float, float]:
+    """Precision and recall as the survey has them, by area: the mean over the rooms of a map of the largest share of one that
+    lies in one true room, and the mean over the true rooms of the largest share of one that lies in one room of the map. Cutting
+    a room costs recall alone, and uniting two costs precision alone. Only what is of visited rooms counts.
+    """
+    visited = (truth.raster >= 0) & np.append(truth.visited, False)[truth.raster]
+    count = int(columns.max()) + 1
+    both = contingency(truth.raster[visited], columns[visited], len(truth.visited), count)
+    area = np.bincount(truth.raster[visited], minlength=len(truth.visited))
+    expected, of_map = area * TRUTH_CELL**2 >= LEAST_SEEN_AREA, both.sum(axis=0)
+    if not count or not expected.any():
+        return float("nan"), 0.0
+    real = of_map * TRUTH_CELL**2 >= LEAST_SEEN_AREA
+    precision = float((both.max(axis=0)[real] / of_map[real]).mean()) if real.any() else float("nan")
+    return precision, float((both.max(axis=1)[expected] / area[expected]).mean())

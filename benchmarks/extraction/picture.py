@@ -39,6 +39,28 @@ def save(scan: Scan, map: TopometricMap, columns: Array, verdict: Any, title: st
             figure.savefig(beside, format="png", dpi=80)
 
 
+def save_columns(scan: Scan, columns: Array, title: str, path: Path) -> None:
+    """The columns' rooms of a method that makes no map, one panel a storey, with the true rooms outlined."""
+    truth = scan.truth
+    assert truth is not None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shades = np.random.default_rng(0).integers(90, 240, (int(columns.max()) + 2, 3), np.uint8)
+    shades[0] = 255
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        levels, rows, width = columns.shape
+        figure = Figure(figsize=(WIDE, levels * (WIDE * rows / width + 0.3) + 0.5))
+        FigureCanvasAgg(figure)
+        (x, y), (right, top) = truth.origin, truth.origin + np.array([width, rows]) * TRUTH_CELL
+        for k, axes in enumerate(figure.subplots(levels, 1, squeeze=False).ravel()):
+            axes.imshow(shades[columns[k] + 1], origin="lower", extent=(x, right, y, top), interpolation="nearest")
+            for room in (r for r in scan.rooms if r.storey == k):
+                axes.plot(*np.concatenate([room.polygon, room.polygon[:1]]).T, color="#c00000", linewidth=1.0)
+        figure.suptitle(title, fontsize=9)
+        with replacing(path) as beside:
+            figure.savefig(beside, format="png", dpi=80)
+
+
 def _storey(axes: Any, scan: Scan, map: TopometricMap, labels: Array, k: int, verdict: Any, points: Array) -> None:
     truth = scan.truth
     assert truth is not None

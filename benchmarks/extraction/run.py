@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.extraction.agree import with_agreement
-from benchmarks.extraction.cases import GROUPS, chosen
+from benchmarks.extraction.cases import GROUPS, SELECTIONS, chosen
+from benchmarks.extraction.classic import METHODS
 from benchmarks.extraction.measure import Row, measure
 from benchmarks.extraction.scans import Case
 from benchmarks.extraction.tables import listing, summary, write
@@ -36,8 +37,15 @@ def key_of(case: Case, preset: str, code: str) -> str:
     from topomerge.extraction.parameters import PRESETS
 
     varied = [case.thin, case.turn, case.shuffle, case.voxel]
-    inputs = [case.key, varied, asdict(PRESETS[preset]), code]
+    inputs = [case.key, varied, preset if preset in METHODS else asdict(PRESETS[preset]), code]
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def _peer_code() -> str:
+    """What the rows of classic methods depend on: their own files, and the judge's."""
+    files = (Path(__file__).parent / f"{name}.py" for name in ("classic", "occupancy", "voronoi_graph"))
+    own = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    return own + code_digest(*MAKERS[1:])
 
 
 def run(tasks: list[tuple[Any, ...]], jobs: int) -> Iterator[tuple[int, Row]]:
@@ -72,7 +80,8 @@ def results(cases: list[Case], presets: list[str], settings: argparse.Namespace)
         for key in {case.key for case in cases}:
             (scans / f"{key}.npz").unlink(missing_ok=True)
     data = Path(os.environ["TOPOMERGE_DATA"]) if os.environ.get("TOPOMERGE_DATA") else None
-    wanted = [(case, preset, key_of(case, preset, code)) for case in cases for preset in presets]
+    codes = {preset: _peer_code() if preset in METHODS else code for preset in presets}
+    wanted = [(case, preset, key_of(case, preset, codes[preset])) for case in cases for preset in presets]
     missing = [w for w in wanted if w[2] not in rows_by_key or (settings.pictures and not rows_by_key[w[2]].get("picture"))]
     missing = list({w[2]: w for w in missing}.values())
     with (out / "results.jsonl").open("a", encoding="utf-8") as file:
@@ -96,16 +105,17 @@ def _short(row: Row) -> str:
         return str(row.get("missing") or row["error"])[:160]
     if "iou" not in row:
         return f"{row['found']} rooms, {row['seconds']:.1f} s"
-    doors = f"{row['door_precision']:.2f}/{row['door_recall']:.2f}"
+    doors = f"{row['door_precision']:.2f}/{row['door_recall']:.2f}" if "door_precision" in row else "–"
     return f"IoU {row['iou']:.3f} MCC {row['mcc']:.3f} doors {doors} {row['seconds']:.1f} s"
 
 
 def arguments(words: list[str] | None) -> argparse.Namespace:
     """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--set", nargs="+", choices=[*GROUPS, "all"], default=[], help="groups of cases; all: all but dev")
+    names = [*GROUPS, *SELECTIONS, "all"]
+    parser.add_argument("--set", nargs="+", choices=names, default=[], help="groups of cases; all: all but dev")
     parser.add_argument("--dev", action="store_true", help="the set for development (the default)")
-    parser.add_argument("--preset", default="default", help="one or more presets, with commas between them")
+    parser.add_argument("--preset", default="default", help="presets, or classic methods, with commas between them")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--limit", type=int, help="so many cases of each set")
     parser.add_argument("--quick", action="store_true", help="two cases of each set")

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from topomerge.datasets.core.physical import physical_building
 from topomerge.datasets.simulation.floor_truth import Truth, in_frame
 from topomerge.datasets.simulation.scanner import moved
 
@@ -57,12 +58,9 @@ class Case:
 
     @property
     def place(self) -> str:
-        """The building that it is a map of: what intervals are drawn over."""
-        if self.source in ("procedural", "r2v"):
-            return f"{self.source}/{self.building}/{self.seed}"
-        if self.source == "gdc":
-            return self.source
-        return f"{self.source.removesuffix('-plan')}/{self.building.removesuffix('_furnitures').rstrip('0123456789')}"
+        """The physical building that it is a map of: what intervals are drawn over."""
+        made = f"{self.building}-{self.seed}" if self.source == "procedural" else self.building
+        return physical_building(self.source, made)
 
     @property
     def name(self) -> str:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.extraction.classic import METHODS
 from topomerge.io.atomic import replacing
-from topomerge.statistics import bootstrap
+from topomerge.statistics import interval_text
 
 Row = dict[str, Any]
 COLUMNS = {
@@ -18,6 +20,9 @@ COLUMNS = {
 FAILED = 0.5  # mean IoU
 MARK = "extraction"
 FIRST = ("thesis", "default")  # presets, in this order
+PEER_COLUMNS = {
+    "iou": "IoU", "mcc": "MCC", "precision": "P", "recall": "R", "survey_precision": "survey P", "survey_recall": "survey R",
+}  # fmt: skip
 
 
 def listing(rows: list[Row]) -> str:
@@ -42,6 +47,8 @@ def summary(rows: list[Row]) -> str:
 def report(rows: list[Row], command: str) -> str:
     """The section for the results: the presets beside each other, by set and by kind of building, agreement, and failures."""
     rows = [r for r in rows if not r.get("missing")]
+    if any(r["preset"] in METHODS for r in rows):
+        return peers_report(rows, command)
     presets = [p for p in FIRST if any(r["preset"] == p for r in rows)]
     judged = [r for r in rows if "iou" in r]
     parts = [f"`{command}`", _about(judged), _beside(judged, presets, "set", "set")]
@@ -54,6 +61,26 @@ def report(rows: list[Row], command: str) -> str:
     return "\n\n".join(p for p in parts if p)
 
 
+def peers_report(rows: list[Row], command: str) -> str:
+    """The section of the classic methods: a line a set and method, the same maps for each."""
+    judged = [r for r in rows if "iou" in r]
+    methods = [m for m in ("default", *METHODS) if any(r["preset"] == m for r in judged)]
+    lines = _head(["set", "maps", "method", *PEER_COLUMNS.values(), "s"])
+    for group in dict.fromkeys(r["set"] for r in judged):
+        for method in methods:
+            these = [r for r in judged if (r["set"], r["preset"]) == (group, method)]
+            first = [group, str(len(these))] if method == methods[0] else ["", ""]
+            cells = [_mean(these, k, k in ("iou", "mcc")) for k in PEER_COLUMNS]
+            lines.append(_line([*first, "ours" if method == "default" else method, *cells, _mean(these, "seconds", False)]))
+    cases, places = len({r["case"] for r in judged}), len({r["place"] for r in judged})
+    about = f"{cases} maps of {places} physical buildings. {BRACKETS}"
+    return "\n\n".join([f"`{command}`", about, "\n".join(lines)])
+
+
+BRACKETS = (
+    "Means over the maps of a set; in brackets 95 % intervals over its physical buildings, the range of the buildings where "
+    "they are fewer than eight."
+)
 AGREEMENT = (
     "Agreement of two maps of one place: mean and worst over the pairs of maps of the mean IoU of the rooms assigned to each "
     "other one to one, on the floor that both saw; of all: rooms that got no partner count 0. Two sessions have other sensors, "
@@ -65,7 +92,7 @@ AGREEMENT = (
 def _about(rows: list[Row]) -> str:
     cases, places = len({r["case"] for r in rows}), len({r["place"] for r in rows})
     return (
-        f"{cases} maps of {places} buildings. Means over the maps of a set; in brackets 95 % intervals over its buildings. "
+        f"{cases} maps of {places} physical buildings. {BRACKETS} "
         "P and R: precision and recall (rooms at IoU 0.5, doors within 0.5 m, pairs of rooms that are joined). Storeys: share of "
         "the maps with as many as there are, each within 0.5 m. Seconds of work of one core."
     )
@@ -151,8 +178,5 @@ def _cell(value: Any) -> str:
 
 def _mean(rows: list[Row], key: str, interval: bool) -> str:
     values = np.array([r.get(key, np.nan) for r in rows], float)
-    mean, low, high = bootstrap(values, np.array([r["place"] for r in rows]))
-    if not np.isfinite(mean):
-        return "–"
-    places = len({r["place"] for r, v in zip(rows, values, strict=True) if np.isfinite(v)})
-    return f"{mean:.2f}" + (f" [{low:.2f}, {high:.2f}]" if interval and places > 1 else "")
+    text = interval_text(values, np.array([r["place"] for r in rows]))
+    return text if interval else re.split(r"[, ]", text)[0]

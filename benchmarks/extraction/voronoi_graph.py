@@ -8,7 +8,8 @@ from scipy.spatial import Voronoi
 
 from topomerge.types import Array
 
-NEIGHBOURHOOD = 0.7  # m2: a critical point is the narrowest for this, divided by its clearance, along the graph (280 cells of 5 cm)
+# m2: a critical point is the narrowest place of the graph for this, divided by its clearance (the authors: 280 cells of 5 cm).
+NEIGHBOURHOOD = 0.7
 APART = 0.5  # of its clearance that critical points are apart at least
 TEETH = 3.0  # cells between the two walls of a point of the graph: below are the teeth of slanted walls
 

@@ -164,11 +164,21 @@ def said(map: TopometricMap, truth: Truth) -> Array:
         z = filled[0][:, 2] - floor
         level = (z > -0.3) & (z < truth.height[k] + 0.3)
         over = _most(truth, filled[0][level], filled[1][level])
-        floor_of = np.append(truth.visited, False)[truth.raster[k]] & (truth.raster[k] >= 0)
-        wide = np.where(floor_of, _spread(stood, WORD_SPREAD), _spread(stood, TRUTH_CELL))  # a turned raster has holes
-        wide = np.where(wide >= 0, wide, np.where(floor_of, over, -1))
-        out[k] = np.where(floor_of, _spread(wide, WORD_SPREAD), wide)
+        out[k] = column_words(truth, k, stood, over)
     return out
+
+
+def column_words(truth: Truth, storey: int, stood: Array, over: Array) -> Array:
+    """(rows, columns) int32 the room that a map says for each column of a storey, -1 none.
+
+    Args:
+        stood: (rows, columns) rooms of the columns where one can stand, -1 elsewhere.
+        over: (rows, columns) rooms of what stands between floor and ceiling, -1 none.
+    """
+    floor_of = np.append(truth.visited, False)[truth.raster[storey]] & (truth.raster[storey] >= 0)
+    wide = np.where(floor_of, _spread(stood, WORD_SPREAD), _spread(stood, TRUTH_CELL))  # a turned raster has holes
+    wide = np.where(wide >= 0, wide, np.where(floor_of, over, -1))
+    return np.where(floor_of, _spread(wide, WORD_SPREAD), wide)
 
 
 def _spread(labels: Array, reach: float) -> Array:
