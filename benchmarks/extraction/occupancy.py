@@ -24,8 +24,8 @@ from topomerge.types import Array
 
 CELL = 0.05  # m: the maps of the survey
 BAND = (0.3, 1.9)  # m above the floor, in which points are obstacles
-LEAST_POINTS = 1  # of an obstacle
-CLOSED = 0.1  # m: gaps between points of floor and ceiling that are closed
+CLOSED = 0.1  # m: gaps between points, of floor and ceiling and of walls, that are closed
+SPECK, ISLAND = 0.05, 1.0  # m2: smaller obstacles, and smaller pieces of free space, are left out
 NEAR_FLOOR = 0.3  # m below the floor and above the ceiling that belong to a storey
 
 
@@ -72,15 +72,28 @@ def floor_grids(scan: Scan) -> list[FloorGrid | None]:
         origin = points[level, :2].min(axis=0) - 2.5 * CELL  # points of a robot's grid are in the middle of their cells
         columns, rows = np.floor((points[level, :2] - origin) / CELL).astype(np.int64).T
         shape = (int(rows.max()) + 3, int(columns.max()) + 3)
-        cell = rows * shape[1] + columns
         within = (above[level] > BAND[0]) & (above[level] < min(BAND[1], room_height - NEAR_FLOOR))
-        occupied = np.bincount(cell[within], minlength=shape[0] * shape[1]).reshape(shape) >= LEAST_POINTS
-        seen = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape) > 0
-        reach = round(CLOSED / CELL)
-        if reach:
-            seen |= ndimage.binary_closing(np.pad(seen, reach), np.ones((2 * reach + 1,) * 2))[reach:-reach, reach:-reach]
-        out.append(FloorGrid(seen & ~occupied, seen, origin, (floor - float(truth.matrix[2, 3])) / scale))
+        occupied, seen = np.zeros(shape, bool), np.zeros(shape, bool)
+        occupied[rows[within], columns[within]] = True
+        seen[rows, columns] = True
+        occupied, seen = _without_pieces(_closed(occupied), SPECK), _closed(seen)
+        out.append(FloorGrid(_without_pieces(seen & ~occupied, ISLAND), seen, origin, (floor - float(truth.matrix[2, 3])) / scale))
     return out
+
+
+def _closed(mask: Array) -> Array:
+    """The mask with gaps closed."""
+    reach = round(CLOSED / CELL / 2)
+    size = 2 * reach + 1
+    return mask | ndimage.binary_closing(np.pad(mask, size), np.ones((size, size)))[size:-size, size:-size]
+
+
+def _without_pieces(mask: Array, least: float) -> Array:
+    """Without connected pieces of less than an area (m2)."""
+    pieces, _ = ndimage.label(mask, np.ones((3, 3)))
+    large = np.bincount(pieces.ravel()) * CELL**2 >= least
+    large[0] = False
+    return large[pieces]
 
 
 def segmented(scan: Scan, method: str, grids: list[FloorGrid | None]) -> tuple[Array, int]:
