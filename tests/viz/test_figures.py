@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,6 +82,23 @@ def test_colours_of_a_dense_graph() -> None:
     assert len(set(colour_numbers(14, pairs).tolist())) == 14
     assert len(colour_numbers(40, np.array([(a, b) for a in range(40) for b in range(a)]))) == 40
     assert len(colour_numbers(0, np.zeros((0, 2), int))) == 0
+
+
+@pytest.mark.parametrize("joins", [0, 30, 120, 400])
+def test_the_most_constrained_room_is_next(joins: int) -> None:
+    """Against a search through all rooms that are left, in every step."""
+    rng = np.random.default_rng(joins)
+    pairs = np.unique(np.sort(rng.integers(0, 60, (joins, 2)), axis=1), axis=0)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    near = [set(pairs[pairs[:, 1] == i, 0].tolist()) | set(pairs[pairs[:, 0] == i, 1].tolist()) for i in range(60)]
+    numbers: dict[int, int] = {}
+    while len(numbers) < 60:
+        taken = [{numbers[j] for j in near[i] if j in numbers} for i in range(60)]
+        room = min(set(range(60)) - set(numbers), key=lambda i: (-len(taken[i]), -len(near[i]), i))
+        free = [c for c in range(8) if c not in taken[room]] or [c for c in range(16) if c not in taken[room]] or list(range(16))
+        counts = Counter(numbers.values())
+        numbers[room] = min(free, key=lambda c: (counts[c], c))
+    assert colour_numbers(60, pairs).tolist() == [numbers[i] for i in range(60)]
 
 
 def test_same_map_same_file(tmp_path: Path) -> None:

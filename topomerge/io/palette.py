@@ -6,6 +6,8 @@ them and told apart under the common kinds of colour blindness.
 
 from __future__ import annotations
 
+import heapq
+
 import numpy as np
 
 from topomerge.types import Array, TopometricMap
@@ -56,16 +58,20 @@ def colour_numbers(rooms: int, pairs: Array) -> Array:
     number = np.full(rooms, -1)
     used = np.zeros(len(PALETTE), np.int64)
     taken: list[set[int]] = [set() for _ in range(rooms)]
-    waiting = set(range(rooms))
-    while waiting:
-        room = min(waiting, key=lambda i: (-len(taken[i]), -len(around[i]), i))
-        waiting.remove(room)
+    queue = [(0, -len(around[i]), i) for i in range(rooms)]
+    heapq.heapify(queue)
+    while queue:
+        constraints, _, room = heapq.heappop(queue)
+        if number[room] >= 0 or -constraints < len(taken[room]):
+            continue  # it has its colour, or stands in the queue again with more constraints
         allowed = [c for c in range(len(LIGHT)) if c not in taken[room]]
         allowed = allowed or [c for c in range(len(PALETTE)) if c not in taken[room]] or list(range(len(PALETTE)))
         number[room] = min(allowed, key=lambda c: (used[c], c))
         used[number[room]] += 1
         for other in around[room]:
-            taken[other].add(int(number[room]))
+            if int(number[room]) not in taken[other]:
+                taken[other].add(int(number[room]))
+                heapq.heappush(queue, (-len(taken[other]), -len(around[other]), other))
     return number
 
 
