@@ -45,8 +45,8 @@ def distance_transform(free: Array, cell: float) -> Array:
 
 
 def morphological(free: Array, cell: float) -> Array:
-    """Free space is eroded cell by cell; a piece that has come apart from others and has a room's size is a seed and taken out, and
-    so is one that would vanish in the next step.
+    """Free space is eroded cell by cell; a piece that has come apart from others and has a room's size is a seed and taken out,
+    and so is one that would vanish in the next step.
 
     Args:
         free: (h, w) bool.

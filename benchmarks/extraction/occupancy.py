@@ -77,7 +77,8 @@ def floor_grids(scan: Scan) -> list[FloorGrid | None]:
         occupied[rows[within], columns[within]] = True
         seen[rows, columns] = True
         occupied, seen = _without_pieces(_closed(occupied), SPECK), _closed(seen)
-        out.append(FloorGrid(_without_pieces(seen & ~occupied, ISLAND), seen, origin, (floor - float(truth.matrix[2, 3])) / scale))
+        own_floor = (floor - float(truth.matrix[2, 3])) / scale  # in the scan's frame
+        out.append(FloorGrid(_without_pieces(seen & ~occupied, ISLAND), seen, origin, own_floor))
     return out
 
 

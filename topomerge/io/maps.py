@@ -37,8 +37,9 @@ __all__ = ["TMAP_FORMAT", "load_map", "map_to_json", "save_json", "save_map", "s
 
 TMAP_FORMAT = 2
 KIND = "map of topomerge (.tmap)"
-# What a file may declare. The largest buildings have about 1,000 rooms.
-ROOM_LIMIT, STOREY_LIMIT = 10_000, 1_000
+# What a file may declare. The largest buildings have about 1,000 rooms, the tallest 163 storeys.
+ROOM_LIMIT, STOREY_LIMIT = 10_000, 200
+ROOM_COLUMNS, TOTAL_COLUMNS = 50_000_000, 100_000_000  # of the grid, in the rectangle around a room's floor, and around each
 CONNECTION_LIMIT = 30_000  # of edges, areas and narrows each, however many rooms there are
 EDGES_PER_ROOM, AREAS_PER_ROOM = 20, 20  # on average
 COORDINATE_LIMIT = 1e9  # m, either way: beyond, float64 is coarser than 0.1 micrometres
@@ -190,6 +191,22 @@ def _require_sane_counts(arrays: dict[str, Array]) -> None:
         raise ValueError(f"declares {rooms:,} rooms and has only {cells:,} cells")
 
 
+def _require_compact_rooms(navigable: VoxelGrid, room: Array, rooms: int) -> None:
+    """Refuses rooms whose floor is strewn over the map: what draws a room goes through the rectangle around it.
+
+    Raises:
+        ValueError: the rectangles have more columns than those of a building.
+    """
+    inside = (room >= 0) & (room < rooms)
+    low, high = np.full((rooms, 2), np.iinfo(np.int64).max), np.full((rooms, 2), -1)
+    columns = navigable.cells[inside, :2].astype(np.int64)
+    np.minimum.at(low, room[inside], columns)
+    np.maximum.at(high, room[inside], columns)
+    sizes = np.where(high[:, 0] >= 0, np.prod(np.where(high >= 0, high - low + 1, 0), axis=1, dtype=np.float64), 0.0)
+    if sizes.max(initial=0) > ROOM_COLUMNS or sizes.sum() > TOTAL_COLUMNS:
+        raise ValueError(f"has rooms that span {sizes.sum():.2g} columns of cells, the largest {sizes.max():.2g}")
+
+
 def _limited_warnings(messages: list[Any]) -> tuple[str, ...]:
     """The first warnings, each one line of bounded length, and how many more there are."""
     surplus = len(messages) - WARNING_LIMIT
@@ -213,11 +230,14 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
     narrows = _table(arrays, "narrows", EDGE_DTYPE)
     for table in (edges, narrows):
         table["kind"].tolist()  # fails here, not later, where the text is none
+    navigable, navigable_room = _unpack(arrays, "navigable"), _typed(arrays, "navigable_room", "i", 1).astype(np.int32)
+    if len(navigable) == len(navigable_room):  # else the map itself refuses them
+        _require_compact_rooms(navigable, navigable_room, arrays["rooms"].size)
     return TopometricMap(
         grid=_unpack(arrays, "grid"),
         room=_typed(arrays, "room", "i", 1).astype(np.int32),
-        navigable=_unpack(arrays, "navigable"),
-        navigable_room=_typed(arrays, "navigable_room", "i", 1).astype(np.int32),
+        navigable=navigable,
+        navigable_room=navigable_room,
         rooms=_table(arrays, "rooms", ROOM_DTYPE),
         edges=edges,
         storeys=_table(arrays, "storeys", STOREY_DTYPE),

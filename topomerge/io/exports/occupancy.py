@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from topomerge.errors import InputError
 from topomerge.types import Array, TopometricMap
 
 OBSTACLE_BAND = (0.2, 1.8)  # m above the floor beside it: what is occupied there is in the way; lintels and thresholds are not
@@ -14,6 +15,7 @@ CUT = (1.0, 1.9)  # m above the floor: what fills most of this band is a wall
 BAND_SHARE = 0.5  # share of the band that must be occupied
 STEEP = (0.5, 0.2)  # m across, m up: a floor that rises so much is stairs, or the edge of a platform
 NEVER = np.iinfo(np.int32).max
+LARGEST_OCCUPANCY = 50_000_000  # pixels of a storey: 700 m by 700 m of 10 cm, 2 GB while it is made
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,9 @@ class Occupancy:
 def storey_occupancy(map: TopometricMap, storey: int) -> Occupancy:
     """The pixels of one storey; each is as large as a cell of the map.
 
+    Raises:
+        InputError: the storey spans more than `LARGEST_OCCUPANCY` pixels.
+
     Free is the floor one walks on (also floor of no room) without anything above it at the height of a robot; stairs count as
     occupied.
     """
@@ -50,6 +55,9 @@ def storey_occupancy(map: TopometricMap, storey: int) -> Occupancy:
     both = np.concatenate([map.navigable.cells[rows], cells])[:, :2]
     first = both.min(axis=0, initial=NEVER) - 1 if len(both) else np.zeros(2, np.int64)
     nx, ny = (both.max(axis=0, initial=0) - first + 2).tolist()
+    if nx * ny > LARGEST_OCCUPANCY:
+        size = f"{nx * edge:,.0f} by {ny * edge:,.0f} m"
+        raise InputError(f"storey {storey} spans {size} in cells of {edge:g} m: too much for a grid; extract with larger cells")
     level, room = _levels(map, rows, first, (nx, ny))
     walked = level < NEVER
     if walked.any():  # beside the floor, heights are told from the nearest piece of it
