@@ -61,6 +61,17 @@ def test_the_largest_hypothesis_comes_first_and_of_equal_ones_the_cheapest():
     assert alone == [((4, 4),), ((3, 3),), ((1, 1),), ((2, 2),), ((0, 0),)]
 
 
+def test_each_match_may_make_the_alignment_a_little_worse():
+    """Rooms of a stretched map are off by more and more, but none by 2.5 m more than the ones before."""
+    a = building(3)
+    wider = replace(a, rooms=a.rooms.copy())
+    wider.rooms["centroid"][:, 0] = 2.3 * a.rooms["centroid"][:, 0]
+    cost = 1 - 0.9 * np.eye(7)
+    error = align(a.rooms["centroid"], wider.rooms["centroid"])[1]
+    assert error > 2.5 and len(grow(a, wider, cost, c_max=0.5, de_max=2.5)[0]) == 7
+    assert len(grow(a, wider, cost, c_max=0.5, de_max=0.3)[0]) < 7
+
+
 def test_weights_of_an_alignment():
     """A point of no weight changes nothing; the error is the weighted root mean square of what is left."""
     points = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [7, 7, 7]])

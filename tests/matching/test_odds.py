@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.matching.odds import hypothesis_features, hypothesis_probability, match_features, match_probability
+from topomerge.matching.odds import (
+    HYPOTHESIS,
+    MATCH,
+    hypothesis_features,
+    hypothesis_probability,
+    match_features,
+    match_probability,
+    odds_weights,
+)
 
 
 def test_features_of_a_hypothesis():
@@ -21,6 +29,16 @@ def test_hypotheses_share_what_none_of_them_leaves():
     assert alike[0] == alike[1] < alone[0] < 1 and alike.sum() < 1
     odds = alone[0] / (1 - alone[0])  # against "none of them", which does not depend on how many there are
     assert alike == pytest.approx([odds / (2 * odds + 1)] * 2)
+
+
+def test_probabilities_are_those_of_the_logistic_models():
+    evidence = np.array([[3.0, 2.0, 5.0]])
+    logit = float((hypothesis_features(evidence) @ odds_weights(HYPOTHESIS))[0])
+    assert hypothesis_probability(evidence) == pytest.approx([1 / (1 + np.exp(-logit))])
+    a, b, rooms, fit = building(2), building(2), np.array([[0, 1]]), np.array([0.4])
+    a.rooms["area"][0] = 3.0
+    expected = 1 / (1 + np.exp(-match_features(a, b, rooms, fit) @ odds_weights(MATCH)))
+    assert match_probability(a, b, rooms, fit) == pytest.approx(expected)
 
 
 def test_conflict_speaks_against_a_hypothesis():

@@ -20,11 +20,12 @@ def test_of_several_partners_the_best_one_ranks():
 
 
 def test_twins_differ_in_no_size_by_more_than_15_percent():
-    sizes = np.array([[20.0, 5.0, 4.0], [22.0, 5.5, 4.0], [20.0, 8.0, 2.5], [40.0, 10.0, 4.0]])
-    matches = np.array([[0, 0], [1, 2], [4, 3]])
-    assert has_twin(sizes, matches, np.array([0, 1, 4])).tolist() == [True, False, False]
+    sizes = np.array([[20.0, 5.0, 4.0], [22.0, 5.5, 4.0], [20.0, 8.0, 2.5], [24.0, 6.0, 4.0]])
+    matches = np.array([[0, 0], [1, 2], [4, 3]])  # room 3 of b is a fifth larger than room 0, and less than a tenth than room 1
+    assert has_twin(sizes, matches, np.array([0, 1, 4])).tolist() == [True, False, True]
+    assert has_twin(np.delete(sizes, 1, axis=0), np.array([[0, 0]]), np.array([0])).tolist() == [False]
     both = np.array([[0, 0], [0, 1]])  # two pieces of one room are no twins of each other
-    assert has_twin(sizes, both, np.array([0])).tolist() == [False]
+    assert has_twin(sizes[:3], both, np.array([0])).tolist() == [False]
 
 
 def test_certainty_is_the_mean_of_both_ways():
@@ -39,7 +40,8 @@ def test_certain_pairs_have_the_largest_sum_and_no_doubt():
 
 
 def test_counts_of_pairs():
-    """Of three pairs two are right; of three rooms of a and three of b that have a partner two and two got theirs."""
-    matches = np.array([[0, 0], [0, 1], [1, 2], [2, 2]])
-    assert pair_counts(np.array([[0, 1], [1, 2], [2, 0]]), matches) == (3, 2, 6, 4)
-    assert pair_counts(np.zeros((0, 2), int), matches) == (0, 0, 6, 0)
+    """Of four pairs three are right; of two rooms of a and three of b that have a partner two and three got theirs."""
+    matches = np.array([[0, 0], [0, 1], [1, 2]])
+    assert pair_counts(np.array([[0, 0], [0, 1], [1, 2], [2, 0]]), matches) == (4, 3, 5, 5)
+    assert pair_counts(np.array([[0, 1], [1, 0]]), matches) == (2, 1, 5, 2)
+    assert pair_counts(np.zeros((0, 2), int), matches) == (0, 0, 5, 0)
