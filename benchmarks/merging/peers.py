@@ -1,15 +1,15 @@
-"""Ours, KISS-Matcher (0.2 and 0.3 m), FPFH + RANSAC and FGR on the same pairs, in one run: what is right, and the time it takes.
+"""Ours, KISS-Matcher (0.2 and 0.3 m), FPFH + RANSAC and FGR on the same pairs: poses, scores, and the time they take.
 
-``python -m benchmarks.merging.peers SECONDS [real|heldout]`` works through test pairs (`cached_pairs.py`)
-for so many seconds of processor, bin by bin and kind by kind in turn; or through the real pairs of TOPOMERGE_DATA; or through the
-maps that `evaluate.py data=heldout` kept, with the learned embedder's merge among the methods. Resumable: a line of JSON a pair
-with all methods in ``cache/merge/peers*.jsonl``; `peers_table.py` makes the tables of them.
+``python -m benchmarks.merging.peers SECONDS [train|test|raw|real|heldout|MANIFEST]`` works through pairs (`peer_pairs.py`) for
+so many seconds of processor: ``train`` for the thresholds of the verdicts (`peer_thresholds.py`), ``test`` for the tables
+(`peers_table.py`), ``raw`` with all simulated points instead of the means of 0.1 m cells; the real pairs of TOPOMERGE_DATA; the
+maps that `evaluate.py data=heldout` kept, with the learned embedder's merge among the methods; or any manifest of pairs of the
+same format, e.g. of look-alikes. Resumable: a line of JSON a pair with all methods in ``cache/merge/peers_*.jsonl``.
 
-Everyone gets the same two clouds, the means of the points of 0.1 m cells, on one core and one thread. Timed, in seconds of
-processor: from these clouds in memory to the pose; ours also from them to the joined map with its rooms (``extract`` of both,
-``merge``). KISS-Matcher gets points thinned at its voxel, so that its Python binding has little to copy, and its solver of four
-degrees of freedom (Quatro). Open3D has none: its poses are made upright afterwards. Where the scale is unknown (Halmstad), ours
-has to find it; the others, which can't, are given it.
+All on one core, in seconds of processor from points in memory to the pose; ours also from them to the joined map with its rooms
+(``extract`` of both, ``merge``). Peers run in processes of their own; what takes longer than a minute of processor, or dies, is
+a miss (`peer_calls.py`). Poses are made upright afterwards. Where the scale is unknown (Halmstad), ours has to find it; the
+others, which can't, are given it.
 """
 
 from __future__ import annotations
@@ -18,58 +18,50 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topomerge.datasets.pairs.evaluation_pair import load_set
-from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
+from topomerge.datasets.pairs.grid_pairs import GridPair
 
-from benchmarks.merging.cached_pairs import pair_files
-from benchmarks.merging.register import SCALELESS, open3d_features, real_pairs, upright
-from topomerge.fusion.cell_means import cell_middles
+from benchmarks.merging import peer_methods
+from benchmarks.merging.peer_calls import CALL_SECONDS, GuardedWork
+from benchmarks.merging.peer_pairs import DESCRIBED, PeerPair, peer_pairs, scaled
+from benchmarks.merging.register import SCALELESS, upright
 from topomerge.training.belief_hypotheses import error
-from topomerge.types import PointCloud, Sim3, VoxelGrid
+from topomerge.types import Array, PointCloud, VoxelGrid
 
 CACHE = Path("cache/merge")
-TARGETS = {"": CACHE / "peers.jsonl", "real": CACHE / "peers_real.jsonl", "heldout": CACHE / "peers_heldout.jsonl"}
-HELDOUT = Path("cache/evaluation/heldout.jsonl")
-VOXEL, ITERATIONS = 0.3, 100_000  # of Open3D
-WHOLE = 3  # every third pair goes the whole way to a joined map
-AREA_BINS = {"<40 m²": (1.0, 40.0), "40-80 m²": (40.0, 80.0), "≥80 m²": (80.0, np.inf)}
-ORDER = ["lidar", "other 3D", "slice", "floor plan"]
-Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, s of processor
+WHOLE = 6  # every sixth pair of the test set goes the whole way to a joined map
+PEER_CALLS = (  # each in a process of its own
+    (GuardedWork(partial(peer_methods.kiss, voxel=0.2)), ("kiss02", "kiss02q")),
+    (GuardedWork(partial(peer_methods.kiss, voxel=0.3)), ("kiss03", "kiss03q")),
+    (GuardedWork(peer_methods.open3d), ("fgr", "fpfh")),
+)
+Outcome = dict[str, Any]  # status (empty: answered), err, err_icp, scores, seconds, refinement_seconds
 
 
-def kind_of(sensors: Sequence[str]) -> str:
-    """What is compared: a lidar's or another scan, a 2D slice or a floor plan, with what."""
-    names = {"laser2d": "slice", "drawing": "floor plan", "lidar": "lidar", "phone": "slice"}
-    one, two = sorted((names.get(s, "other 3D") for s in sensors), key=ORDER.index)
-    return f"{one} - {two}"
+def target_of(what: str) -> Path:
+    """Where the lines of a set of pairs are."""
+    return CACHE / f"peers_{Path(what).stem if what.endswith('.jsonl') else what}.jsonl"
 
 
-def bin_of(common: float) -> str:
-    """Of the area that both maps saw."""
-    return next(name for name, (low, high) in AREA_BINS.items() if low <= common < high)
-
-
-def cloud(grid: VoxelGrid, free: VoxelGrid | None = None) -> PointCloud:
-    """A grid's points as a cloud."""
-    return PointCloud(np.asarray(grid.properties["mean"], np.float32), free=free)
-
-
-def ours(pair: GridPair) -> Answer:
+def ours(given: PeerPair) -> Outcome:
     """From points to the pose: cells, plans, search, verdict."""
     from topomerge.extraction.voxels import voxelise
     from topomerge.fusion.registration import register
 
-    points = [np.asarray(g.properties["mean"]) for g in (pair.a, pair.b)]
-    began = time.process_time()
-    a, b = (voxelise(PointCloud(p), pair.a.edge) for p in points)
-    registration = register(a, b, free=pair.free, scale="free" if pair.about["source"] in SCALELESS else "fixed")
-    return registration.transform, registration.accepted, time.process_time() - began
+    pair, free = given.pair, given.pair.about["source"] in SCALELESS
+    begun = time.process_time()
+    clouds = (given.a, np.asarray(pair.b.properties["mean"], float) if free else given.b)
+    a, b = (voxelise(PointCloud(points), pair.a.edge) for points in clouds)
+    registration = register(a, b, free=pair.free, scale="free" if free else "fixed")
+    seconds = time.process_time() - begun
+    pose = registration.transform
+    err = None if pose is None else error(pose, pair)
+    scores = {"probability": 0.0 if pose is None else registration.probability}
+    return {"status": "", "err": err, "scores": scores, "believed": registration.accepted, "seconds": seconds}
 
 
 def whole(pair: GridPair) -> dict[str, float]:
@@ -77,142 +69,89 @@ def whole(pair: GridPair) -> dict[str, float]:
     from topomerge.extraction.extract import extract
     from topomerge.fusion.merge import merge
 
-    began = time.process_time()
+    begun = time.process_time()
     a, b = (extract(cloud(g, f), name=n) for g, f, n in zip((pair.a, pair.b), pair.free, "ab", strict=True))
     middle = time.process_time()
     result = merge([a, b], scale="free" if pair.about["source"] in SCALELESS else "fixed", force=True)
-    return {"extract": middle - began, "merge": time.process_time() - middle, "joined": float(result.map is not None)}
+    return {"extract": middle - begun, "merge": time.process_time() - middle, "joined": float(result.map is not None)}
 
 
-def kiss(voxel: float) -> Callable[[GridPair], Answer]:
-    """KISS-Matcher; it believes its answer if it says `valid`."""
-
-    def run(pair: GridPair) -> Answer:
-        import kiss_matcher
-        import open3d as o3d
-
-        began = time.process_time()
-        clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cell_middles(g))) for g in (pair.b, pair.a)]
-        thin = [np.asarray(c.voxel_down_sample(voxel).points, np.float32) for c in clouds]
-        matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(voxel, use_quatro=True))
-        solution = matcher.estimate(*thin)
-        seconds = time.process_time() - began
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = np.array(solution.rotation), np.array(solution.translation).ravel()
-        return upright(matrix, pair), bool(solution.valid), seconds
-
-    return run
+def cloud(grid: VoxelGrid, free: VoxelGrid | None = None) -> PointCloud:
+    """A grid's points as a cloud."""
+    return PointCloud(np.asarray(grid.properties["mean"], np.float32), free=free)
 
 
-def open3d(pair: GridPair) -> dict[str, Answer]:
-    """RANSAC and FGR, with one set of features, whose time counts for both. It has no verdict: an answer counts as believed."""
-    import open3d as o3d
-
-    o3d.utility.random.seed(0)
-    reg = o3d.pipelines.registration
-    began = time.process_time()
-    b, a, fb, fa = open3d_features(pair, VOXEL)
-    features = time.process_time() - began
-    checks = [reg.CorrespondenceCheckerBasedOnEdgeLength(0.9), reg.CorrespondenceCheckerBasedOnDistance(1.5 * VOXEL)]
-    estimate, criteria = reg.TransformationEstimationPointToPoint(False), reg.RANSACConvergenceCriteria(ITERATIONS, 0.999)
-    option = reg.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * VOXEL)
-    run: dict[str, Callable[[], Any]] = {
-        "fpfh": lambda: reg.registration_ransac_based_on_feature_matching(
-            b, a, fb, fa, True, 1.5 * VOXEL, estimate, 3, checks, criteria
-        ),
-        "fgr": lambda: reg.registration_fgr_based_on_feature_matching(b, a, fb, fa, option),
-    }
-    out: dict[str, Answer] = {}
-    for name, method in run.items():
-        began = time.process_time()
-        solution = method()
-        out[name] = upright(np.asarray(solution.transformation), pair), True, features + time.process_time() - began
-    return out
-
-
-def learned(pair: GridPair) -> Answer:
+def learned(pair: GridPair) -> Outcome:
     """`merge` of the extracted maps: rooms matched by the embedder that ships propose poses, too."""
     from topomerge.fusion.merge import merge
 
     maps = pair.about["evaluation_pair"].maps()  # type: ignore[attr-defined]
-    began = time.process_time()
+    begun = time.process_time()
     result = merge(maps)
+    seconds = time.process_time() - begun
     pose = result.registration.transform if result.registration else None
-    return pose, result.merged, time.process_time() - began
+    scores = {"probability": result.registration.probability if result.registration else 0.0}
+    err = None if pose is None else error(pose, pair)
+    return {"status": "", "err": err, "scores": scores, "believed": result.merged, "seconds": seconds}
 
 
-def heldout_pairs() -> Iterator[GridPair]:
-    """Held-out pairs of extracted maps that show something in common, as cells."""
-    for evaluation_pair in load_set(HELDOUT):
-        if evaluation_pair.transform is None or evaluation_pair.about["common"] < 1 or evaluation_pair.about["scale_free"]:
-            continue
-        maps = evaluation_pair.maps()
-        a, b = (m.grid.with_properties(mean=m.grid.centroids()) for m in maps)
-        about = {key: evaluation_pair.about[key] for key in ("sensors", "source")}
-        about |= {"building": str(evaluation_pair.about["building"]), "kind": "overlap", "evaluation_pair": evaluation_pair}
-        free, common = (maps[0].free, maps[1].free), evaluation_pair.about["common"]
-        yield GridPair(evaluation_pair.name, a, b, free, evaluation_pair.transform, common, about)
+def peers(given: PeerPair) -> tuple[dict[str, Outcome], float]:
+    """The outcomes of all peers, and the seconds of processor that their processes took."""
+    outcomes: dict[str, Outcome] = {}
+    used, judged = 0.0, scaled(given.pair)
+    for call, names in PEER_CALLS:
+        answers, why, seconds = call(given.b, given.a)
+        used += seconds
+        for name in names:
+            if name not in answers:
+                outcomes[name] = {"status": why, "err": None, "err_icp": None, "scores": {}, "seconds": CALL_SECONDS}
+                continue
+            answer = answers[name]
+            errors = {"err": _error(answer.pose, judged), "err_icp": _error(answer.refined, judged)}
+            times = {"seconds": answer.seconds, "refinement_seconds": answer.refinement_seconds}
+            outcomes[name] = {"status": "", **errors, "scores": answer.scores, **times}
+    return outcomes, used
 
 
-def scaled(pair: GridPair) -> GridPair:
-    """The pair with b brought to the scale of a."""
-    size = pair.truth.scale if pair.truth is not None else 1.0
-    if size == 1.0:
-        return pair
-    grid = VoxelGrid(pair.b.cells, pair.b.origin * size, pair.b.edge * size, pair.b.shape)
-    grid = grid.with_properties(mean=np.asarray(pair.b.properties["mean"]) * size)
-    return replace(pair, b=grid, free=(pair.free[0], None), truth=replace(pair.truth, scale=1.0))
+def _error(matrix: Array, pair: GridPair) -> list[float] | None:
+    """Of the pose made upright; None where it turns the map over, or no pose is right."""
+    pose = upright(matrix, pair)
+    return None if pose is None else error(pose, pair)
 
 
-def measured(pair: GridPair, all_the_way: bool) -> dict[str, Any]:
-    """All methods on one pair."""
-    given = scaled(pair)
-    answers = {"kiss02": kiss(0.2)(given), "kiss03": kiss(0.3)(given), **open3d(given)}
-    outcomes = {}
-    for name, where, (pose, believed, seconds) in (("ours", pair, ours(pair)), *((n, given, a) for n, a in answers.items())):
-        outcomes[name] = {"err": None if pose is None else error(pose, where), "believed": believed, "seconds": seconds}
+def measured(given: PeerPair, all_the_way: bool) -> tuple[Outcome, float]:
+    """The line of a pair, and the seconds that the peers took."""
+    pair = given.pair
+    outcomes = {"ours": ours(given)}
     if "evaluation_pair" in pair.about:
-        pose, believed, seconds = learned(pair)
-        outcomes["learned"] = {"err": None if pose is None else error(pose, pair), "believed": believed, "seconds": seconds}
-    about = {k: pair.about[k] for k in ("sensors", "building", "kind", "source")}
-    return {"name": pair.name, "common": pair.common, **about, "methods": outcomes, "whole": whole(pair) if all_the_way else None}
+        outcomes["learned"] = learned(pair)
+    answers, used = peers(given)
+    about = {k: pair.about[k] for k in DESCRIBED if k in pair.about}
+    line = {"name": pair.name, "common": pair.common, **about, "points": [len(given.a), len(given.b)]}
+    return {**line, "methods": {**outcomes, **answers}, "whole": whole(pair) if all_the_way else None}, used
 
 
-def chosen() -> Iterator[Path]:
-    """Pairs that share something, one of each bin and kind in turn; drawings of unknown scale are left out."""
-    groups: dict[tuple[str, str], list[Path]] = {}
-    for path in pair_files("test") + pair_files("test_drawings", ("overlap",)):
-        with np.load(path) as arrays:
-            about = json.loads(arrays["about"].tobytes())
-        if about["kind"] == "overlap" and about["common"] >= 1 and not about.get("scaled"):
-            groups.setdefault((bin_of(about["common"]), kind_of(about["sensors"])), []).append(path)
-    for k in range(max(map(len, groups.values()))):
-        yield from (paths[k] for _, paths in sorted(groups.items()) if k < len(paths))
+def done_of(target: Path) -> set[str]:
+    """Names of the pairs that a file has lines of."""
+    return {json.loads(line)["name"] for line in target.read_text().splitlines()} if target.exists() else set()
 
 
-def pairs(which: str, done: set[str]) -> Iterator[tuple[int, GridPair]]:
-    """Numbered pairs that are not done."""
-    if which:
-        every = real_pairs() if which == "real" else heldout_pairs()
-        yield from ((k, pair) for k, pair in enumerate(every) if pair.name not in done)
-        return
-    for k, path in enumerate(list(chosen())):
-        if path.stem not in done:
-            yield k, load_grids(path, mean=True)
-
-
-def run(seconds: float, which: str = "") -> None:
-    """Measure what is missing, until the seconds of processor are used up."""
+def run(seconds: float, what: str = "test") -> None:
+    """Measure what is missing, until the seconds of processor, simulation included, are used up."""
     os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})  # KISS-Matcher takes all cores otherwise
-    target = TARGETS[which]
-    done = {json.loads(line)["name"] for line in target.read_text().splitlines()} if target.exists() else set()
-    for k, pair in pairs(which, done):
-        row = measured(pair, k % WHOLE == 0 and not which)
+    os.environ["OMP_NUM_THREADS"] = "1"  # in the processes of the peers: two threads on one core wait for each other
+    target = target_of(what)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    done, of_peers = done_of(target), 0.0
+    for k, given in enumerate(peer_pairs(what, done), len(done)):
+        row, used = measured(given, what == "test" and k % WHOLE == 0)
+        of_peers += used
         with target.open("a") as out:
             out.write(json.dumps(row) + "\n")
         summary = {m: (round(r["seconds"], 1), r["err"] and round(r["err"][0], 2)) for m, r in row["methods"].items()}
-        print(row["name"], row["sensors"], summary, row["whole"], flush=True)
-        if time.process_time() > seconds:
+        total = time.process_time() + of_peers
+        print(f"{k + 1} {total:.0f} s", row["name"], row["sensors"], row["kind"], round(row["common"]), summary, flush=True)
+        if total > seconds:
             return
 
 

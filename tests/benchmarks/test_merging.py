@@ -18,10 +18,10 @@ def module():
 
 
 def test_kinds_and_bins_do_not_depend_on_the_order(module) -> None:
-    peers = module("peers")
-    assert peers.kind_of(("laser2d", "lidar")) == peers.kind_of(("lidar", "laser2d")) == "lidar - slice"
-    assert peers.kind_of(("drawing", "tls")) == "other 3D - floor plan"
-    assert [peers.bin_of(m2) for m2 in (1.0, 39.9, 40.0, 80.0)] == ["<40 m²", "<40 m²", "40-80 m²", "≥80 m²"]
+    pairs = module("peer_pairs")
+    assert pairs.pair_class(("laser2d", "lidar")) == pairs.pair_class(("lidar", "laser2d")) == "with a slice"
+    assert pairs.pair_class(("drawing", "laser2d")) == "with a floor plan" and pairs.pair_class(("tls", "depth")) == "3D–3D"
+    assert [pairs.bin_of(m2) for m2 in (1.0, 39.9, 40.0, 80.0)] == ["<40 m²", "<40 m²", "40–80 m²", "≥80 m²"]
 
 
 def test_plans_that_differ_only_where_nobody_looked_are_the_same() -> None:
