@@ -66,7 +66,7 @@ def kiss(b: Array, a: Array, voxel: float) -> Iterator[tuple[str, PeerAnswer]]:
 
 
 def open3d(b: Array, a: Array) -> Iterator[tuple[str, PeerAnswer]]:
-    """FGR and RANSAC with one set of features, whose time counts for both; clouds (n, 3) m."""
+    """RANSAC and FGR with one set of features, whose time counts for both; clouds (n, 3) m."""
     import open3d as o3d
 
     o3d.utility.random.seed(0)
@@ -75,7 +75,7 @@ def open3d(b: Array, a: Array) -> Iterator[tuple[str, PeerAnswer]]:
     (thin_b, features_b), (thin_a, features_a) = (_features(c) for c in (b, a))
     described = time.process_time() - begun
     refine = Refinement(b, a)
-    for name in ("fgr", "fpfh"):
+    for name in ("fpfh", "fgr"):
         begun = time.process_time()
         if name == "fgr":
             option = reg.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * OPEN3D_VOXEL)

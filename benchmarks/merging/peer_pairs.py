@@ -20,6 +20,7 @@ from topomerge.datasets.pairs.recipe import Library
 
 from benchmarks.merging.cached_pairs import SETS, pair_files
 from benchmarks.merging.register import real_pairs
+from benchmarks.merging.tables import modality
 from topomerge.errors import InputError
 from topomerge.fusion.cell_means import cell_middles
 from topomerge.types import Array, VoxelGrid
@@ -27,12 +28,12 @@ from topomerge.types import Array, VoxelGrid
 HELDOUT = Path("cache/evaluation/heldout.jsonl")
 AREA_BINS = {"<40 m²": (1.0, 40.0), "40–80 m²": (40.0, 80.0), "≥80 m²": (80.0, np.inf)}
 OVERLAP_BINS = {"<0.25": (0.0, 0.25), "0.25–0.5": (0.25, 0.5), "≥0.5": (0.5, np.inf)}
-ORDINARY, SLICED, DRAWN = "3D–3D", "with a slice", "with a floor plan"
-PAIR_CLASSES = (ORDINARY, SLICED, DRAWN)
+PAIR_CLASSES = ("3D–3D", "with a slice", "with a floor plan")  # `tables.modality`
+ORDINARY = PAIR_CLASSES[0]
 MOST_AREA = tuple(AREA_BINS)[-1]
 TRAIN_TURN, RAW_TURN = 3, 4  # ordinary pairs with the largest area in a turn, where other cells have one
 RAW_PAIRS = 30
-DESCRIBED = ("sensors", "building", "kind", "source", "overlap", "differs", "walls_differ", "scaled")
+PEER_SPLITS = {"train": "train", "test": "test", "raw": "test", "real": "real"}  # sets whose buildings `register` can tell
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +45,6 @@ class PeerPair:
     a: Array
 
 
-def pair_class(sensors: Sequence[str]) -> str:
-    """3D scans of both, or one of them a slice, or a floor plan."""
-    if "drawing" in sensors:
-        return DRAWN
-    return SLICED if {"laser2d", "phone"} & set(sensors) else ORDINARY
-
-
 def bin_of(value: float, bins: Mapping[str, tuple[float, float]] = AREA_BINS) -> str:
     """The bin of a value; of the area that both maps saw if nothing else is said."""
     return next(name for name, (low, high) in bins.items() if low <= value < high)
@@ -60,7 +54,13 @@ def cell_of(about: Mapping[str, Any]) -> tuple[str, str]:
     """Class of sensors, and the area in common or, of pairs that must not merge, their kind."""
     alike = about["kind"] == "overlap"
     shared = "nothing in common" if alike and about["common"] < 1 else ""
-    return pair_class(about["sensors"]), shared or (bin_of(about["common"]) if alike else about["kind"])
+    return modality(about), shared or (bin_of(about["common"]) if alike else about["kind"])
+
+
+def described(pair: GridPair) -> dict[str, Any]:
+    """What a line of results tells of a pair."""
+    names = ("sensors", "building", "kind", "source", "overlap", "differs", "walls_differ", "lookalike", "tellable", "furniture")
+    return {name: pair.about[name] for name in names if name in pair.about}
 
 
 def in_turn(groups: Mapping[tuple[str, str], Sequence[Path]], many: Callable[[tuple[str, str]], int]) -> Iterator[Path]:
@@ -83,13 +83,14 @@ def cells(paths: Sequence[Path]) -> dict[tuple[str, str], list[Path]]:
 
 
 def cached_order(what: str) -> list[Path]:
-    """Files of ``train``, ``test`` or ``raw`` in their order; of a manifest of pairs of the same format, as it stands there.
+    """Files of ``train``, ``test`` or ``raw`` in their order; of a manifest of pairs of the same format, cells in turn.
 
     In the test set ordinary scans that share most come first; in training they are three of each turn.
     """
     if what.endswith(".jsonl"):
         lines = Path(what).read_text(encoding="utf-8").splitlines()
-        return [Path(what).parent / "grids" / json.loads(line)["file"] for line in lines]
+        scaled_too = [Path(what).parent / "grids" / json.loads(line)["file"] for line in lines]
+        return list(in_turn(cells(scaled_too), lambda key: 1))
     most = (ORDINARY, MOST_AREA)
     if what == "raw":
         groups = {k: v for k, v in cells(pair_files("test")).items() if k[0] == ORDINARY and k[1] in AREA_BINS}

@@ -27,8 +27,8 @@ from topomerge.datasets.pairs.grid_pairs import GridPair
 
 from benchmarks.merging import peer_methods
 from benchmarks.merging.peer_calls import CALL_SECONDS, GuardedWork
-from benchmarks.merging.peer_pairs import DESCRIBED, PeerPair, peer_pairs, scaled
-from benchmarks.merging.register import SCALELESS, upright
+from benchmarks.merging.peer_pairs import PEER_SPLITS, PeerPair, described, peer_pairs, scaled
+from benchmarks.merging.register import SCALELESS, upright, where_from
 from topomerge.training.belief_hypotheses import error
 from topomerge.types import Array, PointCloud, VoxelGrid
 
@@ -37,7 +37,7 @@ WHOLE = 6  # every sixth pair of the test set goes the whole way to a joined map
 PEER_CALLS = (  # each in a process of its own
     (GuardedWork(partial(peer_methods.kiss, voxel=0.2)), ("kiss02", "kiss02q")),
     (GuardedWork(partial(peer_methods.kiss, voxel=0.3)), ("kiss03", "kiss03q")),
-    (GuardedWork(peer_methods.open3d), ("fgr", "fpfh")),
+    (GuardedWork(peer_methods.open3d), ("fpfh", "fgr")),
 )
 Outcome = dict[str, Any]  # status (empty: answered), err, err_icp, scores, seconds, refinement_seconds
 
@@ -52,7 +52,7 @@ def ours(given: PeerPair) -> Outcome:
     from topomerge.extraction.voxels import voxelise
     from topomerge.fusion.registration import register
 
-    pair, free = given.pair, given.pair.about["source"] in SCALELESS
+    pair, free = given.pair, given.pair.about.get("source") in SCALELESS
     begun = time.process_time()
     clouds = (given.a, np.asarray(pair.b.properties["mean"], float) if free else given.b)
     a, b = (voxelise(PointCloud(points), pair.a.edge) for points in clouds)
@@ -72,7 +72,7 @@ def whole(pair: GridPair) -> dict[str, float]:
     begun = time.process_time()
     a, b = (extract(cloud(g, f), name=n) for g, f, n in zip((pair.a, pair.b), pair.free, "ab", strict=True))
     middle = time.process_time()
-    result = merge([a, b], scale="free" if pair.about["source"] in SCALELESS else "fixed", force=True)
+    result = merge([a, b], scale="free" if pair.about.get("source") in SCALELESS else "fixed", force=True)
     return {"extract": middle - begun, "merge": time.process_time() - middle, "joined": float(result.map is not None)}
 
 
@@ -119,14 +119,14 @@ def _error(matrix: Array, pair: GridPair) -> list[float] | None:
     return None if pose is None else error(pose, pair)
 
 
-def measured(given: PeerPair, all_the_way: bool) -> tuple[Outcome, float]:
-    """The line of a pair, and the seconds that the peers took."""
+def measured(given: PeerPair, what: str, all_the_way: bool) -> tuple[dict[str, Any], float]:
+    """The line of a pair of a set, and the seconds that the peers took."""
     pair = given.pair
     outcomes = {"ours": ours(given)}
     if "evaluation_pair" in pair.about:
         outcomes["learned"] = learned(pair)
     answers, used = peers(given)
-    about = {k: pair.about[k] for k in DESCRIBED if k in pair.about}
+    about = {**described(pair), **(where_from(pair, PEER_SPLITS[what]) if what in PEER_SPLITS else {})}
     line = {"name": pair.name, "common": pair.common, **about, "points": [len(given.a), len(given.b)]}
     return {**line, "methods": {**outcomes, **answers}, "whole": whole(pair) if all_the_way else None}, used
 
@@ -144,7 +144,7 @@ def run(seconds: float, what: str = "test") -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     done, of_peers = done_of(target), 0.0
     for k, given in enumerate(peer_pairs(what, done), len(done)):
-        row, used = measured(given, what == "test" and k % WHOLE == 0)
+        row, used = measured(given, what, what == "test" and k % WHOLE == 0)
         of_peers += used
         with target.open("a") as out:
             out.write(json.dumps(row) + "\n")

@@ -18,9 +18,10 @@ def module():
 
 
 def test_kinds_and_bins_do_not_depend_on_the_order(module) -> None:
-    pairs = module("peer_pairs")
-    assert pairs.pair_class(("laser2d", "lidar")) == pairs.pair_class(("lidar", "laser2d")) == "with a slice"
-    assert pairs.pair_class(("drawing", "laser2d")) == "with a floor plan" and pairs.pair_class(("tls", "depth")) == "3D–3D"
+    pairs, modality = module("peer_pairs"), module("tables").modality
+    assert modality({"sensors": ("laser2d", "lidar")}) == modality({"sensors": ("lidar", "laser2d")}) == "with a slice"
+    assert modality({"sensors": ("drawing", "laser2d")}) == "with a floor plan"
+    assert modality({"sensors": ("tls", "depth")}) == "3D–3D"
     assert [pairs.bin_of(m2) for m2 in (1.0, 39.9, 40.0, 80.0)] == ["<40 m²", "<40 m²", "40–80 m²", "≥80 m²"]
 
 

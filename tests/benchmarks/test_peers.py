@@ -1,0 +1,236 @@
+"""Peers beside ours: their processes and caps, poses and scores, the choice of thresholds, what the tables count."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+
+import numpy as np
+import pytest
+
+from topomerge.types import Sim3, VoxelGrid
+
+
+@pytest.fixture
+def module():
+    return lambda name: importlib.import_module(f"benchmarks.merging.{name}")
+
+
+def pair_row(name="p", kind="overlap", common=100.0, overlap=0.6, sensors=("tls", "depth"), building="office-1-1", **methods):
+    """A line as `peers.py` writes it."""
+    about = {"name": name, "kind": kind, "common": common, "overlap": overlap, "sensors": list(sensors), "building": building}
+    return {**about, "source": "procedural", "differs": None, "whole": None, "methods": methods}
+
+
+def peer_outcome(right=True, fine=True, **scores):
+    """A peer's outcome: its refined pose is `right` or 9 m off; the solver's own is right, but not fine."""
+    refined = [0.01 if fine else 0.3, 0.0, 0.1] if right else [9.0, 0.0, 0.1]
+    return {"status": "", "err": [0.3, 0.0, 0.1], "err_icp": refined, "scores": scores, "seconds": 2.0, "refinement_seconds": 1.0}
+
+
+def our_outcome(right=True, probability=0.9):
+    """Ours."""
+    error = [0.01, 0.0, 0.1] if right else [9.0, 0.0, 0.1]
+    return {"status": "", "err": error, "scores": {"probability": probability}, "believed": probability >= 0.8, "seconds": 1.0}
+
+
+def answers_slowly(many):
+    """The first answer at once, then one that never comes."""
+    yield "first", many
+    while True:
+        pass
+
+
+def dies(how):
+    """Ends its process, raises, or answers."""
+    if how == "killed":
+        os._exit(3)
+    if how == "raises":
+        raise RuntimeError("no")
+    yield "answer", how
+
+
+def test_an_answer_over_the_cap_is_a_miss_and_those_before_it_count(module) -> None:
+    calls = module("peer_calls")
+    work = calls.GuardedWork(answers_slowly, seconds=1)
+    answers, why, used = work(7)
+    assert answers == {"first": 7} and why == calls.TOO_LONG and used >= 1
+    work.close()
+
+
+def test_a_peer_that_dies_or_fails_is_a_miss_and_the_next_call_works(module) -> None:
+    calls = module("peer_calls")
+    work = calls.GuardedWork(dies)
+    for how in ("killed", "raises"):
+        answers, why, _ = work(how)
+        assert answers == {} and why == calls.CALL_FAILED
+    assert work("well")[:2] == ({"answer": "well"}, "")
+    work.close()
+
+
+def corner(rng) -> np.ndarray:
+    """(n, 3) points of a floor and two walls of different sizes, and of a box and a column that make it one of a kind."""
+    flat = [
+        rng.random((n, 3)) * size for n, size in ((9000, (9, 7, 0)), (4000, (9, 0, 3)), (3000, (0, 7, 3)), (1500, (1.5, 0.8, 1)))
+    ]
+    flat[3] += (5, 3, 0)
+    turn = rng.random(2000) * 2 * np.pi
+    column = np.column_stack([2 + 0.3 * np.cos(turn), 5 + 0.3 * np.sin(turn), 3 * rng.random(2000)])
+    return np.concatenate([*flat, column])
+
+
+@pytest.mark.parametrize("method", ["kiss", "open3d"])
+def test_peers_bring_a_cloud_back_to_itself(module, method) -> None:
+    for package in ("open3d", "kiss_matcher"):
+        pytest.importorskip(package)
+    methods = module("peer_methods")
+    a = corner(np.random.default_rng(0))
+    truth = Sim3(0.7, (3.0, -2.0, 0.4))
+    b = truth.inverse().apply(a)
+    answers = dict(methods.kiss(b, a, 0.2) if method == "kiss" else methods.open3d(b, a))
+    assert set(answers) == ({"kiss02", "kiss02q"} if method == "kiss" else {"fgr", "fpfh"})
+    brought = 0
+    for answer in answers.values():
+        assert answer.seconds > 0 and answer.refinement_seconds > 0
+        off = np.abs(b @ answer.refined[:3, :3].T + answer.refined[:3, 3] - a).max()
+        brought += off < 0.05
+        assert (answer.scores["fitness_icp"] > 0.95) == (off < 0.05)
+    assert brought == 2 if method == "kiss" else brought >= 1  # FGR may land elsewhere; its fitness says so
+
+
+def test_the_threshold_is_the_lowest_at_which_nearly_nothing_is_wrong(module) -> None:
+    least = module("peer_thresholds").least_score
+    assert least(np.array([1.0, 4, 3, 5, 2]), np.array([0, 1, 0, 1, 1]), 4) == (3.5, 1.0, 0.5)
+    assert least(np.array([3.0, 2]), np.array([0, 1]), 1)[0] is None  # what is wrong scores best
+    assert least(np.array([-np.inf, 2.0]), np.array([1, 1]), 2) == (1.0, 1.0, 0.5)  # no answer is never believed
+    hundred = np.arange(200.0, 0, -1)
+    wrong = np.isin(np.arange(200), (100, 150))
+    assert least(hundred, ~wrong, 198)[1:] == (198 / 200, 1.0)
+
+
+def training_rows():
+    """Two right answers and a wrong one of each variant; yaw alone has the higher inliers. A twin wing nobody can tell apart."""
+    rows = []
+    for k, (right, inliers, fitness, residual) in enumerate([(True, 6, 0.5, 0.05), (True, 9, 0.6, 0.06), (False, 8, 0.7, 0.2)]):
+        both = (inliers, inliers if right else 2)
+        space, yaw = (peer_outcome(right, inliers=n, fitness_icp=0.1, residual_icp=0.1) for n in both)
+        flat = peer_outcome(right, fitness=fitness, residual=residual, fitness_icp=0.1, residual_icp=0.1)
+        rows.append(pair_row(f"p{k}", kiss02=space, kiss02q=yaw, kiss03=space, kiss03q=space, fpfh=flat, fgr=flat))
+    same = peer_outcome(False, inliers=99, fitness=0.99, residual=0.01, fitness_icp=0.99, residual_icp=0.01)
+    methods = dict.fromkeys(("kiss02", "kiss02q", "kiss03", "kiss03q", "fpfh", "fgr"), same)
+    return [*rows, {**pair_row("twin", kind="twin-wing", common=0.0, overlap=0.0, **methods), "differs": 0.1}]
+
+
+def test_verdicts_are_chosen_over_variants_scores_and_residuals(module, tmp_path) -> None:
+    thresholds = module("peer_thresholds")
+    rows = training_rows()
+    verdicts = thresholds.choose(rows)
+    assert (verdicts["kiss02"].variant, verdicts["kiss02"].score, verdicts["kiss02"].at_least) == ("kiss02q", "inliers", 4.0)
+    assert verdicts["kiss02"].recall == 2 / 3 and verdicts["kiss02"].precision == 1
+    assert verdicts["kiss03"].variant == "kiss03" and verdicts["kiss03"].at_least == 8.5  # 8 is wrong
+    fpfh = verdicts["fpfh"]
+    assert fpfh.score == "fitness" and 0.06 <= fpfh.residual_at_most < 0.2 and fpfh.recall == 2 / 3
+    assert [fpfh.believes(r["methods"]["fpfh"]) for r in rows[:3]] == [True, True, False]
+    path = tmp_path / "thresholds.json"
+    path.write_text(json.dumps(thresholds.written(rows, verdicts)))
+    assert thresholds.load_verdicts(path) == verdicts
+    assert json.loads(path.read_text())["names"] == ["p0", "p1", "p2"]
+
+
+def test_what_is_believed_nowhere_stays_so(module) -> None:
+    verdict = module("peer_thresholds").PeerVerdict("fgr", "fitness", None, None, 0.0, 0.0, 0)
+    assert not verdict.believes(peer_outcome(fitness=1.0, residual=0.0))
+    assert not verdict.believes({"scores": {}})
+
+
+def test_rows_know_the_refined_pose_and_the_time_it_took(module) -> None:
+    rows, verdict = module("peer_rows"), module("peer_thresholds").PeerVerdict("kiss02q", "inliers", 4.5, None, 1.0, 1.0, 1)
+    line = pair_row(ours=our_outcome(), kiss02=peer_outcome(False, inliers=9), kiss02q=peer_outcome(inliers=5))
+    ours, kiss = rows.answers([line], {"kiss02": verdict})
+    assert (ours["method"], ours["score"], ours["believed"]) == ("ours", 0.9, True)
+    assert (kiss["method"], kiss["score"], kiss["believed"], kiss["seconds"]) == ("kiss02", 5, True, 3.0)
+    columns = dict(zip(rows.ANSWER_HEADS, rows.answer_columns([kiss]), strict=True))
+    assert columns["within 0.1 m, 1° %"].startswith("100") and columns["before ICP"] == "0"
+    assert (columns["right and believed"], columns["wrong and believed"], columns["over the cap"]) == (1, 0, 0)
+    assert rows.answer_columns([]) == [0, *["–"] * (len(rows.ANSWER_HEADS) - 1)]
+
+
+def invented(module):
+    """Answers of ours and FGR: two ordinary pairs, of which FGR has one right; a stranger that FGR believes."""
+    verdict = module("peer_thresholds").PeerVerdict("fgr", "fitness", 0.5, None, 1.0, 1.0, 1)
+    lines = [
+        pair_row("one", ours=our_outcome(), fgr=peer_outcome(fitness=0.8)),
+        pair_row("two", overlap=0.3, ours=our_outcome(False, 0.1), fgr=peer_outcome(False, fitness=0.6)),
+        pair_row("three", "other-building", 0.0, 0.0, ours=our_outcome(False, 0.2), fgr=peer_outcome(False, fitness=0.7)),
+    ]
+    for r in lines[2:]:
+        r["methods"] = {m: {**o, "err": None, "err_icp": None} for m, o in r["methods"].items()}
+    return module("peer_rows").answers(lines, {"fgr": verdict})
+
+
+def test_every_cell_of_a_crossed_table_stands_and_empty_ones_are_dashes(module) -> None:
+    rows = module("peer_rows")
+    lines = rows.crossed([r for r in invented(module) if r["kind"] == "overlap"]).splitlines()
+    assert len(lines) == 2 + 9 and lines[0].endswith("| topomerge | FGR |")
+    cells = {tuple(line.split(" | ")[:2]): line for line in lines[2:]}
+    assert cells["| ≥80 m²", "≥0.5"].endswith("| 1 | 1 · 1 · 0 | 1 · 1 · 0 |")
+    assert cells["| ≥80 m²", "0.25–0.5"].endswith("| 1 | 0 · 0 · 0 | 0 · 0 · 1 |")
+    assert cells["| <40 m²", "<0.25"].endswith("| 0 | – | – |")
+
+
+def test_pairs_that_must_not_merge_are_counted_by_kind(module) -> None:
+    lines = module("peer_rows").negatives_by_kind(invented(module)).splitlines()
+    assert lines[2:] == ["| stranger | 3D–3D | 1 | 0 | 1 |", "| **all** |  | 1 | 0 | 1 |"]
+
+
+def test_curves_count_wrong_poses_and_strangers_against_precision(module) -> None:
+    rows = module("peer_rows")
+    fgr = [r for r in invented(module) if r["method"] == "fgr"]
+    precision, recall = rows.curve(fgr)  # by fitness: .8 right, .7 a stranger, .6 wrong
+    assert precision.tolist() == [1, 1 / 2, 1 / 3] and recall.tolist() == [0.5, 0.5, 0.5]
+    assert rows.points_of(precision, recall) == [0.5, 0.5, 0.5, 0.5]
+    two = rows.points_of(np.array([1.0, 0.96, 0.9]), np.array([0.2, 0.5, 0.6]))
+    assert two[:3] == [0.2, 0.2, 0.5] and two[3] == pytest.approx(0.2 + 0.96 * 0.3 + 0.9 * 0.1)
+    silent = [{**r, "score": -np.inf} for r in fgr]
+    assert rows.points_of(*rows.curve(silent)) == [0, 0, 0, 0]
+
+
+def test_where_another_has_more_right_is_told(module) -> None:
+    rows = module("peer_rows")
+    mine = [r for r in invented(module) if r["name"] == "one"]
+    assert rows.behind(mine, [lambda r: "all"]) == "nowhere"
+    off = [{**r, "err": [9.0, 0.0, 0.0]} if r["method"] == "ours" else r for r in mine]
+    assert rows.behind(off, [lambda r: "all"]).startswith("all, within 0.5 m: FGR 1, topomerge 0")
+
+
+def test_the_figure_is_written(module, tmp_path) -> None:
+    module("peer_figure").draw_curves({"3D–3D": invented(module), "all": invented(module)}, tmp_path / "new" / "curves.png")
+    assert (tmp_path / "new" / "curves.png").stat().st_size > 5000
+
+
+def test_cells_come_in_turn_and_some_more_often(module) -> None:
+    pairs = module("peer_pairs")
+    groups = {("3D–3D", "a"): list("ABCDE"), ("3D–3D", "b"): list("xy"), ("with a slice", "a"): ["s"]}
+    assert "".join(pairs.in_turn(groups, lambda key: 2 if key[1] == "a" and key[0] == "3D–3D" else 1)) == "ABxsCDyE"
+    assert list(pairs.in_turn({}, lambda key: 1)) == []
+
+
+def test_pairs_that_must_not_merge_are_cells_of_their_kind(module) -> None:
+    cell = module("peer_pairs").cell_of
+    assert cell({"kind": "twin-wing", "common": 0.0, "sensors": ["tls", "laser2d"]}) == ("with a slice", "twin-wing")
+    assert cell({"kind": "overlap", "common": 0.5, "sensors": ["tls", "drawing"]}) == ("with a floor plan", "nothing in common")
+    assert cell({"kind": "overlap", "common": 80.0, "sensors": ["tls", "tls"]}) == ("3D–3D", "≥80 m²")
+
+
+def test_peers_get_the_second_map_at_the_scale_of_the_first(module) -> None:
+    pairs = module("peer_pairs")
+    cells = np.array([[0, 0, 0], [3, 1, 2]], np.int32)
+    grid = VoxelGrid(cells, np.zeros(3), 0.1, (4, 4, 4))
+    a, b = (grid.with_properties(mean=grid.centroids().astype(np.float32)) for _ in range(2))
+    truth = Sim3(0.3, (1.0, 2.0, 0.0), 2.0)
+    pair = module("peer_pairs").GridPair("p", a, b, (None, None), truth, 1.0, {"kind": "overlap", "sensors": ["phone", "phone"]})
+    given = pairs.thinned(pair)
+    judged = pairs.scaled(pair)
+    assert judged.truth.scale == 1 and np.allclose(judged.truth.apply(given.b), truth.apply(grid.centroids()), atol=1e-6)
+    assert np.allclose(given.a, grid.centroids(), atol=1e-6)
