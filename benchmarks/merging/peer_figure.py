@@ -19,7 +19,7 @@ def draw_curves(groups: Mapping[str, Sequence[Row]], path: Path) -> None:
     """A panel a group of rows (`peer_rows.answers`), a line a method; the dot is at the threshold of the verdict."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(4.2 * len(groups), 3.8), layout="constrained", facecolor="white")
+    figure = Figure(figsize=(4.2 * len(groups), 4.0), layout="constrained", facecolor="white")
     panels = figure.subplots(1, len(groups), squeeze=False)[0]
     for panel, (title, rows) in zip(panels, groups.items(), strict=True):
         for method in methods_of(rows):
@@ -29,12 +29,14 @@ def draw_curves(groups: Mapping[str, Sequence[Row]], path: Path) -> None:
             panel.plot(recall, precision, color=color, linestyle=dashes, linewidth=1.6, label=METHOD_TITLES[method])
             if any(r["believed"] for r in mine):
                 panel.plot(*_believed(mine), marker="o", color=color, markersize=5)
-        panel.set(xlim=(0, 1.02), ylim=(0, 1.04), xlabel="recall", ylabel="precision")
+        panel.set(xlim=(0, 1.02), ylim=(0, 1.04))
+        panel.set_xlabel("recall", fontsize=9, color=INK)
+        panel.set_ylabel("precision", fontsize=9, color=INK)
         panel.set_title(title, fontsize=9, color=INK, loc="left")
         panel.grid(color=GRID, linewidth=0.6)
         panel.tick_params(labelsize=8, colors=INK)
         panel.spines[["top", "right"]].set_visible(False)
-    panels[0].legend(fontsize=7.5, frameon=False, loc="lower right")
+    figure.legend(*panels[-1].get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside lower center", ncols=6)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
 

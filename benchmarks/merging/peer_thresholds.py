@@ -21,6 +21,7 @@ import numpy as np
 from benchmarks.merging.false_merges import broken, tellable
 from benchmarks.merging.peers import target_of
 from benchmarks.merging.tables import Row, good, rows_of
+from topomerge.errors import InputError
 from topomerge.statistics import precision_recall
 from topomerge.types import Array
 
@@ -123,7 +124,13 @@ def choose(rows: Sequence[Row]) -> dict[str, PeerVerdict]:
 
 
 def load_verdicts(path: Path = THRESHOLDS_FILE) -> dict[str, PeerVerdict]:
-    """Verdicts that were written by `main`."""
+    """Verdicts that were written by `main`.
+
+    Raises:
+        InputError: they were not.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; make it with {THRESHOLDS_COMMAND}")
     return {peer: PeerVerdict(**values) for peer, values in json.loads(path.read_text(encoding="utf-8"))["verdicts"].items()}
 
 
