@@ -31,8 +31,8 @@ OVERLAP_BINS = {"<0.25": (0.0, 0.25), "0.25–0.5": (0.25, 0.5), "≥0.5": (0.5,
 PAIR_CLASSES = ("3D–3D", "with a slice", "with a floor plan")  # `tables.modality`
 ORDINARY = PAIR_CLASSES[0]
 MOST_AREA = tuple(AREA_BINS)[-1]
-TRAIN_TURN, RAW_TURN = 3, 4  # ordinary pairs with the largest area in a turn, where other cells have one
-RAW_PAIRS = 30
+COMMON_TURN = 4  # ordinary pairs with the largest area in a turn, where other cells have one
+FIRST_PAIRS, RAW_PAIRS = 30, 30  # test pairs of that cell before all others; pairs with all their points
 PEER_SPLITS = {"train": "train", "test": "test", "raw": "test", "real": "real"}  # sets whose buildings `register` can tell
 
 
@@ -85,20 +85,21 @@ def cells(paths: Sequence[Path]) -> dict[tuple[str, str], list[Path]]:
 def cached_order(what: str) -> list[Path]:
     """Files of ``train``, ``test`` or ``raw`` in their order; of a manifest of pairs of the same format, cells in turn.
 
-    In the test set ordinary scans that share most come first; in training they are three of each turn.
+    Ordinary scans that share most are four in each turn; in the test set thirty of them come first.
     """
     if what.endswith(".jsonl"):
         lines = Path(what).read_text(encoding="utf-8").splitlines()
         scaled_too = [Path(what).parent / "grids" / json.loads(line)["file"] for line in lines]
         return list(in_turn(cells(scaled_too), lambda key: 1))
     most = (ORDINARY, MOST_AREA)
+    often = lambda key: COMMON_TURN if key == most else 1  # noqa: E731
     if what == "raw":
         groups = {k: v for k, v in cells(pair_files("test")).items() if k[0] == ORDINARY and k[1] in AREA_BINS}
-        return list(in_turn(groups, lambda key: RAW_TURN if key == most else 1))[:RAW_PAIRS]
+        return list(in_turn(groups, often))[:RAW_PAIRS]
     groups = cells([*pair_files(what), *_drawings(what)])
-    if what == "train":
-        return list(in_turn(groups, lambda key: TRAIN_TURN if key == most else 1))
-    return [*groups.pop(most, []), *in_turn(groups, lambda key: 1)]
+    first = groups.get(most, [])[: FIRST_PAIRS if what == "test" else 0]
+    groups[most] = groups.get(most, [])[len(first) :]
+    return [*first, *in_turn(groups, often)]
 
 
 def _drawings(split: str) -> list[Path]:
