@@ -23,9 +23,9 @@ from topomerge.metrics import contingency
 from topomerge.types import Array
 
 CELL = 0.05  # m: the maps of the survey
-BAND = (0.3, 1.9)  # m above the floor, in which points are obstacles
-CLOSED = 0.1  # m: gaps between points, of floor and ceiling and of walls, that are closed
-SPECK, ISLAND = 0.05, 1.0  # m2: smaller obstacles, and smaller pieces of free space, are left out
+OBSTACLE_HEIGHTS = (0.3, 1.9)  # m above the floor, in which points are obstacles
+CLOSED_GAPS = 0.1  # m: gaps between points, of floor and ceiling and of walls, that are closed
+OBSTACLE_SPECK, FREE_ISLAND = 0.05, 1.0  # m2: smaller obstacles, and smaller pieces of free space, are left out
 NEAR_FLOOR = 0.3  # m below the floor and above the ceiling that belong to a storey
 
 
@@ -72,19 +72,19 @@ def floor_grids(scan: Scan) -> list[FloorGrid | None]:
         origin = points[level, :2].min(axis=0) - 2.5 * CELL  # points of a robot's grid are in the middle of their cells
         columns, rows = np.floor((points[level, :2] - origin) / CELL).astype(np.int64).T
         shape = (int(rows.max()) + 3, int(columns.max()) + 3)
-        within = (above[level] > BAND[0]) & (above[level] < min(BAND[1], room_height - NEAR_FLOOR))
+        within = (above[level] > OBSTACLE_HEIGHTS[0]) & (above[level] < min(OBSTACLE_HEIGHTS[1], room_height - NEAR_FLOOR))
         occupied, seen = np.zeros(shape, bool), np.zeros(shape, bool)
         occupied[rows[within], columns[within]] = True
         seen[rows, columns] = True
-        occupied, seen = _without_pieces(_closed(occupied), SPECK), _closed(seen)
+        occupied, seen = _without_pieces(_closed(occupied), OBSTACLE_SPECK), _closed(seen)
         own_floor = (floor - float(truth.matrix[2, 3])) / scale  # in the scan's frame
-        out.append(FloorGrid(_without_pieces(seen & ~occupied, ISLAND), seen, origin, own_floor))
+        out.append(FloorGrid(_without_pieces(seen & ~occupied, FREE_ISLAND), seen, origin, own_floor))
     return out
 
 
 def _closed(mask: Array) -> Array:
     """The mask with gaps closed."""
-    reach = round(CLOSED / CELL / 2)
+    reach = round(CLOSED_GAPS / CELL / 2)
     size = 2 * reach + 1
     return mask | ndimage.binary_closing(np.pad(mask, size), np.ones((size, size)))[size:-size, size:-size]
 
