@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shlex
 import subprocess
 import sys
 import time
@@ -145,7 +146,7 @@ def measure_and_append(words: Sequence[str]) -> None:
     data = Path(os.environ["TOPOMERGE_DATA"]) if os.environ.get("TOPOMERGE_DATA") and not options.small else None
     began = time.time()
     rows = run("train" if options.small else SEALED, data, public_sets(options.public), options.jobs, options.small)
-    text = block(rows, __version__, " ".join(["python -m benchmarks.sealed", *words]), time.time() - began, before)
+    text = block(rows, __version__, shlex.join(["python", "-m", "benchmarks.sealed", *words]), time.time() - began, before)
     if page:
         append(page, text)
     print(text)

@@ -1,0 +1,128 @@
+"""Commands beside the tables of results: each module exists and takes the words that stand there. Nothing is measured."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import inspect
+import re
+import shlex
+import sys
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = (ROOT / "docs" / "results.md", *sorted((ROOT / "docs" / "results").glob("*.md")))
+COMMAND = re.compile(r"(?<![\w-])python (?=-m |evaluate\.py|train\.py)([^`\n;|]*)")
+PLACEHOLDERS = {"$n": "2 6"}  # of loops of the shell
+INSTALLED = ("datasets", "models", "configs")  # that stand at the top of the repository
+
+
+class ParsedError(Exception):
+    """The words were taken; the work itself is left out."""
+
+
+def written() -> list[tuple[str, str]]:
+    """Page and words behind ``python`` of every command of the pages, once each."""
+    out = {}
+    for page in PAGES:
+        for match in COMMAND.finditer(page.read_text(encoding="utf-8")):
+            out.setdefault(match[1].split(" #")[0].split(" &&")[0].strip(), page.name)
+    return [(page, words) for words, page in out.items()]
+
+
+def source_of(module: str) -> Path:
+    """The file that ``python -m`` runs."""
+    parts = module.split(".")
+    parts = parts[1:] if parts[0] == "topomerge" and parts[1] in INSTALLED else parts
+    path = ROOT.joinpath(*parts)
+    return path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def take(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the script of a command take its words, without its work.
+
+    Raises:
+        Exception: it does not take them.
+    """
+    if words[0] == "train.py":
+        importlib.import_module("topomerge.training.tasks").settings_of(words[1:])
+        return
+    if words[0] == "evaluate.py":
+        from topomerge.config import compose
+        from topomerge.evaluation.settings import Evaluation
+
+        compose("evaluate", Evaluation, [w for w in words[1:] if not w.startswith("task=")])
+        return
+    assert words[0] == "-m", words
+    path = source_of(words[1])
+    assert path.is_file(), f"{words[1]}: no such module"
+    module: Any = importlib.import_module(words[1] if path.name != "__main__.py" else f"{words[1]}.__main__")
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    last = [node for node in tree.body if isinstance(node, ast.If) and "__main__" in ast.unparse(node.test)]
+    assert last, f"{words[1]}: is no script"
+    started = ast.Module(last[-1].body, [])
+    monkeypatch.setattr(sys, "argv", [str(path), *words[2:]])
+    if "ArgumentParser" in ast.unparse(tree):
+        parse = argparse.ArgumentParser.parse_args
+
+        def parsed(self: argparse.ArgumentParser, *rest: Any, **named: Any) -> None:
+            parse(self, *rest, **named)
+            raise ParsedError
+
+        monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parsed)
+        with pytest.raises(ParsedError):
+            exec(compile(started, str(path), "exec"), vars(module))
+        return
+    calls: list[object] = []
+    for name in {n.func.id for n in ast.walk(started) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}:
+        if inspect.isfunction(vars(module).get(name)):
+            monkeypatch.setattr(module, name, partial(record, calls, inspect.signature(vars(module)[name])))
+    with suppress(SystemExit):  # of ``sys.exit(main())``
+        exec(compile(started, str(path), "exec"), vars(module))
+    assert calls, f"{words[1]}: does not start with these words"
+
+
+def record(calls: list[object], signature: inspect.Signature, *given: Any, **named: Any) -> None:
+    """Stand in for a function: its arguments must fit."""
+    calls.append(signature.bind(*given, **named))
+
+
+def words_of(text: str) -> list[str]:
+    """As the shell splits them."""
+    for name, words in PLACEHOLDERS.items():
+        text = text.replace(name, words)
+    return shlex.split(text)
+
+
+@pytest.mark.parametrize(("page", "text"), [pytest.param(p, t, id=f"{p}-{t[:60]}") for p, t in written()])
+def test_commands_of_the_results_are_taken(page: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("hydra")
+    take(words_of(text), monkeypatch)
+
+
+def test_there_are_commands() -> None:
+    pages = {page for page, _ in written()}
+    assert {"rooms.md", "merging.md", "peers.md", "learned.md", "ablation.md", "robustness.md"} <= pages | {"results.md"}
+    assert len(written()) > 15
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "-m benchmarks.merging.nowhere test",
+        "-m benchmarks.merging.register test 1000 ours what",
+        "-m benchmarks.extraction.run --sets all",
+        "evaluate.py data=heldout nothing=1",
+        "evaluate.py data=heldout only=[engineered,shapedna surface]",
+    ],
+)
+def test_a_command_that_is_not_taken_is_seen(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("hydra")
+    with pytest.raises((Exception, SystemExit)):  # whatever the script says
+        take(words_of(text), monkeypatch)
