@@ -23,7 +23,9 @@ from topomerge.metrics import contingency
 from topomerge.types import Array
 
 CELL = 0.05  # m: the maps of the survey
-OBSTACLE_HEIGHTS = (0.3, 1.9)  # m above the floor, in which points are obstacles
+# m above the floor, in which points are obstacles: above furniture, chosen on three training scans; lower of what ends below.
+WALL_HEIGHTS, LOW_HEIGHTS = (1.7, 2.6), (0.3, 1.9)
+REACHED = 95.0  # percentile of the heights of points that must be as high
 CLOSED_GAPS = 0.1  # m: gaps between points, of floor and ceiling and of walls, that are closed
 OBSTACLE_SPECK, FREE_ISLAND = 0.05, 1.0  # m2: smaller obstacles, and smaller pieces of free space, are left out
 NEAR_FLOOR = 0.3  # m below the floor and above the ceiling that belong to a storey
@@ -72,7 +74,8 @@ def floor_grids(scan: Scan) -> list[FloorGrid | None]:
         origin = points[level, :2].min(axis=0) - 2.5 * CELL  # points of a robot's grid are in the middle of their cells
         columns, rows = np.floor((points[level, :2] - origin) / CELL).astype(np.int64).T
         shape = (int(rows.max()) + 3, int(columns.max()) + 3)
-        within = (above[level] > OBSTACLE_HEIGHTS[0]) & (above[level] < min(OBSTACLE_HEIGHTS[1], room_height - NEAR_FLOOR))
+        heights = WALL_HEIGHTS if np.percentile(above[level], REACHED) > WALL_HEIGHTS[0] else LOW_HEIGHTS
+        within = (above[level] > heights[0]) & (above[level] < min(heights[1], room_height - NEAR_FLOOR))
         occupied, seen = np.zeros(shape, bool), np.zeros(shape, bool)
         occupied[rows[within], columns[within]] = True
         seen[rows, columns] = True

@@ -38,7 +38,7 @@ __all__ = ["TMAP_FORMAT", "load_map", "map_to_json", "save_json", "save_map", "s
 TMAP_FORMAT = 2
 KIND = "map of topomerge (.tmap)"
 # What a file may declare. The largest buildings have about 1,000 rooms, the tallest 163 storeys.
-ROOM_LIMIT, STOREY_LIMIT = 10_000, 200
+ROOM_LIMIT, STOREY_LIMIT = 5_000, 200
 ROOM_COLUMNS, TOTAL_COLUMNS = 50_000_000, 100_000_000  # of the grid, in the rectangle around a room's floor, and around each
 CONNECTION_LIMIT = 30_000  # of edges, areas and narrows each, however many rooms there are
 EDGES_PER_ROOM, AREAS_PER_ROOM = 20, 20  # on average
