@@ -108,9 +108,10 @@ def test_a_rival_claim_that_its_own_maps_contradict_is_not_heard():
 
 
 def test_a_rival_claim_that_a_third_one_contradicts_weighs_less():
-    claims = {(1, 2): claim(1, 2, 0.95, WRONG), (1, 3): claim(1, 3, 0.9)}
+    two_places = (*claim(0, 1, 0.5), *claim(0, 1, 0.45, WRONG))  # so that backing is not cut off
+    claims = {(0, 1): two_places, (1, 2): claim(1, 2, 0.95, WRONG), (1, 3): claim(1, 3, 0.9)}
     left = odds(0.95) - odds(0.9) - 1.0  # of the rival, after the claim of maps 1 and 3
-    assert heard((2, 3), claims, Votes(to_true={(1, 3): -1.9})).log_odds == pytest.approx(min(3.0 - left - 1.0, BACKING))
+    assert heard((2, 3), claims, Votes(to_true={(1, 3): -1.9})).log_odds == pytest.approx(3.0 - left - 1.0)
     assert heard((2,), claims, Votes()).log_odds == pytest.approx(-odds(0.95) - 1.0)
 
 
