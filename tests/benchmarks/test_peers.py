@@ -107,6 +107,8 @@ def test_the_threshold_is_the_lowest_at_which_nearly_nothing_is_wrong(module) ->
     hundred = np.arange(200.0, 0, -1)
     wrong = np.isin(np.arange(200), (100, 150))
     assert least(hundred, ~wrong, 198)[1:] == (198 / 200, 1.0)
+    wrong[199] = True  # 197 of 200 are too few
+    assert least(hundred, ~wrong, 197) == (50.5, 149 / 150, 149 / 197)
 
 
 def training_rows():
@@ -234,3 +236,45 @@ def test_peers_get_the_second_map_at_the_scale_of_the_first(module) -> None:
     judged = pairs.scaled(pair)
     assert judged.truth.scale == 1 and np.allclose(judged.truth.apply(given.b), truth.apply(grid.centroids()), atol=1e-6)
     assert np.allclose(given.a, grid.centroids(), atol=1e-6)
+
+
+def about_file(path, **about):
+    """A cached pair of which only what stands about it is read."""
+    np.savez(path, about=np.frombuffer(json.dumps(about).encode(), np.uint8))
+    return path
+
+
+def test_thirty_ordinary_pairs_come_first_and_unknown_scales_not_at_all(module, monkeypatch, tmp_path) -> None:
+    pairs = module("peer_pairs")
+    alike = {"kind": "overlap", "common": 90.0}
+    grids = [about_file(tmp_path / f"a{k:02d}.npz", sensors=["tls", "tls"], **alike) for k in range(40)]
+    grids += [about_file(tmp_path / f"s{k}.npz", sensors=["tls", "laser2d"], **alike) for k in range(2)]
+    grids += [about_file(tmp_path / "x.npz", sensors=["tls", "tls"], kind="twin-wing", common=0.0)]
+    drawn = [about_file(tmp_path / f"d{k}.npz", sensors=["tls", "drawing"], scaled=k == 1, **alike) for k in range(2)]
+    monkeypatch.setattr(pairs, "pair_files", lambda split: drawn if split.endswith("_drawings") else grids)
+    test, train, raw = ([path.stem for path in pairs.cached_order(what)] for what in ("test", "train", "raw"))
+    assert test[:30] == [f"a{k:02d}" for k in range(30)] and len(test) == 44 == len(set(test)) and "d1" not in test
+    assert sorted(test[30:37]) == ["a30", "a31", "a32", "a33", "d0", "s0", "x"]
+    assert sorted(train[:7]) == ["a00", "a01", "a02", "a03", "d0", "s0", "x"]
+    assert raw == [f"a{k:02d}" for k in range(30)]
+
+
+def test_poses_are_judged_upright_and_misses_are_told(module, monkeypatch) -> None:
+    peers, pairs, answer = module("peers"), module("peer_pairs"), module("peer_methods").PeerAnswer
+    grid = VoxelGrid(np.array([[0, 0, 0], [30, 10, 20]], np.int32), np.zeros(3), 0.1, (40, 40, 40))
+    grid = grid.with_properties(mean=grid.centroids().astype(np.float32))
+    about = {"kind": "overlap", "sensors": ["tls", "tls"], "source": "procedural", "building": "office-1-1"}
+    given = pairs.thinned(pairs.GridPair("p", grid, grid, (None, None), Sim3(0.0, (1.0, 0.0, 0.0)), 1.0, about))
+    off, exact = np.eye(4), np.eye(4)
+    off[0, 3], exact[0, 3] = 1.3, 1.0
+    over = np.diag([1.0, -1.0, -1.0, 1.0])
+    said = {"kiss02": answer(off, exact, {"inliers": 5.0}, 2.0, 1.0), "kiss02q": answer(over, over, {"inliers": 0.0}, 2.0, 1.0)}
+    calls = ((lambda b, a: (said, "", 6.0), ("kiss02", "kiss02q")), (lambda b, a: ({}, "over the cap", 60.0), ("fpfh", "fgr")))
+    monkeypatch.setattr(peers, "PEER_CALLS", calls)
+    outcomes, used = peers.peers(given)
+    assert used == 66.0 and outcomes["kiss02"]["scores"] == {"inliers": 5.0}
+    assert outcomes["kiss02"]["err"] == pytest.approx([0.3, 0.0, 0.0]) and outcomes["kiss02"]["err_icp"] == pytest.approx(
+        [0, 0, 0]
+    )
+    assert outcomes["kiss02q"]["err"] is None and outcomes["kiss02q"]["status"] == ""  # it turns the map over
+    assert outcomes["fgr"]["status"] == "over the cap" and outcomes["fgr"]["seconds"] == module("peer_calls").CALL_SECONDS
