@@ -2,10 +2,10 @@
 
 ``python -m benchmarks.merging.register [split] [limit] [methods]``: cached simulated pairs (``cached_pairs.py``; split
 ``train`` for
-development, ``test`` for final runs only; ``test_drawings`` for maps and their floor plans), or ``real`` for the real pairs of
-TOPOMERGE_DATA. Methods: ours, kiss02, kiss03, fpfh, fgr (comma-separated; default all). Resumable: a line of JSON a pair and
-method in ``cache/merge/results_<split>.jsonl``; the first `limit` pairs are run (0: none, only the table). Peers get the means
-of the points of 0.1 m cells and a voxel size; `peers.py` compares them with more care.
+development, ``test`` for final runs only; ``test_drawings`` for maps and their floor plans), ``real`` for the real pairs of
+TOPOMERGE_DATA, ``development`` for those to choose by. Methods: ours, kiss02, kiss03, fpfh, fgr (comma-separated; default all).
+Resumable: a line of JSON a pair and method in ``cache/merge/results_<split>.jsonl``; the first `limit` pairs are run (0: none,
+only the table). Peers get the means of the points of 0.1 m cells and a voxel size; `peers.py` compares them with more care.
 
 Right: within 0.5 m and 5 degrees (fine: 0.1 m, 1 degree) in the middle of what both maps saw; of slices and drawings horizontally
 and on the right storey. Seconds are of the processor, so that other jobs on the machine do not count.
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from topomerge.datasets.pairs.grid_pairs import GridPair, common_area, free_of, grid_of, load_grids
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.real.sources import iter_real_pairs
+from topomerge.datasets.real.sources import DEVELOPMENT_FOLDERS, iter_real_pairs
 
 from benchmarks.merging.cached_pairs import buildings_of, hard_of, pair_files, places_of
 from topomerge.fusion.cell_means import cell_middles
@@ -34,6 +34,7 @@ from topomerge.training.belief_hypotheses import error, kind_of, right
 from topomerge.types import Array, Sim3, VoxelGrid
 
 SCALELESS = ("halmstad",)  # no metres per pixel are known
+REAL_SPLITS = {"real": None, "development": tuple(DEVELOPMENT_FOLDERS)}  # split -> sources of `datasets.real`; None: all
 FINE = (0.1, 1.0)  # m, degrees
 Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, how much
 
@@ -114,9 +115,9 @@ def upright(matrix: Array, pair: GridPair) -> Sim3 | None:
     return Sim3(yaw, (x, y, z))
 
 
-def real_pairs() -> Iterator[GridPair]:
-    """The real pairs, at 0.1 m."""
-    for name, pair in iter_real_pairs(os.environ["TOPOMERGE_DATA"]):
+def real_pairs(split: str = "real") -> Iterator[GridPair]:
+    """The real pairs, at 0.1 m; of split ``development`` those that one may choose by."""
+    for name, pair in iter_real_pairs(os.environ["TOPOMERGE_DATA"], REAL_SPLITS[split]):
         if isinstance(pair, Pair):
             a, b = grid_of(pair.a), grid_of(pair.b)
             free = tuple(free_of(c, g) if c.poses is not None else c.free for c, g in ((pair.a, a), (pair.b, b)))
@@ -137,7 +138,7 @@ def run(split: str, limit: int, methods: list[str], target: Path) -> None:
     """Run what is missing."""
     done = {(r["name"], r["method"]) for r in map(json.loads, target.read_text().splitlines())} if target.exists() else set()
     whole = {name for name, _ in done if all((name, m) in done for m in methods)}
-    for pair in real_pairs() if split == "real" else simulated_pairs(split, limit, whole):
+    for pair in real_pairs(split) if split in REAL_SPLITS else simulated_pairs(split, limit, whole):
         for method in methods:
             if (pair.name, method) in done:
                 continue
@@ -164,7 +165,7 @@ def run(split: str, limit: int, methods: list[str], target: Path) -> None:
 
 def where_from(pair: GridPair, split: str) -> dict[str, str]:
     """Source and buildings of a pair (`places_of`)."""
-    if split == "real":
+    if split in REAL_SPLITS:
         name, source = str(pair.about["building"]), str(pair.about["source"])
         return places_of((name, name), (source, source))
     return places_of(buildings_of(pair, split))
@@ -201,7 +202,7 @@ def main(split: str = "train", limit: str = "40", methods: str = ",".join(REGIST
     target.parent.mkdir(parents=True, exist_ok=True)
     run(split, int(limit), methods.split(","), target)
     rows = [json.loads(line) for line in target.read_text().splitlines()]
-    table(rows, lambda r: f"{r['source']}" if split == "real" else kind_of(r))
+    table(rows, lambda r: f"{r['source']}" if split in REAL_SPLITS else kind_of(r))
     table([r for r in rows if r["common"] >= 40], lambda r: "-".join(sorted(r["sensors"])))
 
 

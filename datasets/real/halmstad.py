@@ -23,8 +23,11 @@ PIXEL = 0.02  # m
 LARGEST_LISTING = 10 << 20  # bytes of the list of pairs
 
 
-def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
-    """Name and maker of every pair of maps of one apartment; of the two orders in which a pair is listed, the first.
+def pairs(folder: Path, pixel: float = PIXEL) -> Iterator[tuple[str, Callable[[], Pair]]]:
+    """Name and maker of every pair of maps of one place; of the two orders in which a pair is listed, the first.
+
+    Args:
+        pixel: m.
 
     Raises:
         InputError: the list of pairs is missing or damaged.
@@ -38,28 +41,28 @@ def pairs(folder: Path) -> Iterator[tuple[str, Callable[[], Pair]]]:
         truths = [(str(p["a"]), str(p["b"]), np.array(p["idx"], int).reshape(-1, 2)) for p in listed["pairs"]]
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: is not a list of key points and pairs ({error}); copy it again") from error
-    read, done = cache(partial(_read, folder)), set()
+    read, done = cache(partial(_read, folder, pixel)), set()
     for a, b, same in truths:
         if frozenset((a, b)) not in done:
             done.add(frozenset((a, b)))
-            yield f"{a}-{b}", partial(_pair, read, points, a, b, same)
+            yield f"{a}-{b}", partial(_pair, read, {n: p * pixel for n, p in points.items()}, a, b, same)
 
 
 def _pair(read: Callable[[str], Flat], points: dict[str, Array], a: str, b: str, same: Array) -> Pair:
     """One pair, in the owner's frames: they differ."""
     maps = read(a), read(b)
     try:
-        truth = fit_points(*(points[n][same[:, k]] * PIXEL for k, n in enumerate((a, b))))
+        truth = fit_points(*(points[n][same[:, k]] for k, n in enumerate((a, b))))
     except (KeyError, IndexError) as error:
         raise InputError(f"{a}-{b}: a key point is missing ({error}); copy the list of pairs again") from error
     sensors = tuple("drawing" if n.endswith("layout") else "phone" for n in (a, b))
     return flat_pair(f"{a}-{b}", *maps, truth, (sensors[0], sensors[1]), "halmstad", a.split("_")[0])
 
 
-def _read(folder: Path, name: str) -> Flat:
+def _read(folder: Path, pixel: float, name: str) -> Flat:
     drawn = name.endswith("layout")
     path = folder / "maps" / name.split("_")[0] / ("layout" if drawn else "pseudo_occupancy") / f"{name}.png"
-    return read_flat(path, PIXEL, rays=not drawn)
+    return read_flat(path, pixel, rays=not drawn)
 
 
 def fit_points(a: Array, b: Array) -> Sim3:

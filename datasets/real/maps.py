@@ -12,7 +12,7 @@ from topomerge.datasets.pairs.evaluation_pair import evaluation_arrays, pair_sta
 from topomerge.datasets.pairs.example import pair_arrays
 from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.plans.floorplans import Refusal
-from topomerge.datasets.real.sources import REAL_FOLDERS, collect, pair_makers
+from topomerge.datasets.real.sources import FOLDERS_BY_SOURCE, collect, pair_makers
 
 from topomerge.code_digest import code_digest
 from topomerge.errors import InputError
@@ -71,7 +71,7 @@ def _makers(data: Path, source: str) -> list[tuple[str, Callable[[], Pair]]]:
 def digest(data: Path, source: str, voxel_size: float) -> str:
     """Hash of a source's files, of the voxel size, and of the code and weights that make pairs and maps of them."""
     whole = hashlib.sha256(f"{code_digest(__name__)} {voxel_size}".encode())
-    for file in sorted(p for p in (data / REAL_FOLDERS[source]).rglob("*") if p.is_file()):
+    for file in sorted(p for p in (data / FOLDERS_BY_SOURCE[source]).rglob("*") if p.is_file()):
         whole.update(file.relative_to(data).as_posix().encode() + hashlib.sha256(file.read_bytes()).digest())
     return whole.hexdigest()[:16]
 

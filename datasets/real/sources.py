@@ -2,8 +2,8 @@
 
 Every source is a module `topomerge.datasets.real.<source>` with a function ``pairs(folder)``, which gives name and maker of each
 pair, as the sets of `datasets.public` do; `REAL_FOLDERS` says where its files are. All are for evaluation: none of their
-buildings may train. `python -m topomerge.datasets.real.sources --table FOLDER` measures how far the walls of each pair lie apart
-under its truth.
+buildings may train. `DEVELOPMENT_FOLDERS` are for choosing by, and are read where they are named only.
+`python -m topomerge.datasets.real.sources --table FOLDER` measures how far the walls of each pair lie apart under its truth.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ REAL_FOLDERS = {  # source -> folder of its files within that of the real data
     "ifc": "ifc_buildings",
 }
 REAL_SOURCES = tuple(REAL_FOLDERS)
+DEVELOPMENT_FOLDERS = {"office_floor": "halmstad_office_f5"}  # likewise of what one chooses by, and never reports
+FOLDERS_BY_SOURCE = {**REAL_FOLDERS, **DEVELOPMENT_FOLDERS}
 TABLE_HEAD = (
     "pair",
     "sensors",
@@ -52,15 +54,15 @@ def iter_real_pairs(folder: str | Path, sources: Sequence[str] | None = None) ->
 
     Args:
         folder: with one folder a source, named as in `REAL_FOLDERS`.
-        sources: some of `REAL_SOURCES`; None: all.
+        sources: some of `REAL_SOURCES` or of `DEVELOPMENT_FOLDERS`; None: all of the former.
 
     Raises:
         InputError: no such folder or source.
     """
     folder, sources = Path(folder), REAL_SOURCES if sources is None else tuple(sources)
-    unknown = sorted(set(sources) - set(REAL_SOURCES))
+    unknown = sorted(set(sources) - set(FOLDERS_BY_SOURCE))
     if unknown:
-        raise InputError(f"source {unknown[0]!r}: {', '.join(REAL_SOURCES)} are possible")
+        raise InputError(f"source {unknown[0]!r}: {', '.join(FOLDERS_BY_SOURCE)} are possible")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the one that holds the data sets")
     return _iterate(folder, sources)
@@ -78,7 +80,7 @@ def pair_makers(source: str, folder: Path) -> Iterator[tuple[str, Callable[[], P
         folder: of all real data.
     """
     makers: Iterator[tuple[str, Callable[[], Pair]]] = import_module(f"topomerge.datasets.real.{source}").pairs(
-        folder / REAL_FOLDERS[source]
+        folder / FOLDERS_BY_SOURCE[source]
     )
     return makers
 
@@ -136,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m topomerge.datasets.real.sources", description=__doc__)
     parser.add_argument("--table", metavar="FOLDER", type=Path, required=True, help="the folder with the data sets")
-    parser.add_argument("--sources", nargs="*", choices=REAL_SOURCES, help="only these")
+    parser.add_argument("--sources", nargs="*", choices=tuple(FOLDERS_BY_SOURCE), help="only these")
     options = parser.parse_args(arguments)
     return print_lines(_table(options.table, options.sources))
 
