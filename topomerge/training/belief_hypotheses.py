@@ -29,6 +29,7 @@ from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array, Sim3
 
 DESCRIBED = ("sensors", "kind", "building", "source", "overlap", "differs", "walls_differ", "scaled")
+DESCRIBED += ("lookalike", "furniture", "tellable", "repeats")  # of look-alikes
 RIGHT_POSE = (0.5, 5.0)  # m, degrees
 SAME_WALLS = 3.0  # m2 of walls by which two storeys differ at most that no drawing tells apart
 ALIKE_WINGS = 0.3  # m by which walls of twin wings differ at most, where both maps look: drift does as much
@@ -107,7 +108,9 @@ def fair(row: dict[str, Any]) -> bool:
 
 
 def kind_of(row: dict[str, Any]) -> str:
-    """Bin by the area in common."""
+    """Bin by the area in common; look-alikes by their kind, and by whether anybody could tell them apart."""
+    if "lookalike" in row:
+        return f"{row['lookalike']}{'' if row['tellable'] else ' (nobody can tell)'}"
     if row["kind"] != "overlap" or row["common"] < 1 or row.get("overlap") == 0:
         return f"none ({row['kind']})"
     return next(name for limit, name in ((40, "<40"), (80, "40-80"), (200, "80-200"), (np.inf, ">200")) if row["common"] < limit)

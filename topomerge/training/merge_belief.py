@@ -18,6 +18,7 @@ from scipy.optimize import minimize
 from topomerge.errors import InputError
 from topomerge.fusion.verify import LEAD_VECTOR, POSE_VECTOR, WINNER_VECTOR, lead, vector, winner_vector
 from topomerge.training.belief_hypotheses import belief_rows, fair, kind_of, right
+from topomerge.training.belief_lookalikes import lookalike_rows, lookalike_scores
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.task_settings import MergeBelief
@@ -46,6 +47,7 @@ def fit_belief(settings: MergeBelief, say: Say) -> Fitted:
     """The models for pairs of maps with heights, from all pairs without drawings, and those for slices and drawings, from all
     pairs; what left-out pairs say about them is reported of the pairs that each is for."""
     rows = [row for row in belief_rows(settings.data, settings, say) if row["hyps"] and fair(row)]
+    rows += [row for row in lookalike_rows(settings.alike, settings, say) if row["hyps"]]
     weights: dict[str, Any] = {"names": BELIEF_FEATURES, "threshold": settings.threshold}
     metrics: dict[str, float] = {}
     parts = []
@@ -53,12 +55,14 @@ def fit_belief(settings: MergeBelief, say: Say) -> Fitted:
         chosen = rows if flat else [row for row in rows if "drawing" not in row["sensors"]]
         weights[name], scored = fit_models(chosen, flat, settings)
         parts.append(scored)
-        metrics |= {f"{key}_{name}": value for key, value in belief_scores(*scored, settings.threshold).items()}
+        metrics |= {f"{key}_{name}": value for key, value in belief_scores(*ordinary(*scored), settings.threshold).items()}
     rows_scored = [row for part in parts for row in part[0]]
     believed, true = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
-    metrics |= belief_scores(rows_scored, believed, true, settings.threshold)
+    metrics |= belief_scores(*ordinary(rows_scored, believed, true), settings.threshold)
+    metrics |= lookalike_scores(rows_scored, believed, true, settings.threshold)
     say(believed_by_kind(rows_scored, believed, true, settings.threshold))
-    origin = {"set": settings.data.name, "split": settings.data.split, "pairs": len(rows)}
+    trained = sum(not row.get("judged_only") for row in rows)
+    origin = {"set": settings.data.name, "split": settings.data.split, "pairs": trained, "lookalikes": settings.lookalikes}
     return Fitted(weights=_rounded(weights), metrics=metrics, origin=origin)
 
 
@@ -94,7 +98,8 @@ def label(hypothesis: dict[str, Any], row: dict[str, Any]) -> int:
 @dataclass(frozen=True, eq=False)
 class Table:
     """All hypotheses of all pairs: of which pair (`owner`), what the first model sees (`x`), right or not (`y`: `label`), what
-    is known from looking closer (`near`; nan where nobody did), and the building of each pair."""
+    is known from looking closer (`near`; nan where nobody did). Of each pair its building, and whether it trains; the first
+    `ordinary` buildings are those of ordinary pairs."""
 
     rows: list[dict[str, Any]]
     owner: Array
@@ -102,16 +107,20 @@ class Table:
     y: Array
     near: Array
     building: Array
+    trains: Array
+    ordinary: int
 
 
 def tabled(rows: list[dict[str, Any]]) -> Table:
     """Hypotheses as arrays."""
     hypotheses = [(i, h) for i, row in enumerate(rows) for h in row["hyps"]]
     near = [winner_vector(h) if "pieces" in h else np.full(len(WINNER_VECTOR), np.nan) for _, h in hypotheses]
-    names = [row["building"].split(" + ")[0] for row in rows]
+    names = [f"{int('lookalike' in row)}{row['building'].split(' + ')[0]}" for row in rows]  # ordinary ones first
     y = np.array([label(h, rows[i]) for i, h in hypotheses])
     x = np.array([vector(h) for _, h in hypotheses])
-    return Table(rows, np.array([i for i, _ in hypotheses]), x, y, np.array(near), np.unique(names, return_inverse=True)[1])
+    trains = np.array([not row.get("judged_only") for row in rows], bool)
+    owner, building = np.array([i for i, _ in hypotheses]), np.unique(names, return_inverse=True)[1]
+    return Table(rows, owner, x, y, np.array(near), building, trains, len({name for name in names if name[0] == "0"}))
 
 
 def best(t: Table, scores: Array, pose: dict[str, Any], i: int, wrong: bool = False) -> tuple[int, Array, float] | None:
@@ -125,9 +134,11 @@ def best(t: Table, scores: Array, pose: dict[str, Any], i: int, wrong: bool = Fa
     return int(rows[0]), np.concatenate([t.x[rows[0]], leads[:3], t.near[rows[0]]]), leads[3]
 
 
-def folds(groups: Array, count: int) -> Iterator[tuple[Array, Array]]:
-    """Rows to train on and rows to test on; no group is in both."""
-    of = np.random.default_rng(0).permutation(groups.max() + 1)[groups] % count
+def folds(groups: Array, count: int, ordinary: int) -> Iterator[tuple[Array, Array]]:
+    """Rows to train on and rows to test on; no group is in both. Groups from `ordinary` on (of look-alikes) are dealt in turn, so
+    that the folds of the others are the same without them."""
+    first = int(groups[groups < ordinary].max(initial=-1)) + 1
+    of = np.append(np.random.default_rng(0).permutation(first), np.arange(first, groups.max() + 1))[groups] % count
     for k in range(count):
         yield np.flatnonzero(of != k), np.flatnonzero(of == k)
 
@@ -140,11 +151,11 @@ def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) ->
         InputError: too few pairs or buildings.
     """
     t = tabled(rows)
-    sure = t.y >= 0
+    sure = (t.y >= 0) & t.trains[t.owner]
     if len(np.unique(t.building)) < 2 or len(np.unique(t.y[sure] > 0)) < 2:
         raise InputError("data.sets: too few pairs: right and wrong hypotheses of two buildings are needed")
     pose, scores = fitted(t.x[sure], t.y[sure] > 0, POSE_VECTOR, settings.pose_strength), np.zeros(len(t.y))
-    for train, test in folds(t.building[t.owner], settings.folds):
+    for train, test in folds(t.building[t.owner], settings.folds, t.ordinary):
         train = train[sure[train]]
         scores[test] = logits(fitted(t.x[train], t.y[train] > 0, POSE_VECTOR, settings.pose_strength), t.x[test])
     first = [(i, b) for i in range(len(t.rows)) if (b := best(t, scores, pose, i)) is not None]
@@ -154,18 +165,18 @@ def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) ->
     y = np.array([t.y[b[0]] for _, b in first] + [0] * (len(both) - len(first)))
     share = np.array([b[2] for _, b in first])
     building = np.array([t.building[i] for i, _ in both])
+    certain = (y >= 0) & np.array([t.trains[i] for i, _ in both])
     missed = np.where(np.arange(len(y)) < len(first), 1.0, settings.missed)
     weight = missed * np.where(flat & (y == 0), settings.strict, 1.0)
     believed = np.zeros(len(y))
-    for train, test in folds(building, settings.folds):
-        train = train[y[train] >= 0]
+    for train, test in folds(building, settings.folds, t.ordinary):
+        train = train[certain[train]]
         model = fitted(x[train], y[train] > 0, BELIEF_FEATURES, settings.winner_strength, weight[train])
         believed[test] = 1 / (1 + np.exp(-logits(model, x[test])))
-    certain = y >= 0
     winner = fitted(x[certain], y[certain] > 0, BELIEF_FEATURES, settings.winner_strength, weight[certain])
     same_kind = np.array([is_flat(t.rows[i]) == flat for i, _ in first], bool)
     scored = [t.rows[i] for (i, _), so in zip(first, same_kind, strict=True) if so]
-    model = {"pairs": len(first), "pose": pose, "winner": winner}
+    model = {"pairs": int(sum(t.trains[i] for i, _ in first)), "pose": pose, "winner": winner}
     return model, (scored, np.minimum(believed[: len(first)], share)[same_kind], y[: len(first)][same_kind])
 
 
@@ -186,6 +197,12 @@ def belief_scores(rows: Sequence[dict[str, Any]], believed: Array, true: Array, 
     }
 
 
+def ordinary(rows: Sequence[dict[str, Any]], believed: Array, true: Array) -> tuple[list[dict[str, Any]], Array, Array]:
+    """What is scored, without look-alikes: they would change the shares of all others."""
+    chosen = np.array(["lookalike" not in row for row in rows], bool)
+    return [row for row, so in zip(rows, chosen, strict=True) if so], np.asarray(believed)[chosen], np.asarray(true)[chosen]
+
+
 def believed_by_kind(rows: Sequence[dict[str, Any]], believed: Array, true: Array, threshold: float) -> str:
     """A line: of each bin of area in common how many pairs there are, are right first, rightly and falsely believed."""
     bins: dict[str, list[int]] = {}
@@ -201,6 +218,7 @@ def judge(settings: MergeBelief, file: Path, say: Say) -> dict[str, Any]:
     """Scores of weights on pairs of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
     rows = [row for row in belief_rows(settings.heldout, settings, say) if row["hyps"] and fair(row)]
+    rows += [row for row in lookalike_rows(settings.alike_heldout, settings, say) if row["hyps"]]
     scored_rows, believed, true = [], [], []
     for name, flat in (("solid", False), ("flat", True)):
         of = [row for row in rows if is_flat(row) == flat]
@@ -218,7 +236,8 @@ def judge(settings: MergeBelief, file: Path, say: Say) -> dict[str, Any]:
         raise InputError(f"{settings.heldout.name}: no pair has a hypothesis that can be judged")
     threshold = float(weights["threshold"])
     say(believed_by_kind(scored_rows, np.array(believed), np.array(true), threshold))
-    return belief_scores(scored_rows, np.array(believed), np.array(true), threshold)
+    scores = belief_scores(*ordinary(scored_rows, np.array(believed), np.array(true)), threshold)
+    return scores | lookalike_scores(scored_rows, np.array(believed), np.array(true), threshold)
 
 
 def is_flat(row: dict[str, Any]) -> bool:

@@ -6,9 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from topomerge.datasets.pairs.grid_pairs import GridRecipe
+from topomerge.datasets.pairs.lookalikes import LookalikeRecipe
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.recipe import Recipe
 from topomerge.errors import InputError
+
+LOOKALIKES_TAKEN = ("none", "judged", "fitted")
 
 
 @dataclass
@@ -141,6 +144,8 @@ class MergeBelief(TaskSettings):
     strict: weight of a wrong hypothesis where a slice or a drawing hides what tells storeys apart: rather refused than wrong.
     folds: of buildings, for the scores.
     threshold: probability from which on a merge is believed.
+    lookalikes: none, judged (left-out models are tried on them) or fitted (they train, too; `belief_lookalikes`).
+    alike, alike_heldout: the look-alikes to fit to and to judge on.
     """
 
     task: str = "merge_belief"
@@ -155,6 +160,9 @@ class MergeBelief(TaskSettings):
     strict: float = 1.25
     folds: int = 8
     threshold: float = 0.8
+    lookalikes: str = "none"
+    alike: LookalikeRecipe = field(default_factory=LookalikeRecipe)
+    alike_heldout: LookalikeRecipe = field(default_factory=LookalikeRecipe)
     watch: str = "right_believed"
 
 
@@ -204,6 +212,8 @@ def check_task(settings: TaskSettings) -> None:
             raise InputError(f"{key} must be above 0, not {getattr(settings, key)}")
     if not 0 <= getattr(settings, "threshold", 0.5) <= 1:
         raise InputError(f"threshold must be 0 to 1, not {settings.threshold}")  # type: ignore[attr-defined]
+    if isinstance(settings, MergeBelief) and settings.lookalikes not in LOOKALIKES_TAKEN:
+        raise InputError(f"lookalikes must be {', '.join(LOOKALIKES_TAKEN)}, not {settings.lookalikes!r}")
     if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
         raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
     if isinstance(settings, PlanSegmentation):
