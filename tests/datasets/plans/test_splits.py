@@ -7,6 +7,7 @@ from itertools import chain, combinations
 from pathlib import Path
 
 import pytest
+from topomerge.datasets.core.physical import physical_building
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.plans import splits
 from topomerge.datasets.plans.floorplans import iter_plans, plan_names, siblings
@@ -42,6 +43,15 @@ def test_plans_of_one_property_stay_together() -> None:
     for split in splits.SPLITS:
         for name in splits.members(split, "r2v"):
             assert where.setdefault(name.rpartition("/")[0], split) == split
+
+
+def test_a_physical_building_is_in_one_split() -> None:
+    where: dict[str, set[str]] = {}
+    for split in splits.SPLITS:
+        for source in splits.FOLDERS:
+            for name in splits.members(split, source):
+                where.setdefault(physical_building(source, name), set()).add(split)
+    assert len(where) > 100 and all(len(of) == 1 for of in where.values())
 
 
 def test_split_of() -> None:
