@@ -116,7 +116,7 @@ def test_there_are_commands() -> None:
     "text",
     [
         "-m benchmarks.merging.nowhere test",
-        "-m benchmarks.merging.register test 1000 ours what",
+        "-m benchmarks.merging.register test 1000 what",
         "-m benchmarks.extraction.run --sets all",
         "evaluate.py data=heldout nothing=1",
         "evaluate.py data=heldout only=[engineered,shapedna surface]",

@@ -1,11 +1,9 @@
-"""Registration of whole maps beside KISS-Matcher and Open3D: what is merged right and wrong, and how fast.
+"""Registration of whole maps: what is merged right and wrong, and how fast; beside other methods: `peers.py`.
 
-``python -m benchmarks.merging.register [split] [limit] [methods]``: cached simulated pairs (``cached_pairs.py``; split
-``train`` for
+``python -m benchmarks.merging.register [split] [limit]``: cached simulated pairs (``cached_pairs.py``; split ``train`` for
 development, ``test`` for final runs only; ``test_drawings`` for maps and their floor plans), ``real`` for the real pairs of
-TOPOMERGE_DATA, ``development`` for those to choose by. Methods: ours, kiss02, kiss03, fpfh, fgr (comma-separated; default all).
-Resumable: a line of JSON a pair and method in ``cache/merge/results_<split>.jsonl``; the first `limit` pairs are run (0: none,
-only the table). Peers get the means of the points of 0.1 m cells and a voxel size; `peers.py` compares them with more care.
+TOPOMERGE_DATA, ``development`` for those to choose by. Resumable: a line of JSON a pair in ``cache/merge/results_<split>.jsonl``;
+the first `limit` pairs are run (0: none, only the table).
 
 Right: within 0.5 m and 5 degrees (fine: 0.1 m, 1 degree) in the middle of what both maps saw; of slices and drawings horizontally
 and on the right storey. Seconds are of the processor, so that other jobs on the machine do not count.
@@ -27,7 +25,6 @@ from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.real.sources import DEVELOPMENT_FOLDERS, iter_real_pairs
 
 from benchmarks.merging.cached_pairs import buildings_of, hard_of, pair_files, places_of
-from topomerge.fusion.cell_means import cell_middles
 from topomerge.fusion.registration import register
 from topomerge.metrics import on_storey
 from topomerge.training.belief_hypotheses import error, kind_of, right
@@ -45,64 +42,6 @@ def ours(pair: GridPair) -> Answer:
     scaled = pair.about["source"] in SCALELESS or pair.about.get("scaled")
     registration = register(a, b, free=pair.free, scale="free" if scaled else "fixed")
     return registration.transform, registration.accepted, registration.probability
-
-
-def kiss(voxel: float) -> Callable[[GridPair], Answer]:
-    """KISS-Matcher; it believes its answer if it says `valid`."""
-
-    def run(pair: GridPair) -> Answer:
-        import kiss_matcher
-
-        config = kiss_matcher.KISSMatcherConfig(voxel)
-        matcher = kiss_matcher.KISSMatcher(config)
-        solution = matcher.estimate(cell_middles(pair.b), cell_middles(pair.a))
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = np.array(solution.rotation), np.array(solution.translation).ravel()
-        return upright(matrix, pair), bool(solution.valid), float(solution.valid)
-
-    return run
-
-
-def open3d_features(pair: GridPair, voxel: float) -> tuple[Any, Any, Any, Any]:
-    """Downsampled clouds of b and a, and their FPFH features, as Open3D's tutorial makes them."""
-    import open3d as o3d
-
-    out = []
-    for grid in (pair.b, pair.a):
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cell_middles(grid))).voxel_down_sample(voxel)
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=2 * voxel, max_nn=30))
-        search = o3d.geometry.KDTreeSearchParamHybrid(radius=5 * voxel, max_nn=100)
-        out.append((cloud, o3d.pipelines.registration.compute_fpfh_feature(cloud, search)))
-    return out[0][0], out[1][0], out[0][1], out[1][1]
-
-
-def fpfh(pair: GridPair, voxel: float = 0.3) -> Answer:
-    """Open3D: FPFH and RANSAC. It has no verdict: an answer counts as believed."""
-    import open3d as o3d
-
-    reg = o3d.pipelines.registration
-    b, a, fb, fa = open3d_features(pair, voxel)
-    checks = [reg.CorrespondenceCheckerBasedOnEdgeLength(0.9), reg.CorrespondenceCheckerBasedOnDistance(1.5 * voxel)]
-    estimate = reg.TransformationEstimationPointToPoint(False)
-    criteria = reg.RANSACConvergenceCriteria(100_000, 0.999)
-    solution = reg.registration_ransac_based_on_feature_matching(b, a, fb, fa, True, 1.5 * voxel, estimate, 3, checks, criteria)
-    return upright(solution.transformation, pair), True, float(solution.fitness)
-
-
-def fgr(pair: GridPair, voxel: float = 0.3) -> Answer:
-    """Open3D: fast global registration."""
-    import open3d as o3d
-
-    reg = o3d.pipelines.registration
-    b, a, fb, fa = open3d_features(pair, voxel)
-    option = reg.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * voxel)
-    solution = reg.registration_fgr_based_on_feature_matching(b, a, fb, fa, option)
-    return upright(solution.transformation, pair), True, float(solution.fitness)
-
-
-REGISTRATIONS: dict[str, Callable[[GridPair], Answer]] = {
-    "ours": ours, "kiss02": kiss(0.2), "kiss03": kiss(0.3), "fpfh": fpfh, "fgr": fgr,
-}  # fmt: skip
 
 
 def upright(matrix: Array, pair: GridPair) -> Sim3 | None:
@@ -134,33 +73,21 @@ def simulated_pairs(split: str, limit: int, skip: set[str]) -> Iterator[GridPair
             yield load_grids(path, mean=True)
 
 
-def run(split: str, limit: int, methods: list[str], target: Path) -> None:
+def run(split: str, limit: int, target: Path) -> None:
     """Run what is missing."""
-    done = {(r["name"], r["method"]) for r in map(json.loads, target.read_text().splitlines())} if target.exists() else set()
-    whole = {name for name, _ in done if all((name, m) in done for m in methods)}
-    for pair in real_pairs(split) if split in REAL_SPLITS else simulated_pairs(split, limit, whole):
-        for method in methods:
-            if (pair.name, method) in done:
-                continue
-            began = time.process_time()
-            try:
-                pose, believed, how = REGISTRATIONS[method](pair)
-            except Exception as failure:  # a peer that fails has not merged
-                print(f"{pair.name} {method}: {failure}", flush=True)
-                pose, believed, how = None, False, 0.0
-            about = {k: pair.about.get(k) for k in ("sensors", "kind", "overlap", "differs", "scaled")}
-            row = {
-                "name": pair.name,
-                "method": method,
-                "common": pair.common,
-                **about,
-                **where_from(pair, split),
-                "hard": hard_of(pair),
-            }
-            row |= {"seconds": time.process_time() - began, "believed": believed, "probability": how}
-            row |= {"answered": pose is not None, **outcome(pose, pair)}
-            with target.open("a") as out:
-                out.write(json.dumps(row) + "\n")
+    done = {r["name"] for r in map(json.loads, target.read_text().splitlines())} if target.exists() else set()
+    for pair in real_pairs(split) if split in REAL_SPLITS else simulated_pairs(split, limit, done):
+        if pair.name in done:
+            continue
+        began = time.process_time()
+        pose, believed, probability = ours(pair)
+        seconds = time.process_time() - began
+        about = {k: pair.about.get(k) for k in ("sensors", "kind", "overlap", "differs", "scaled")}
+        row = {"name": pair.name, "method": "ours", "common": pair.common, **about, **where_from(pair, split)}
+        row |= {"hard": hard_of(pair), "seconds": seconds, "believed": believed, "probability": probability}
+        row |= {"answered": pose is not None, **outcome(pose, pair)}
+        with target.open("a") as out:
+            out.write(json.dumps(row) + "\n")
 
 
 def where_from(pair: GridPair, split: str) -> dict[str, str]:
@@ -182,25 +109,23 @@ def outcome(pose: Sim3 | None, pair: GridPair) -> dict[str, Any]:
 
 
 def table(rows: list[dict[str, Any]], key: Callable[[dict[str, Any]], str]) -> None:
-    """One line a method and group: pairs, right and fine among all, believed and right, believed and wrong, median seconds."""
+    """One line a group: pairs, right and fine among all, believed and right, believed and wrong, median seconds."""
     for group in sorted({key(r) for r in rows}):
-        for method in REGISTRATIONS:
-            mine = [r for r in rows if key(r) == group and r["method"] == method]
-            if mine:
-                good, fine = (np.array([r[key] for r in mine]) for key in ("right", "fine"))
-                believed = np.array([r["believed"] and r["answered"] for r in mine])
-                seconds = np.median([r["seconds"] for r in mine])
-                print(
-                    f"{group:24s} {method:10s} pairs {len(mine):3d}  right {good.sum():3d}  fine {fine.sum():3d}  believed right "
-                    f"{(good & believed).sum():3d}  believed wrong {(believed & ~good).sum():3d}  cpu s {seconds:.2f}"
-                )
+        members = [r for r in rows if key(r) == group]
+        good, fine = (np.array([r[name] for r in members]) for name in ("right", "fine"))
+        believed = np.array([r["believed"] and r["answered"] for r in members])
+        print(
+            f"{group:24s} pairs {len(members):3d}  right {good.sum():3d}  fine {fine.sum():3d}  believed right "
+            f"{(good & believed).sum():3d}  believed wrong {(believed & ~good).sum():3d}  cpu s "
+            f"{np.median([r['seconds'] for r in members]):.2f}"
+        )
 
 
-def main(split: str = "train", limit: str = "40", methods: str = ",".join(REGISTRATIONS)) -> None:
+def main(split: str = "train", limit: str = "40") -> None:
     """Run and print."""
     target = Path("cache/merge") / f"results_{split}.jsonl"
     target.parent.mkdir(parents=True, exist_ok=True)
-    run(split, int(limit), methods.split(","), target)
+    run(split, int(limit), target)
     rows = [json.loads(line) for line in target.read_text().splitlines()]
     table(rows, lambda r: f"{r['source']}" if split in REAL_SPLITS else kind_of(r))
     table([r for r in rows if r["common"] >= 40], lambda r: "-".join(sorted(r["sensors"])))
