@@ -31,6 +31,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         moved = MOVE.apply(cloud).astype(np.float32)
         topomerge.save_map(topomerge.extract(moved, name=f"{name}.ply"), place / f"{name}.tmap")
     assert cli(["merge", str(place / "a.npy"), str(place / "b.tmap"), "-o", str(place / "merged"), "-q"]) == 0
+    (place / "copy.tmap").write_bytes((place / "b.tmap").read_bytes())
+    (place / "broken.tmap").write_bytes((place / "b.tmap").read_bytes()[:-2000])
+    (place / "text.ply").write_text("no points\n")
+    np.save(place / "mm.npy", np.load(place / "a.npy")[::40] * 1000)
     return place
 
 
@@ -100,10 +104,6 @@ def test_force_writes_all_and_keeps_the_status(run: Run, folder: Path) -> None:
     ],
 )
 def test_bad_input_is_told_in_one_line(run: Run, folder: Path, words: tuple[str, ...], message: str) -> None:
-    (folder / "copy.tmap").write_bytes((folder / "b.tmap").read_bytes())
-    (folder / "broken.tmap").write_bytes((folder / "b.tmap").read_bytes()[:-2000])
-    (folder / "text.ply").write_text("no points\n")
-    np.save(folder / "mm.npy", np.load(folder / "a.npy") * 1000)
     status, out, err = run(*words, "-o", "new")
     assert status == 1 and out == ""
     assert message in err and len(err.splitlines()) == 1
