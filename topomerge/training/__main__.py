@@ -16,7 +16,6 @@ def main(words: list[str]) -> int:
     from topomerge.training.embedding import fit
     from topomerge.training.settings import from_dict, from_file, to_dict
 
-
     def work() -> None:
         values = to_dict(from_file(words[0]))
         for word in words[1:]:

@@ -28,8 +28,10 @@ from topomerge.metrics import pose_right
 from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array, Sim3
 
-DESCRIBED = ("sensors", "kind", "building", "source", "overlap", "differs", "walls_differ", "scaled")
-DESCRIBED += ("lookalike", "furniture", "tellable", "repeats")  # of look-alikes
+DESCRIBED = (
+    *("sensors", "kind", "building", "source", "overlap", "differs", "walls_differ", "scaled"),
+    *("lookalike", "furniture", "tellable", "repeats"),  # of look-alikes
+)
 RIGHT_POSE = (0.5, 5.0)  # m, degrees
 SAME_WALLS = 3.0  # m2 of walls by which two storeys differ at most that no drawing tells apart
 ALIKE_WINGS = 0.3  # m by which walls of twin wings differ at most, where both maps look: drift does as much

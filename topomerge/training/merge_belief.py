@@ -236,8 +236,8 @@ def judge(settings: MergeBelief, file: Path, say: Say) -> dict[str, Any]:
         raise InputError(f"{settings.heldout.name}: no pair has a hypothesis that can be judged")
     threshold = float(weights["threshold"])
     say(believed_by_kind(scored_rows, np.array(believed), np.array(true), threshold))
-    scores = belief_scores(*ordinary(scored_rows, np.array(believed), np.array(true)), threshold)
-    return scores | lookalike_scores(scored_rows, np.array(believed), np.array(true), threshold)
+    judged = belief_scores(*ordinary(scored_rows, np.array(believed), np.array(true)), threshold)
+    return judged | lookalike_scores(scored_rows, np.array(believed), np.array(true), threshold)
 
 
 def is_flat(row: dict[str, Any]) -> bool:

@@ -1,9 +1,9 @@
 """A run is a folder: its settings, what it reports, the best weights, the state to go on from; and what it exports.
 
-    config.json, config.yaml     what was asked for
-    metrics.jsonl, tb/           `training.log`
-    best/                        files as the package has them, and their card
-    last/                        `topomerge.checkpoint`, of networks
+config.json, config.yaml     what was asked for
+metrics.jsonl, tb/           `training.log`
+best/                        files as the package has them, and their card
+last/                        `topomerge.checkpoint`, of networks
 """
 
 from __future__ import annotations

@@ -34,9 +34,7 @@ class Task:
 
 
 TASKS = {
-    "plan_segmentation": Task(
-        "plan_segmentation", "PlanSegmentation", "topomerge.extraction.plans", "plan_network.npz", 1.5
-    ),
+    "plan_segmentation": Task("plan_segmentation", "PlanSegmentation", "topomerge.extraction.plans", "plan_network.npz", 1.5),
     "door_classification": Task(
         "door_classification", "DoorClassification", "topomerge.extraction.plans", "door_classifier.json", 0.7
     ),
