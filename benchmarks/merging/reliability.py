@@ -9,13 +9,18 @@ import numpy as np
 from benchmarks.merging.tables import Row, good, table
 from topomerge.statistics import NEAR_ZERO, Calibration, calibration
 
-ORIGINS = ("procedural buildings", "simulated scans of real plans", "real maps")
+ORIGINS = ("procedural buildings", "simulated scans of real plans", "real maps", "look-alikes, made to deceive")
 PER_BIN = 8  # pairs
 REAL_MAPS = ("carmen", "halmstad", "strands", "utexas", "ipad", "libpointmatcher", "octomap")
 
 
 def origin(row: Row) -> str:
-    """Where the maps of a pair are from: one of `ORIGINS`; a real plan beside a procedural building is a real plan."""
+    """Where the maps of a pair are from: one of `ORIGINS`; a real plan beside a procedural building is a real plan.
+
+    Look-alikes stand apart: a set of pairs that are all made to deceive says nothing of how sure a probability is elsewhere.
+    """
+    if row.get("lookalike"):
+        return ORIGINS[3]
     sources = {row.get("source", "procedural"), row.get("other_source", row.get("source", "procedural"))}
     if sources & set(REAL_MAPS):
         return ORIGINS[2]
