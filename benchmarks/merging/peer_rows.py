@@ -35,6 +35,8 @@ def answers(rows: Sequence[Row], verdicts: Mapping[str, PeerVerdict]) -> list[Ro
                 mine = row["methods"][name]
                 out.append({**base, **mine, "method": name, "err_solved": mine["err"], "score": mine["scores"]["probability"]})
         for name, verdict in verdicts.items():
+            if verdict.variant not in row["methods"]:
+                continue  # not tried on this pair
             answer = refined({**base, "methods": row["methods"]}, verdict.variant)
             answer |= {"score": verdict.score_of(answer), "believed": verdict.believes(answer)}
             answer["seconds"] += answer.get("refinement_seconds", 0.0)

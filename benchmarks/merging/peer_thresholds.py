@@ -98,9 +98,9 @@ def least_score(score: Array, right: Array, of: int) -> tuple[float | None, floa
 
 def tried(rows: Sequence[Row], variant: str) -> Iterable[PeerVerdict]:
     """A variant's verdicts by every score and limit of the residual."""
-    mine = [refined(r, variant) for r in rows]
+    mine = [refined(r, variant) for r in rows if variant in r["methods"]]
     right = np.array([good(r) for r in mine])
-    of = sum(map(possible, rows))
+    of = sum(map(possible, mine))
     for score, residual in SCORES.items():
         if not any(score in r["scores"] for r in mine):
             continue
@@ -137,7 +137,7 @@ def load_verdicts(path: Path = THRESHOLDS_FILE) -> dict[str, PeerVerdict]:
 def written(rows: Sequence[Row], verdicts: dict[str, PeerVerdict]) -> dict[str, Any]:
     """What is committed: verdicts, where they are from, and what each variant had right."""
     fair = [r for r in rows if tellable(r) and not broken(r)]
-    variants = {v: sum(good(refined(r, v)) for r in fair) for names in VARIANTS.values() for v in names}
+    variants = {v: sum(good(refined(r, v)) for r in fair if v in r["methods"]) for names in VARIANTS.values() for v in names}
     return {
         "command": THRESHOLDS_COMMAND,
         "rule": f"highest recall at a precision of {LEAST_PRECISION} or more, over variants, scores and limits of the residual",

@@ -8,8 +8,8 @@ same format, e.g. of look-alikes. Resumable: a line of JSON a pair with all meth
 
 All on one core, in seconds of processor from points in memory to the pose; ours also from them to the joined map with its rooms
 (``extract`` of both, ``merge``). Peers run in processes of their own; what takes longer than a minute of processor, or dies, is
-a miss (`peer_calls.py`). Poses are made upright afterwards. Where the scale is unknown (Halmstad), ours has to find it; the
-others, which can't, are given it.
+a miss (`peer_calls.py`). Open3D's methods get every third pair. Poses are made upright afterwards. Where the scale is unknown
+(Halmstad), ours has to find it; the others, which can't, are given it.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,11 +35,13 @@ from topomerge.types import Array, PointCloud, VoxelGrid
 
 CACHE = Path("cache/merge")
 WHOLE = 6  # every sixth pair of the test set goes the whole way to a joined map
-PEER_CALLS = (  # each in a process of its own
+OPEN3D_SHARE = 3  # RANSAC and FGR, which take most of the time, get every third pair
+PEER_CALLS: tuple[PeerCall, ...] = (  # each in a process of its own
     (GuardedWork(partial(peer_methods.kiss, voxel=0.2)), ("kiss02", "kiss02q")),
     (GuardedWork(partial(peer_methods.kiss, voxel=0.3)), ("kiss03", "kiss03q")),
     (GuardedWork(peer_methods.open3d), ("fpfh", "fgr")),
 )
+PeerCall = tuple[GuardedWork, tuple[str, ...]]
 Outcome = dict[str, Any]  # status (empty: answered), err, err_icp, scores, seconds, refinement_seconds
 
 
@@ -95,11 +98,11 @@ def learned(pair: GridPair) -> Outcome:
     return {"status": "", "err": err, "scores": scores, "believed": result.merged, "seconds": seconds}
 
 
-def peers(given: PeerPair) -> tuple[dict[str, Outcome], float]:
-    """The outcomes of all peers, and the seconds of processor that their processes took."""
+def peers(given: PeerPair, calls: Sequence[PeerCall] = PEER_CALLS) -> tuple[dict[str, Outcome], float]:
+    """The outcomes of peers, and the seconds of processor that their processes took."""
     outcomes: dict[str, Outcome] = {}
     used, judged = 0.0, scaled(given.pair)
-    for call, names in PEER_CALLS:
+    for call, names in calls:
         answers, why, seconds = call(given.b, given.a)
         used += seconds
         for name in names:
@@ -119,16 +122,24 @@ def _error(matrix: Array, pair: GridPair) -> list[float] | None:
     return None if pose is None else error(pose, pair)
 
 
-def measured(given: PeerPair, what: str, all_the_way: bool) -> tuple[dict[str, Any], float]:
-    """The line of a pair of a set, and the seconds that the peers took."""
+def measured(given: PeerPair, what: str, number: int) -> tuple[dict[str, Any], float]:
+    """The line of a pair of a set, and the seconds that the peers took.
+
+    Args:
+        number: of the pair in its set: some methods get every so many pairs only.
+    """
     pair = given.pair
     outcomes = {"ours": ours(given)}
     if "evaluation_pair" in pair.about:
         outcomes["learned"] = learned(pair)
-    answers, used = peers(given)
+    answers, used = peers(given, PEER_CALLS if number % OPEN3D_SHARE == 0 else PEER_CALLS[:-1])
     about = {**described(pair), **(where_from(pair, PEER_SPLITS[what]) if what in PEER_SPLITS else {})}
     line = {"name": pair.name, "common": pair.common, **about, "points": [len(given.a), len(given.b)]}
-    return {**line, "methods": {**outcomes, **answers}, "whole": whole(pair) if all_the_way else None}, used
+    return {
+        **line,
+        "methods": {**outcomes, **answers},
+        "whole": whole(pair) if what == "test" and number % WHOLE == 0 else None,
+    }, used
 
 
 def done_of(target: Path) -> set[str]:
@@ -146,7 +157,7 @@ def run(seconds: float, what: str = "test") -> None:
     for k, given in enumerate(peer_pairs(what, done), len(done)):
         if k == len(done):
             ours(given)  # compiled code is loaded at the first call
-        row, used = measured(given, what, what == "test" and k % WHOLE == 0)
+        row, used = measured(given, what, k)
         of_peers += used
         with target.open("a") as out:
             out.write(json.dumps(row) + "\n")

@@ -271,7 +271,10 @@ def test_poses_are_judged_upright_and_misses_are_told(module, monkeypatch) -> No
     said = {"kiss02": answer(off, exact, {"inliers": 5.0}, 2.0, 1.0), "kiss02q": answer(over, over, {"inliers": 0.0}, 2.0, 1.0)}
     calls = ((lambda b, a: (said, "", 6.0), ("kiss02", "kiss02q")), (lambda b, a: ({}, "over the cap", 60.0), ("fpfh", "fgr")))
     monkeypatch.setattr(peers, "PEER_CALLS", calls)
-    outcomes, used = peers.peers(given)
+    monkeypatch.setattr(peers, "ours", lambda given: {"status": "", "err": None, "scores": {"probability": 0.0}, "seconds": 1.0})
+    tried = [set(peers.measured(given, "real", number)[0]["methods"]) for number in (3, 4)]
+    assert tried == [{"ours", "kiss02", "kiss02q", "fpfh", "fgr"}, {"ours", "kiss02", "kiss02q"}]  # every third pair, all
+    outcomes, used = peers.peers(given, calls)
     assert used == 66.0 and outcomes["kiss02"]["scores"] == {"inliers": 5.0}
     assert outcomes["kiss02"]["err"] == pytest.approx([0.3, 0.0, 0.0]) and outcomes["kiss02"]["err_icp"] == pytest.approx(
         [0, 0, 0]
