@@ -92,11 +92,12 @@ def test_the_rate_at_a_prior_by_hand(counts) -> None:
 
 
 def test_origins(reliable) -> None:
-    procedural, plans, real = reliable.ORIGINS
+    procedural, plans, real, made_alike = reliable.ORIGINS
     assert reliable.origin(row()) == reliable.origin({"source": "procedural"}) == reliable.origin({}) == procedural
     assert reliable.origin(row(building="school/Franch1")) == reliable.origin({"source": "ifc"}) == plans
     assert reliable.origin(row(other="school/Franch1")) == plans
     assert reliable.origin({"source": "carmen", "other_source": "utexas"}) == real
+    assert reliable.origin({"lookalike": "modules", "source": "procedural"}) == made_alike
 
 
 def test_probabilities_below_the_truth_show_above_a_tenth_only(reliable) -> None:
