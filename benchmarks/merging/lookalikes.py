@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from topomerge.datasets.pairs.build import Build
 from topomerge.datasets.pairs.evaluation_pair import sim3_of
 from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
 from topomerge.datasets.pairs.lookalike_places import LOOKALIKES
@@ -35,14 +36,10 @@ Row = dict[str, Any]
 
 
 @dataclass
-class LookalikeBuild:
+class LookalikeBuild(Build):
     """Settings of the build."""
 
-    data: LookalikeRecipe = field(default_factory=LookalikeRecipe)
-    cache: str = "cache"
-    jobs: int = 1
-    cluster: str | None = None
-    part: list[int] = field(default_factory=lambda: [1, 1])
+    data: LookalikeRecipe = field(default_factory=LookalikeRecipe)  # type: ignore[assignment]
 
 
 def lookalike_files(split: str, words: Sequence[str] = ()) -> list[Path]:
