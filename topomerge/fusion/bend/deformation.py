@@ -22,7 +22,7 @@ LATTICE_STEPS = 6.0  # nodes of the lattice within the reach of a piece
 MOST_NODES = 2000  # of the lattice along an axis
 MARGIN = 2.0  # times the reach, of the lattice around the middles of the pieces
 BETWEEN_STOREYS = 0.3  # m: below a floor by less, a point belongs to the storey above; moves are blended over as much again
-PIECE_LIMIT = 200_000  # pieces that a file may declare
+PIECE_LIMIT, FARTHEST_ANCHOR = 200_000, 1e9  # pieces that a file may declare, and m from the origin
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +164,8 @@ class Deformation:
         numbers = (self.anchors, self.moves, self.floors, np.array([self.reach]))
         finite = all(np.isfinite(x).all() for x in numbers) and 0.01 <= self.reach <= 1000
         stays = not len(self) or bool(self.storey.min() >= 0 and self.storey.max() < len(self.floors))
-        return finite and stays and self.least_growth > 0
+        near = finite and np.abs(self.anchors).max(initial=0) <= FARTHEST_ANCHOR
+        return near and stays and self.least_growth > 0
 
 
 def blended(points: Array, anchors: Array, moves: Array, reach: float) -> Array:
