@@ -256,17 +256,20 @@ def pair_arrays(pair: Pair, about: dict[str, object]) -> dict[str, Array]:
     common = common_area(pair, grids[0], grids[1], (free[0], free[1]))
     out: dict[str, Array] = {}
     for side, grid, empty in zip("ab", grids, free, strict=True):
-        out[f"{side}.cells"], out[f"{side}.origin"] = grid.cells.astype(np.int16), grid.origin
-        offset = (grid.properties["mean"] - grid.cell_bounds(grid.cells)[0]) / grid.edge
-        out[f"{side}.mean"] = np.clip(offset * 256, 0, 255).astype(np.uint8)
-        out[f"{side}.shape"] = np.array(grid.shape)
-        if empty is not None:
-            out[f"{side}.free"] = empty.cells.astype(np.int16)
+        out |= grid_arrays(side, grid, empty)
     out["truth"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
     of_pair = {k: getattr(pair, k) for k in ("sensors", "kind", "building", "overlap")}
     about = {**about, **of_pair, "common": common, "differs": differs(pair)}
     out["about"] = np.frombuffer(json.dumps(about, sort_keys=True, default=str).encode(), np.uint8)
     return out
+
+
+def grid_arrays(side: str, grid: VoxelGrid, empty: VoxelGrid | None) -> dict[str, Array]:
+    """What is cached of a map: occupied cells with the middles of their points, and empty cells where they are known."""
+    offset = (grid.properties["mean"] - grid.cell_bounds(grid.cells)[0]) / grid.edge
+    out = {f"{side}.cells": grid.cells.astype(np.int16), f"{side}.origin": grid.origin, f"{side}.shape": np.array(grid.shape)}
+    out[f"{side}.mean"] = np.clip(offset * 256, 0, 255).astype(np.uint8)
+    return out if empty is None else {**out, f"{side}.free": empty.cells.astype(np.int16)}
 
 
 def load_grids(path: str | Path, mean: bool = False) -> GridPair:
