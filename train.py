@@ -1,9 +1,9 @@
 """Train a learned part: ``python train.py task=plan_segmentation data=plan_scans``; see configs/train.yaml and configs/task/.
 
-    python train.py experiment=sage_pointnet data=train_small           the task is embedding where none is named
-    python train.py -m geometry=engineered,pointnet node=none,gat       a sweep
-    torchrun --nproc-per-node 2 train.py ...                            several processes, for embedding
-    python -m topomerge.training run.json                               without Hydra, for embedding
+python train.py experiment=sage_pointnet data=train_small           the task is embedding where none is named
+python train.py -m geometry=engineered,pointnet node=none,gat       a sweep
+torchrun --nproc-per-node 2 train.py ...                            several processes, for embedding
+python -m topomerge.training run.json                               without Hydra, for embedding
 """
 
 from __future__ import annotations

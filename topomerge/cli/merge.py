@@ -40,7 +40,7 @@ def _merge(args: argparse.Namespace, folder: Path) -> int:
         topomap, read, extract = _timed_map(path, args)
         maps.append(topomap)
         read_seconds, extract_seconds = read_seconds + read, extract_seconds + extract
-    choices = given(args, "force", "threshold")
+    choices = given(args, "force", "threshold", "rigid")
     result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices)
     result = replace(result, seconds={**result.seconds, "read": read_seconds, "extract": extract_seconds})
     warn(result.warnings)
@@ -84,6 +84,7 @@ MERGE = Command(
             default="search",
             help="rooms: only of matched rooms by their surfaces, as the thesis does; two maps",
         ),
+        option("--rigid", action="store_true", help="do not bend the maps where their drift could be the reason of what is left"),
         option("--force", action="store_true", help="write the best merge even if it is not believed (status 2 stays)"),
         option("--threshold", type=share, metavar="P", help="probability from which a merge is believed (default 0.8)"),
         DESCRIPTOR,

@@ -36,6 +36,7 @@ def merge(
     threshold: float | None = None,
     embedder: str | Descriptor = DEFAULT,
     poses: str = "search",
+    rigid: bool = False,
 ) -> MergeResult:
     """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
 
@@ -48,6 +49,7 @@ def merge(
             map -> (R, D), for the matching of rooms.
         poses: "search": of walls and of matched rooms (default); "rooms": of each matched pair of rooms by its surfaces alone, as
             the thesis does (two maps of one scale; with `embedder="shapedna"` its whole way).
+        rigid: do not bend the maps.
 
     Raises:
         InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale
@@ -59,7 +61,7 @@ def merge(
     if len(maps) < 2:
         raise InputError(f"merge takes two maps or more, {len(maps)} given; give another one")
     check_scale(scale)
-    settings = _Settings(scale, force, threshold, embedder, poses)
+    settings = _Settings(scale, force, threshold, embedder, poses, rigid)
     return _merge_two(maps[0], maps[1], settings) if len(maps) == 2 else _merge_several(maps, settings)
 
 
@@ -72,6 +74,7 @@ class _Settings:
     threshold: float | None
     embedder: str | Descriptor
     poses: str
+    rigid: bool
 
 
 def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> MergeResult:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from topomerge.fusion.bend.deformation import Deformation
+from topomerge.fusion.bend.placement import Placement, bend_to_json, placements, with_bends
 from topomerge.fusion.registration import Registration
 from topomerge.io.listing import plain
 from topomerge.types import Sim3, TopometricMap
@@ -52,6 +54,7 @@ class MergeResult:
         atlas: the evidence, of more than two.
         warnings: what the user should know.
         descriptor: of the rooms, by which they were matched.
+        bends: k -> how map k is bent in its own frame, before its transform is applied; rigid ones are left out.
     """
 
     status: str
@@ -66,15 +69,23 @@ class MergeResult:
     atlas: AtlasResult | None = None
     warnings: tuple[str, ...] = ()
     descriptor: str = ""
+    bends: Mapping[int, Deformation] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.status not in ("merged", "abstained"):
             raise ValueError(f"status must be merged or abstained, not {self.status!r}")
+        if self.map is not None:  # whoever has only the joined map can bend what it was joined of, too
+            object.__setattr__(self, "map", with_bends(self.map, list(self.placements.values())))
 
     @property
     def merged(self) -> bool:
         """Is the merge to be trusted?"""
         return self.status == "merged"
+
+    @property
+    def placements(self) -> dict[int, Placement]:
+        """k -> where the points of map k lie in the joined frame, of every map that is part of it; none where nothing is."""
+        return {p.map: p for p in placements(self.maps, self.transforms, self.bends)} if self.transforms else {}
 
     def save(self, folder: str | Path) -> None:
         """Write merge.json and report.html, and where there is a joined map merged.ply and map.tmap; all of them or none.
@@ -101,6 +112,7 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
         "descriptor": result.descriptor,
         "maps": [{"source": m.source, "rooms": len(m.rooms), "storeys": len(m.storeys)} for m in result.maps],
         "transforms": transforms,
+        "bend": {str(k): bend_to_json(result.maps[k], p) for k, p in result.placements.items() if p.bend is not None},
         "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],
         "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in MERGE_STEPS},
     }

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from topomerge import __version__
+from topomerge.fusion.bend.placement import BEND_PARAMETER
 from topomerge.io.atomic import replacing
 from topomerge.types import Array, TopometricMap
 from topomerge.viz.markup import Markup, element, join, json_data
@@ -129,7 +130,10 @@ def warnings(messages: Sequence[str]) -> Markup:
 
 def parameters(map: TopometricMap) -> Markup:
     """What the map was made from and with."""
-    return facts({"source": map.source or "–", "voxel_size": float(map.grid.edge), **map.parameters}, "Parameters")
+    values = {"source": map.source or "–", "voxel_size": float(map.grid.edge), **map.parameters}
+    if isinstance(values.get(BEND_PARAMETER), list):  # hundreds of numbers
+        values[BEND_PARAMETER] = f"of {len(values[BEND_PARAMETER])} of its maps"
+    return facts(values, "Parameters")
 
 
 def storey_names(map: TopometricMap) -> list[tuple[str, str]]:
