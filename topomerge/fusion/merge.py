@@ -18,7 +18,8 @@ from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, sol
 from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import fuse, rooms_in_common
 from topomerge.fusion.inputs import check_pair, check_poses, check_scale, checked_threshold, pair_warnings
-from topomerge.fusion.registration import register, registration_order
+from topomerge.fusion.prepared import registration_order
+from topomerge.fusion.registration import register
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
 from topomerge.fusion.thesis.fpfh import check_open3d
 from topomerge.fusion.thesis.room_poses import room_poses

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.fusion.cell_means import cell_middles
 from topomerge.fusion.judge import Judge
-from topomerge.fusion.refine import Surface, refine_pose, surface
+from topomerge.fusion.prepared import Map, Prepared, prepare
+from topomerge.fusion.refine import refine_pose
 from topomerge.fusion.scale import search_scaled
 from topomerge.fusion.search import search
-from topomerge.fusion.storey_plan import plans
 from topomerge.fusion.verify import MARGIN_CAP, model, probability, rank
 from topomerge.fusion.winner_features import winner_features
-from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.poses import PoseHypothesis, wrapped
 from topomerge.matching.refinement import refine
-from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
+from topomerge.types import Sim3, VoxelGrid
 
 log = logging.getLogger(__name__)
 ALTERNATIVES = 10
@@ -51,40 +48,6 @@ class Registration:
     alternatives: tuple[PoseHypothesis, ...] = ()
     reason: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
-
-
-Map = TopometricMap | VoxelGrid
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """What registration needs of a map; made once where a map is registered with several.
-
-    Args:
-        storeys: their plans, lowest first.
-        order: larger maps come first; among equal ones the order is arbitrary, but always the same.
-        middle: (3,) of its cells, m.
-        surface: makes its points and normals, for the fine registration.
-    """
-
-    storeys: tuple[PlanFields, ...]
-    order: tuple[int, str]
-    middle: Array
-    surface: Callable[[], Surface]
-
-
-def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
-    """Plans of a map, with what is drawn from them when it is first needed.
-
-    Args:
-        free: cells known to be empty; a topometric map brings its own.
-
-    Raises:
-        InputError: an empty map.
-    """
-    grid = _grid(map)
-    storeys = tuple(PlanFields(p) for p in plans(map, free))
-    return Prepared(storeys, registration_order(map), cell_middles(grid).mean(axis=0), lambda: surface(grid))
 
 
 def register(
@@ -170,20 +133,9 @@ def _verdict(
     return Registration(pose, chance, accepted, features, others, reason, seconds)
 
 
-def _grid(m: Map) -> VoxelGrid:
-    return m.grid if isinstance(m, TopometricMap) else m
-
-
-def registration_order(m: Map) -> tuple[int, str]:
-    """Larger maps come first; among equal ones the order is arbitrary, but always the same."""
-    grid = _grid(m)
-    digest = hashlib.sha256(np.ascontiguousarray(grid.cells).tobytes() + grid.origin.tobytes()).hexdigest()
-    return -len(grid), digest
-
-
 def fine(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
     """Point-to-plane refinement of T_ab, unless it runs away, and the root mean square distance of the surfaces, m."""
-    moved = refine_pose(a.surface(), b.surface(), start, scaled)
+    moved = refine_pose(a.surface, b.surface, start, scaled)
     shift = float(np.linalg.norm(moved.pose.apply(b.middle[None]) - start.apply(b.middle[None])))
     turn = abs(wrapped(moved.pose.yaw - start.yaw))
     if not np.isfinite(moved.rmse) or shift > DRIFTED[0] or turn > DRIFTED[1]:

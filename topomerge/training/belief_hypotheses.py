@@ -16,7 +16,7 @@ from topomerge.datasets.core.derived import derive, read_derived
 from topomerge.datasets.pairs.grid_drawings import build_drawings
 from topomerge.datasets.pairs.grid_pairs import GridPair, GridRecipe, build_grids, load_grids
 from topomerge.fusion.judge import Judge
-from topomerge.fusion.registration import registration_order as order
+from topomerge.fusion.prepared import registration_order as order
 from topomerge.fusion.scale import search_scaled
 from topomerge.fusion.search import search
 from topomerge.fusion.storey_plan import plans

@@ -14,8 +14,8 @@ import numpy as np
 from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
+from topomerge.fusion.prepared import Prepared, prepare
 from topomerge.fusion.refine import Surface, surface
-from topomerge.fusion.registration import Prepared, prepare
 from topomerge.io.maps import load_map
 from topomerge.types import Array, TopometricMap
 

@@ -1,0 +1,163 @@
+"""Two maps bent onto each other: pieces registered by themselves, moved by as much as drift explains (method 4).
+
+First the rigid pose is mended by what all pieces say; then, in windows that shrink, each piece is registered locally and a graph
+of joints and measurements settles the moves of both maps (`graph`); last, maps with heights are held against each other by their
+surfaces. What no usual drift explains is not bent: joints give way by a few standard deviations only, and a bending that nearly
+folds space is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from topomerge.fusion.bend.alignment import Alignment
+from topomerge.fusion.bend.bent_plan import bent_plan
+from topomerge.fusion.bend.deformation import Deformation
+from topomerge.fusion.bend.drift import Drift
+from topomerge.fusion.bend.graph import Settled
+from topomerge.fusion.bend.local import Window
+from topomerge.fusion.prepared import Prepared
+from topomerge.matching.plan_fields import PlanFields
+from topomerge.matching.refinement import storeys_at
+from topomerge.types import Array, Sim3
+
+FIRST_WINDOW = Window(1.2, 0.3, float(np.radians(3.0)))  # in which the rigid pose is mended
+POSE_ROUNDS = 2
+WINDOWS = (
+    Window(0.8, 0.2, float(np.radians(2.0))),
+    Window(0.4, 0.15, float(np.radians(1.0))),
+    Window(0.2, 0.1, float(np.radians(0.5))),
+)
+SURFACE_ROUNDS = 3
+LEAST_GROWTH = 0.6  # of a small area: below, space nearly folds
+STIFFER = (1.0, 0.5, 0.25)  # times the drift, tried in turn until space does not fold
+DOUBTED = 0.25  # weight of a measurement that is voted out
+
+
+@dataclass(frozen=True, eq=False)
+class Bend:
+    """How two maps are bent onto each other.
+
+    Args:
+        transform: T_ab, which lays bent map b into the frame of bent map a.
+        deformations: of a and of b, each in its own frame.
+        features: what the bending itself tells of the pose: ``strain`` (misfit of the joints, in standard deviations of the usual
+            drift), ``bent`` (m, root mean square of how far pieces of b moved against a), ``farthest`` (m, most of them),
+            ``doubted`` (share of the pieces that were voted out), ``pieces`` (number of those that were registered).
+        reason: why the maps stay as they are; empty where they are bent.
+    """
+
+    transform: Sim3
+    deformations: tuple[Deformation, Deformation]
+    features: dict[str, float] = field(default_factory=dict)
+    reason: str = ""
+
+    def relative(self, points: Array) -> Array:
+        """Points (n, 3) of b, moved so that the transform alone lays them where bending lays them on an unbent map a."""
+        laid = self.transform.apply(self.deformations[1].apply(points))
+        return self.transform.inverse().apply(self.deformations[0].undo(laid))
+
+    def back(self, points: Array) -> Array:
+        """The inverse of `relative`."""
+        laid = self.deformations[0].apply(self.transform.apply(points))
+        return self.deformations[1].undo(self.transform.inverse().apply(laid))
+
+    def inverse(self) -> Bend:
+        """The same bending seen from b."""
+        return replace(self, transform=self.transform.inverse(), deformations=self.deformations[::-1])
+
+    def storeys(self, b: Sequence[PlanFields]) -> tuple[PlanFields, ...]:
+        """The storeys of b, bent so that the transform lays them on an unbent map a; to be judged."""
+        return tuple(self._bent(fields) for fields in b) if not self.reason else tuple(b)
+
+    def _bent(self, fields: PlanFields) -> PlanFields:
+        level = fields.plan.floor_guess
+
+        def forward(places: Array) -> Array:
+            return self.relative(np.column_stack([places, np.full(len(places), level)]))[:, :2]
+
+        def back(places: Array) -> Array:
+            return self.back(np.column_stack([places, np.full(len(places), level)]))[:, :2]
+
+        return PlanFields(bent_plan(fields.plan, forward, back))
+
+
+def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | None = None, scaled: bool = False) -> Bend:
+    """Bend both maps, each in proportion to its drift, so that they agree under a pose near T_ab; rigid, and why, where nothing
+    can be bent. `bend(b, a, pose.inverse())` gives the inverse.
+
+    Args:
+        pose: T_ab, right to about a metre.
+        drift: of a and of b; of their sensors if None.
+        scaled: is the scale free?
+    """
+    if b.order < a.order:  # so that nothing depends on which comes first
+        return bend(b, a, pose.inverse(), drift=drift and drift[::-1], scaled=scaled).inverse()
+    usual = drift or (a.drift, b.drift)
+    reason = _why_rigid(a, b, pose, usual)
+    if reason:
+        return Bend(pose, (_rigid(a), _rigid(b)), reason=reason)
+    for share in STIFFER:
+        stiff = (Drift(share * usual[0].shift, share * usual[0].turn), Drift(share * usual[1].shift, share * usual[1].turn))
+        alignment = Alignment(a, b, pose, scaled)
+        settled = _settled(alignment, stiff)
+        if settled is None:
+            return Bend(pose, (_rigid(a), _rigid(b)), reason="no walls of the one map are near those of the other")
+        first = len(a.pieces)
+        covariances = settled.covariance[:first], settled.covariance[first:]
+        bent = (alignment.deformation(0, covariances[0]), alignment.deformation(1, covariances[1]))
+        if min(d.least_growth for d in bent) >= LEAST_GROWTH:
+            return Bend(alignment.pose, bent, _features(alignment, settled))
+    return Bend(pose, (_rigid(a), _rigid(b)), reason="bending would fold space")
+
+
+def _settled(alignment: Alignment, drift: tuple[Drift, Drift]) -> Settled | None:
+    for _ in range(POSE_ROUNDS):
+        alignment.mend_pose(FIRST_WINDOW)
+    settled = None
+    for window in WINDOWS:
+        parts = [alignment.by_plan(side, window) for side in (0, 1)]
+        if not sum(len(p.piece) for p in parts):
+            return None
+        settled = alignment.settle(parts, drift)
+    if any(s.plan.sliced for m in alignment.maps for s in m.storeys):  # a slice has no planes
+        return settled
+    for _ in range(SURFACE_ROUNDS):
+        parts = [alignment.by_surfaces(side) for side in (0, 1)]
+        if not sum(len(p.piece) for p in parts):
+            break
+        settled = alignment.settle(parts, drift)
+    return settled
+
+
+def _why_rigid(a: Prepared, b: Prepared, pose: Sim3, drift: tuple[Drift, Drift]) -> str:
+    """Why two maps can't be bent onto each other; empty where they can."""
+    if drift[0].rigid and drift[1].rigid:
+        return "neither map bends"
+    if not storeys_at(a.storeys, b.storeys, pose.translation[2], pose.scale):
+        return "no storeys lie on one level"
+    if min(len(a.pieces), len(b.pieces)) == 0:
+        return "a map shows no walls"
+    if max(len(m.pieces) if not d.rigid else 1 for m, d in zip((a, b), drift, strict=True)) < 2:
+        return "the maps are one piece each"
+    return ""
+
+
+def _rigid(map: Prepared) -> Deformation:
+    none = np.zeros(0, np.int64)
+    floors = np.array([s.plan.floor_guess for s in map.storeys])
+    return Deformation(np.zeros((0, 2)), none, floors, np.zeros((0, 4)), np.zeros((0, 3, 3)), none.astype(np.int32), 1.0)
+
+
+def _features(alignment: Alignment, settled: Settled) -> dict[str, float]:
+    moved = np.linalg.norm(alignment.relative(1)[:, :2], axis=1)
+    return {
+        "strain": float(np.sqrt(settled.strain.sum() / max(3 * len(settled.strain), 1))),
+        "bent": float(np.sqrt((moved**2).mean())),
+        "farthest": float(moved.max()),
+        "doubted": float((settled.weights < DOUBTED).mean()) if len(settled.weights) else 0.0,
+        "pieces": float(len(settled.weights)) / 2,
+    }

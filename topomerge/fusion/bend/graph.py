@@ -1,0 +1,155 @@
+"""Moves of the pieces of two maps from what was measured between them: robust sparse least squares (method 4).
+
+Variables are a shift, a turn and, where the scale is free, the logarithm of a scale for each piece, all in one frame. Joints hold
+neighbouring pieces of one map together, as stiff as its sensor drifts; measurements say how a place of one map lies on the other
+one, with graduated non-convexity (Yang et al. 2020, RA-L 5(2); Geman-McClure), so that a wrong one does not drag the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from topomerge.types import Array
+
+UNKNOWNS = 4  # of a piece: shift x, y, turn, logarithm of the scale
+CONVEX_ROUNDS = 10  # of graduated non-convexity
+OUTLIER = 9.0  # square of the misfit, in standard deviations, from which a measurement is doubted
+HELD = 1e9  # information of what may not move
+
+
+@dataclass(frozen=True, eq=False)
+class Joints:
+    """Neighbouring pieces: (j, 2) numbers, and (j, 4) standard deviations of the differences of their moves at the place between
+    them: m, m, rad, logarithm of the scale."""
+
+    pieces: Array
+    sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """How places lie apart.
+
+    Args:
+        piece: (m,) the piece that was measured.
+        places: (m, 2) where, m.
+        others: (m, q) pieces of the other map, and shares (m, q) of what they have to say there; 0 none.
+        moves: (m, 3) shift and turn of the piece against the others.
+        information: (m, 3, 3).
+    """
+
+    piece: Array
+    places: Array
+    others: Array
+    shares: Array
+    moves: Array
+    information: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """(n, 4) moves; (n, 3, 3) covariance of shift and turn; (m,) weight 0..1 of each measurement; (j,) squared misfit of each
+    joint, in variances."""
+
+    moves: Array
+    covariance: Array
+    weights: Array
+    strain: Array
+
+
+def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array) -> Settled:
+    """The moves of all pieces.
+
+    Args:
+        anchors: (n, 2) m.
+        prior: (n, 4) standard deviations of the moves by themselves; 0: does not move.
+    """
+    n = len(anchors)
+    jointed = _joint_rows(anchors, joints)
+    stiff = sparse.diags(np.where(prior > 0, 1 / np.maximum(prior, 1e-9) ** 2, HELD).ravel())
+    held = jointed.T @ jointed + stiff
+    rows = _measured_rows(anchors, measured)
+    roots = _roots(measured.information)
+    whitened = sparse.block_diag(list(roots), format="csr") @ rows if len(rows.indptr) > 1 else rows
+    aims = np.einsum("mij,mj->mi", roots, measured.moves)
+    weights, moves = np.ones(len(aims)), np.zeros(n * UNKNOWNS)
+    relaxed = 0.0
+    for k in range(CONVEX_ROUNDS):
+        scaled = whitened.multiply(np.repeat(weights, 3)[:, None]).tocsr()
+        factor = splu((held + scaled.T @ whitened).tocsc())
+        moves = factor.solve(scaled.T @ aims.ravel())
+        misfit = (whitened @ moves).reshape(-1, 3) - aims
+        chi = (misfit**2).sum(axis=1)
+        relaxed = max(2 * chi.max(initial=0) / OUTLIER, 1.0) if k == 0 else max(relaxed / 1.6, 1.0)
+        weights = (relaxed * OUTLIER / (chi + relaxed * OUTLIER)) ** 2
+    return Settled(
+        moves.reshape(n, UNKNOWNS), _covariance(factor, n), weights, ((jointed @ moves).reshape(-1, 4) ** 2).sum(axis=1)
+    )
+
+
+def _covariance(factor: object, n: int) -> Array:
+    """(n, 3, 3) of each piece by itself."""
+    out = np.zeros((n, 3, 3))
+    for k in range(3):
+        for start in range(0, n, 256):
+            many = min(256, n - start)
+            ones = np.zeros((n * UNKNOWNS, many))
+            at = UNKNOWNS * (start + np.arange(many))
+            ones[at + k, np.arange(many)] = 1.0
+            solved = factor.solve(ones)  # type: ignore[attr-defined]
+            for j in range(3):
+                out[start : start + many, j, k] = solved[at + j, np.arange(many)]
+    return out
+
+
+def _roots(information: Array) -> Array:
+    """(m, 3, 3) R with R^T R the information."""
+    values, vectors = np.linalg.eigh(information)
+    out: Array = np.sqrt(np.maximum(values, 0))[:, :, None] * vectors.transpose(0, 2, 1)
+    return out
+
+
+def _effect(place: Array, anchors: Array) -> Array:
+    """(m, 4, 4) how moves of pieces show at places: shift there, turn, scale."""
+    x, y = (place - anchors).T
+    out = np.tile(np.eye(4), (len(x), 1, 1))
+    out[:, 0, 2], out[:, 1, 2] = -y, x
+    out[:, 0, 3], out[:, 1, 3] = x, y
+    return out
+
+
+def _sparse(blocks: Array, rows: Array, pieces: Array, shape: tuple[int, int]) -> sparse.csr_matrix:
+    """Blocks (m, r, 4) as a sparse matrix: block k in rows r * rows[k].. and at piece pieces[k]."""
+    _, high, wide = blocks.shape
+    i = (high * rows)[:, None, None] + np.arange(high)[None, :, None] + np.zeros((1, 1, wide), int)
+    j = (UNKNOWNS * pieces)[:, None, None] + np.arange(wide)[None, None, :] + np.zeros((1, high, 1), int)
+    return sparse.csr_matrix((blocks.ravel(), (i.ravel(), j.ravel())), shape)
+
+
+def _joint_rows(anchors: Array, joints: Joints) -> sparse.csr_matrix:
+    """Differences of moves at the places between pieces, in standard deviations."""
+    many = len(joints.pieces)
+    middle = anchors[joints.pieces].mean(axis=1).reshape(-1, 2)
+    shape = (4 * many, UNKNOWNS * len(anchors))
+    out = sparse.csr_matrix(shape)
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        ends = joints.pieces[:, side]
+        blocks = sign * _effect(middle, anchors[ends]) / joints.sigma[:, :, None]
+        out = out + _sparse(blocks, np.arange(many), ends, shape)
+    return out
+
+
+def _measured_rows(anchors: Array, measured: Measurements) -> sparse.csr_matrix:
+    """Shift and turn of the measured pieces against the others."""
+    many = len(measured.piece)
+    shape = (3 * many, UNKNOWNS * len(anchors))
+    out = _sparse(_effect(measured.places, anchors[measured.piece])[:, :3], np.arange(many), measured.piece, shape)
+    for k in range(measured.others.shape[1] if many else 0):
+        others = measured.others[:, k]
+        blocks = measured.shares[:, k, None, None] * _effect(measured.places, anchors[others])[:, :3]
+        out = out - _sparse(blocks, np.arange(many), others, shape)
+    return out

@@ -1,0 +1,149 @@
+"""Each piece registered by itself on the other map: a move, and how surely it is held in each direction (method 4).
+
+All small moves are scored; the mean and the covariance of what is left by the scores say where a piece lies and in which
+direction it may slide: a corridor is held across, a room with two walls in a corner in both, an empty one in none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from topomerge.fusion.bend.pieces import Pieces
+from topomerge.kernels.bend import move_scores
+from topomerge.matching.plan_fields import PlanFields
+from topomerge.types import Array, Sim3
+
+SECTORS = 4  # of the directions that walls face; what faces none, or away from all, is compared with all walls
+FACES_ALIKE = -0.3  # cosine, below which two faces are two sides of a wall
+PIECE_POINTS = 400  # wall columns that a piece is registered by
+CONTEXT = 1.0  # m around the walls of a piece that are registered with it
+MISSED = 0.05  # of a wall's likelihood, where no wall is near
+INDIFFERENT = 0.3  # likelihood that speaks neither for nor against
+ON_FREE_FLOOR = 1.0  # logarithm by which a wall on free floor is less likely
+EVIDENCE = 0.12  # of a column of walls: neighbours are not independent
+MOVE_FLOOR = (0.02, float(np.radians(0.2)))  # m, rad: no move is known better
+SHIFT_STEP = 0.05  # m, least step of the tried shifts
+TURNS = 5  # tried ones
+
+
+@dataclass(frozen=True)
+class Window:
+    """Small moves that are tried: shifts up to `shift` m both ways, turns up to `turn` rad, walls as wide as `sigma` m."""
+
+    shift: float
+    sigma: float
+    turn: float
+
+
+class Target:
+    """A storey that pieces of the other map are registered on."""
+
+    def __init__(self, fields: PlanFields) -> None:
+        self.fields = fields
+        self.main = np.radians(float(fields.profile.argmax()) / 2)
+        self._distances = _distances(fields, self.main)
+
+    def gain(self, sigma: float) -> tuple[Array, Array]:
+        """(5, nx, ny) float32 what a wall column that faces each sector, or none, gains there; the corner of the raster, m."""
+        distance, origin = self._distances
+        likelihood = np.log(MISSED + (1 - MISSED) * np.exp(-(distance**2) / (2 * sigma**2))) - np.log(INDIFFERENT)
+        rim = (distance.shape[1] - self.fields.plan.wall.shape[0]) // 2
+        seen, free = np.pad(self.fields.kind != 0, rim), np.pad(self.fields.core, rim)
+        gain = np.where(seen | (likelihood > 0), likelihood - ON_FREE_FLOOR * free, 0.0)
+        return (EVIDENCE * gain).astype(np.float32), origin
+
+    def sectors(self, faces: Array) -> Array:
+        """(n,) sector of the faces (n, 2), `SECTORS` where there is none."""
+        angle = np.arctan2(faces[:, 1], faces[:, 0]) - self.main
+        sector = np.round(angle / (2 * np.pi / SECTORS)).astype(np.int64) % SECTORS
+        return np.where(np.abs(faces).max(axis=1) > 0, sector, SECTORS)
+
+
+def _distances(fields: PlanFields, main: float) -> tuple[Array, Array]:
+    """(5, nx, ny) m to walls that may face each sector, and to any."""
+    from topomerge.matching.plan_fields import DISTANCE_CAP, distance_to
+
+    rim = int(np.ceil(DISTANCE_CAP / fields.plan.edge))
+    wall, face = np.pad(fields.plan.wall, rim), np.pad(fields.face, ((rim, rim), (rim, rim), (0, 0)))
+    two_sided = np.abs(face).max(axis=2) == 0
+    out = []
+    for k in range(SECTORS):
+        angle = main + k * 2 * np.pi / SECTORS
+        alike = face @ np.array([np.cos(angle), np.sin(angle)], np.float32) > FACES_ALIKE
+        out.append(distance_to(wall & (alike | two_sided), fields.plan.edge))
+    out.append(distance_to(wall, fields.plan.edge))
+    return np.stack(out), fields.plan.origin - rim * fields.plan.edge
+
+
+def samples(pieces: Pieces) -> tuple[Array, Array]:
+    """Rows of walls by which each piece is registered, with those near it, and where each piece's begin: (n + 1,)."""
+    rng = np.random.default_rng(0)
+    rows, start = [], [0]
+    for k in range(len(pieces)):
+        own = pieces.walls[pieces.owner == k]
+        same = pieces.storey[pieces.owner] == pieces.storey[k]
+        near = (
+            same
+            & (pieces.walls >= own.min(axis=0) - CONTEXT).all(axis=1)
+            & (pieces.walls <= own.max(axis=0) + CONTEXT).all(axis=1)
+        )
+        chosen = np.flatnonzero(near)
+        if len(chosen) > PIECE_POINTS:
+            chosen = np.sort(rng.permutation(chosen)[:PIECE_POINTS])
+        rows.append(chosen)
+        start.append(start[-1] + len(chosen))
+    return np.concatenate(rows) if rows else np.zeros(0, np.int64), np.array(start)
+
+
+def measure(
+    pieces: Pieces, sampled: tuple[Array, Array], chosen: Array, moves: Array, into: Sim3, target: Target, window: Window
+) -> tuple[Array, Array]:
+    """Moves (k, 3) of the chosen pieces onto a storey of the other map, shift and turn in the pieces' frame, and their
+    information (k, 3, 3); no more than what the window allows.
+
+    Args:
+        chosen: (k,) pieces.
+        moves: (n, 3) where they are tried from.
+        into: the pieces' frame -> that of the target.
+    """
+    rows, start = sampled
+    spans = [rows[start[k] : start[k + 1]] for k in chosen]
+    every = np.concatenate(spans) if spans else np.zeros(0, np.int64)
+    firsts = np.cumsum([0, *(len(s) for s in spans)])
+    about = pieces.anchors[np.repeat(chosen, np.diff(firsts))]
+    turn = np.array([[np.cos(into.yaw), -np.sin(into.yaw)], [np.sin(into.yaw), np.cos(into.yaw)]])
+    points = into.scale * (pieces.walls[every] - about)
+    sector = target.sectors(pieces.faces[every] @ turn.T)
+    placed = pieces.anchors[chosen] + moves[chosen, :2]
+    places = into.apply(np.column_stack([placed, np.zeros(len(placed))]))[:, :2]
+    shift = window.shift * into.scale
+    step = max(shift / 8, SHIFT_STEP)
+    shifts = np.arange(-np.round(shift / step), np.round(shift / step) + 1) * step
+    yaws = np.linspace(-window.turn, window.turn, TURNS)
+    gain, origin = target.gain(window.sigma)
+    scores = move_scores(
+        points, sector, firsts, places, into.yaw + moves[chosen, 2], yaws, shifts, gain, origin, target.fields.plan.edge
+    )
+    mean, information = _gaussian(scores, shifts, yaws)
+    back = np.eye(3)
+    back[:2, :2] = turn.T / into.scale
+    there = np.linalg.inv(back)
+    return moves[chosen] + mean @ back.T, there.T @ information @ there
+
+
+def _gaussian(scores: Array, shifts: Array, yaws: Array) -> tuple[Array, Array]:
+    """Means (k, 3) and information (k, 3, 3) of the moves that scores (k, Y, S, S) leave likely, beyond that of the window."""
+    y, x, z = np.meshgrid(yaws, shifts, shifts, indexing="ij")
+    moves = np.column_stack([x.ravel(), z.ravel(), y.ravel()])
+    flat = scores.reshape(len(scores), -1)
+    likely = np.exp(flat - flat.max(axis=1, keepdims=True))
+    likely /= likely.sum(axis=1, keepdims=True)
+    mean = likely @ moves
+    spread = np.einsum("km,mi,mj->kij", likely, moves, moves) - mean[:, :, None] * mean[:, None, :]
+    window = np.linalg.inv(1.2 * np.diag(moves.var(axis=0)))
+    information = np.linalg.inv(spread + np.diag(np.array([MOVE_FLOOR[0], MOVE_FLOOR[0], MOVE_FLOOR[1]]) ** 2)) - window
+    values, vectors = np.linalg.eigh(information)
+    out: Array = (vectors * np.maximum(values, 0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return mean, out
