@@ -12,7 +12,8 @@ import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import office_map, truth
 from tests.scenes import two_rooms
 from topomerge.errors import InputError
-from topomerge.fusion.fuse import fuse, resampled, rooms_in_common
+from topomerge.fusion.fuse import fuse, rooms_in_common
+from topomerge.fusion.resampling import resampled
 from topomerge.fusion.storey_levels import extruded
 from topomerge.types import Sim3, TopometricMap, VoxelGrid
 

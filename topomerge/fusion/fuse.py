@@ -1,8 +1,7 @@
 """Maps and where they lie -> one map: cells are fused one map after the other, rooms and doors extracted once, at the end (seeds
 3.3; method 4).
 
-Cells are resampled: a cell of the joined lattice is occupied where its middle lies in a cell of a moved map, and where the middle
-of a cell of a moved map lies in it. So no cell is lost, and a turned floor or wall gets no holes.
+Maps are bent in their own frames, then posed; their cells are resampled on the lattice of the first one (`resampling`).
 
 Maps whose heights were assumed (slices and drawings, extruded) add only what no other map saw: what stands on the floor of a room
 would become a wall that fills it. They still say that they saw the cells of others that lie in theirs.
@@ -10,9 +9,8 @@ would become a wall that fills it. They still say that they saw the cells of oth
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Protocol
 
 import numpy as np
@@ -23,17 +21,16 @@ from topomerge.extraction.convolution import convolve, moore
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
+from topomerge.fusion.bend.deformation import Deformation
+from topomerge.fusion.resampling import Laying, decoded, encoded, resampled
 from topomerge.fusion.storey_levels import extruded
-from topomerge.kernels import morton
 from topomerge.matching.consistency import matches_under
 from topomerge.matching.room_plans import room_plans
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
 
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
-RESAMPLED_AT_ONCE = 200_000  # cells
 PROVENANCE_BITS = 32  # maps that one bit set tells apart
 ASSUMED_MARGIN = 0.3  # m around what other maps saw: there an extruded wall is one of theirs that is a little off
-CODE_OFFSET = 1 << 20  # cells are counted from there, as Morton codes hold no negative ones
 
 
 class MapSequence(Protocol):
@@ -42,7 +39,7 @@ class MapSequence(Protocol):
     def __getitem__(self, k: int, /) -> TopometricMap: ...
 
 
-def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]]) -> TopometricMap:
+def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[int, Deformation] | None = None) -> TopometricMap:
     """The joined map in the frame of the first one, at its edge length unless another one's cells are clearly finer.
 
     Each cell carries the bit set of the maps that saw it: bit k for the kth pose; maps that are joined already keep their bits,
@@ -52,6 +49,7 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]]) -> TopometricMap:
     Args:
         maps: loaded one at a time.
         poses: which maps, with T_0k; the first is the identity.
+        bends: k -> how map k is bent in its own frame, before it is posed; the others are rigid.
 
     Raises:
         InputError: more maps than provenance can tell apart.
@@ -66,7 +64,8 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]]) -> TopometricMap:
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     for n in order:
         k, pose = poses[n]
-        cells.add_map(maps[k], pose, int(first_bits[n]), parts[n].assumed and n != order[0])
+        laying = Laying.of(pose, (bends or {}).get(k))
+        cells.add_map(maps[k], laying, int(first_bits[n]), parts[n].assumed and n != order[0])
     name = " + ".join(maps[k].source or "map" for k, _ in poses)
     return _extracted(cells, min(part.neighbours for part in parts), name)
 
@@ -110,32 +109,32 @@ class _JoinedCells:
         self.codes = self.free_codes = np.zeros(0, np.uint64)
         self.provenance = np.zeros(0, np.uint32)
 
-    def add_map(self, map: TopometricMap, pose: Sim3, first_bit: int, assumed: bool) -> None:
+    def add_map(self, map: TopometricMap, laying: Laying, first_bit: int, assumed: bool) -> None:
         """Add a map; of one whose heights were assumed only what no other saw."""
         provenance = np.ones(len(map.grid), np.uint32) if map.provenance is None else map.provenance.astype(np.uint32)
-        cells, rows = resampled(map.grid, pose, self.origin, self.edge)
+        cells, rows = resampled(map.grid, laying, self.origin, self.edge)
         provenance = provenance[rows] << np.uint32(first_bit)
         if assumed and len(cells):
             added = self._contains(cells) | ~self._surveyed(cells)
             cells, provenance = cells[added], provenance[added]
         self._add(cells, provenance)
         if map.free is not None:
-            free_cells = resampled(map.free, pose, self.origin, 2 * self.edge)[0]
-            self.free_codes = np.union1d(self.free_codes, _encoded(free_cells))
+            free_cells = resampled(map.free, laying, self.origin, 2 * self.edge)[0]
+            self.free_codes = np.union1d(self.free_codes, encoded(free_cells))
 
     def _add(self, cells: Array, provenance: Array) -> None:
-        self.codes, row = np.unique(np.concatenate([self.codes, _encoded(cells)]), return_inverse=True)
+        self.codes, row = np.unique(np.concatenate([self.codes, encoded(cells)]), return_inverse=True)
         joined = np.zeros(len(self.codes), np.uint32)
         np.bitwise_or.at(joined, row, np.concatenate([self.provenance, provenance]))
         self.provenance = joined
 
     def _contains(self, cells: Array) -> Array:
         """(n,) bool: is a cell there already?"""
-        return np.isin(_encoded(cells), self.codes)
+        return np.isin(encoded(cells), self.codes)
 
     def _surveyed(self, cells: Array) -> Array:
         """(n,) bool: have the columns of cells, at the heights between the lowest and the highest of them, anything near?"""
-        occupied = _decoded(self.codes)
+        occupied = decoded(self.codes)
         low, high = cells[:, 2].min(), cells[:, 2].max()
         occupied = occupied[(occupied[:, 2] >= low - 3) & (occupied[:, 2] <= high + 3)]
         if not len(occupied):
@@ -156,14 +155,14 @@ def _extracted(joined: _JoinedCells, neighbours: float, name: str) -> Topometric
         neighbours: usual number of neighbours of a cell in the sparsest map. Where several maps saw a place cells are dense, and
             floors that only the sparsest one saw must not count as noise beside them.
     """
-    cells = _decoded(joined.codes)
+    cells = decoded(joined.codes)
     base = 2 * (cells.min(axis=0) // 2)  # even: free cells are twice as long
     grid = VoxelGrid.from_cells(cells - base, joined.origin + base * joined.edge, joined.edge)
     provenance = np.zeros(len(grid), np.uint32)
     provenance[grid.rows(cells - base)] = joined.provenance
     free = None
     if len(joined.free_codes):
-        free_cells = _decoded(joined.free_codes) - base // 2
+        free_cells = decoded(joined.free_codes) - base // 2
         free_cells = free_cells[((free_cells >= 0) & (free_cells < -(-np.array(grid.shape) // 2))).all(axis=1)]
         x, y, z = (-(-s // 2) for s in grid.shape)
         free = VoxelGrid.from_cells(free_cells, grid.origin, 2 * grid.edge, (x, y, z))
@@ -181,73 +180,37 @@ def _usual_neighbours(grid: VoxelGrid) -> float:
     return float(np.median(convolve(grid, moore()))) if len(grid) else 0.0
 
 
-def resampled(grid: VoxelGrid, pose: Sim3, origin: Array, edge: float) -> tuple[Array, Array]:
-    """Cells (n, 3) int64 of a lattice that the moved cells of a grid fill, and the row (n,) of one that does.
-
-    Args:
-        pose: of the grid in the frame of the lattice.
-        origin: (3,) m, corner of the lattice's cell (0, 0, 0); cells may be negative.
-        edge: of the lattice's cells, m.
-    """
-    offset = (grid.origin - origin) / edge
-    if pose == Sim3() and abs(grid.edge - edge) < 1e-9 and np.allclose(offset, np.round(offset), atol=1e-6):
-        return grid.cells + np.round(offset).astype(np.int64), np.arange(len(grid))
-    blocks = list(_resampled_blocks(grid, pose, origin, edge))
-    if not blocks:
-        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
-    cells = np.concatenate([c for c, _ in blocks])
-    rows = np.concatenate([r for _, r in blocks])
-    _, first = np.unique(_encoded(cells), return_index=True)
-    return cells[first], rows[first]
-
-
-def _resampled_blocks(grid: VoxelGrid, pose: Sim3, origin: Array, edge: float) -> Iterator[tuple[Array, Array]]:
-    """`resampled` of some cells at a time; cells may come twice."""
-    ratio = pose.scale * grid.edge / edge
-    wide, tall = int(ratio * np.sqrt(0.5) + 0.5), int(ratio / 2 + 0.5)  # how far a cell reaches from the one its middle is in
-    flat = range(-wide, wide + 1)
-    around = np.array(list(product(flat, flat, range(-tall, tall + 1))))
-    back = pose.inverse()
-    for start in range(0, len(grid), RESAMPLED_AT_ONCE):
-        middles = pose.apply(grid.centroids(grid.cells[start : start + RESAMPLED_AT_ONCE]))
-        holding = np.floor((middles - origin) / edge).astype(np.int64)  # the cells that the middles lie in
-        cells = (holding[:, None] + around).reshape(-1, 3)
-        cells = cells[np.unique(_encoded(cells), return_index=True)[1]]
-        rows = grid.rows(grid.locate(back.apply(origin + (cells + 0.5) * edge)))
-        yield cells[rows >= 0], rows[rows >= 0]
-        yield holding, np.arange(start, start + len(holding))
-
-
-def _encoded(cells: Array) -> Array:
-    """(n,) uint64, one code for each cell within a million of the origin."""
-    return morton.encode((cells + CODE_OFFSET).astype(np.int32))
-
-
-def _decoded(codes: Array) -> Array:
-    """(n, 3) int64, the cells of `_encoded`."""
-    cells: Array = morton.decode(codes).astype(np.int64) - CODE_OFFSET
-    return cells
-
-
-def rooms_in_common(a: TopometricMap, b: TopometricMap, transform: Sim3) -> tuple[Array, Array]:
+def rooms_in_common(
+    a: TopometricMap,
+    b: TopometricMap,
+    transform: Sim3,
+    bends: tuple[Deformation | None, Deformation | None] = (None, None),
+) -> tuple[Array, Array]:
     """(M, 2) rooms of a and of b that are one room under T_ab, and (M,) 0..1 how much of their floor they share.
 
     A room that is cut in two in the other map is in two rows.
+
+    Args:
+        bends: of a and of b, each in its own frame; T_ab lays bent b on bent a.
     """
     if not len(a.rooms) or not len(b.rooms):
         return np.zeros((0, 2), np.int64), np.zeros(0)
-    return matches_under(transform, (room_plans(a), room_plans(b)))
+    to, moved = Laying.of(Sim3(), bends[0]), Laying.of(transform, bends[1])
+    bent = to.bend is not None or moved.bend is not None
+    return matches_under(transform, (room_plans(a), room_plans(b)), (lambda p: to.undo(moved.apply(p))) if bent else None)
 
 
-def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3) -> Array:
+def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3, bend: Deformation | None = None) -> Array:
     """(R,) room of the joined map in which most of the floor of each room of a part lies, -1 none.
 
     Args:
         pose: of the part in the joined map.
+        bend: of the part, in its own frame, before it is posed; None: rigid.
     """
     rooms = np.full(len(part.rooms), -1, np.int64)
     inside = part.navigable_room >= 0
-    cells = joined.navigable.locate(pose.apply(part.navigable.centroids(part.navigable.cells[inside])))
+    floor = part.navigable.centroids(part.navigable.cells[inside])
+    cells = joined.navigable.locate(Laying.of(pose, bend).apply(floor))
     joined_room = np.full(len(cells), -1, np.int64)
     for up in (0, 1, -1, 2, -2):  # floors of two maps are seldom at one height to a cell
         rows = joined.navigable.rows(cells + (0, 0, up))

@@ -6,6 +6,7 @@ the other map, moved so that walls meet, and ranked by walls that agree less wal
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -157,8 +158,14 @@ def rank(poses: PoseArrays, evidence: Array, plans: tuple[RoomPlans, RoomPlans])
     return tuple(ranked)
 
 
-def matches_under(transform: Sim3, plans: tuple[RoomPlans, RoomPlans]) -> tuple[Array, Array]:
-    """(M, 2) rooms whose footprints meet under a transform T_ab and (M,) how well they fit (see `by_overlap`)."""
+def matches_under(
+    transform: Sim3, plans: tuple[RoomPlans, RoomPlans], lay: Callable[[Array], Array] | None = None
+) -> tuple[Array, Array]:
+    """(M, 2) rooms whose footprints meet under a transform T_ab and (M,) how well they fit (see `by_overlap`).
+
+    Args:
+        lay: where the points (n, 3) of b lie in a, if not exactly where the transform puts them.
+    """
     a, b = plans
     storeys = storey_map(PoseArrays.of([transform]), a.floors, b.floors)[0]
     storey, x, y = np.nonzero(b.footprint >= 0)
@@ -166,7 +173,7 @@ def matches_under(transform: Sim3, plans: tuple[RoomPlans, RoomPlans]) -> tuple[
     storey, x, y = storey[::step], x[::step], y[::step]
     room = b.footprint[storey, x, y]
     places = b.origin + (np.stack([x, y], axis=1) + 0.5) * b.edge
-    at = transform.apply(np.concatenate([places, np.zeros((len(places), 1))], axis=1))[:, :2]
+    at = (lay or transform.apply)(np.column_stack([places, b.floors[storey]]))[:, :2]
     cell = np.floor((at - a.origin) / a.edge).astype(int)
     on = storeys[storey]
     inside = (cell >= 0).all(axis=1) & (cell < a.footprint.shape[1:]).all(axis=1) & (on >= 0)
