@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING
 import topomerge
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, check_outputs, output_folder, say, warn
+from topomerge.cli.merge_points import point_files, points_written
 from topomerge.cli.options import CLOUD_OPTIONS, DESCRIPTOR, given, map_from, output, quiet, share
 from topomerge.errors import InputError
 
@@ -27,14 +30,15 @@ def merge_command(args: argparse.Namespace) -> int:
         raise InputError(f"{args.inputs[0]}: merge takes two maps or more, 1 given; give another one")
     check_inputs(args.inputs)
     with output_folder(args.output) as folder:
-        check_outputs([folder / name for name in MERGE_OUTPUTS], args.inputs)
+        files = point_files(args.inputs, folder) if args.points else {}
+        check_outputs([*(folder / name for name in MERGE_OUTPUTS), *files.values()], args.inputs)
         try:
-            return _merge(args, folder)
+            return _merge(args, folder, files)
         except OSError as error:
             raise InputError(f"{folder}: can't be written ({error.strerror or error}); give another place") from error
 
 
-def _merge(args: argparse.Namespace, folder: Path) -> int:
+def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) -> int:
     maps, read_seconds, extract_seconds = [], 0.0, 0.0
     for path in args.inputs:
         topomap, read, extract = _timed_map(path, args)
@@ -44,9 +48,11 @@ def _merge(args: argparse.Namespace, folder: Path) -> int:
     result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices)
     result = replace(result, seconds={**result.seconds, "read": read_seconds, "extract": extract_seconds})
     warn(result.warnings)
-    result.save(folder)
+    with points_written(result, files, args) if args.points else nullcontext():
+        result.save(folder)
     if not args.quiet:
         joined = f"; {len(result.matches)} matches, {len(result.map.rooms)} rooms in all" if result.map else ""
+        joined = "; no points are written" if args.points and not result.placements else joined
         say(f"{result.reason}{joined} -> {folder}")
     elif not result.merged:
         say(f"topomerge: {result.reason}", sys.stderr)
@@ -85,6 +91,12 @@ MERGE = Command(
             help="rooms: only of matched rooms by their surfaces, as the thesis does; two maps",
         ),
         option("--rigid", action="store_true", help="do not bend the maps where their drift could be the reason of what is left"),
+        option(
+            "--points",
+            action="store_true",
+            default=False,
+            help="also write the points of the inputs, bent and brought into the joined frame: A_merged.las, .laz or .ply",
+        ),
         option("--force", action="store_true", help="write the best merge even if it is not believed (status 2 stays)"),
         option("--threshold", type=share, metavar="P", help="probability from which a merge is believed (default 0.8)"),
         DESCRIPTOR,

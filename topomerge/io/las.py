@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +20,16 @@ SMALLEST_CHUNK = 20  # bytes: a compressed chunk starts with one point as it is
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Blocks of points with their colours."""
+    del options
+    for header, rows, done in records(path):
+        colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
+        yield Piece(coordinates(rows), _colors(rows) if colored else None, done=done)
+
+
+def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
+    """The header, a block of records with all their dimensions, and the share of the file that is read with it."""
     import laspy
 
-    del options
     _check_head(path)
     done = 0
     # The parallel decoder believes the table of chunks and ends the process where a damaged one asks for too much memory.
@@ -31,15 +39,18 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         room = path.stat().st_size - header.offset_to_point_data
         if not header.are_points_compressed and promised * size > room:
             raise cut_short(path, max(room, 0) // size, promised)
-        colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
         for rows in reader.chunk_iterator(BLOCK_POINTS):
             if not len(rows):
                 break
             done += len(rows)
-            xyz = np.stack([np.asarray(rows.x), np.asarray(rows.y), np.asarray(rows.z)], axis=1)
-            yield Piece(xyz, _colors(rows) if colored else None, done=done / promised)
+            yield header, rows, done / promised
     if done < promised:
         raise cut_short(path, done, promised)
+
+
+def coordinates(rows: Any) -> Array:
+    """(n, 3) float64 of records, in the file's frame and unit."""
+    return np.stack([np.asarray(rows.x), np.asarray(rows.y), np.asarray(rows.z)], axis=1)
 
 
 def _colors(rows: object) -> Array | None:

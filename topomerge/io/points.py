@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from topomerge.errors import InputError
 from topomerge.io.gather import Gatherer
@@ -21,6 +21,7 @@ from topomerge.io.piece import Piece, damaged
 from topomerge.types import PointCloud
 
 Progress = Callable[[float, str], None]
+Block = TypeVar("Block")
 MESSAGE_LETTERS = 500  # of a message beside the path, at most: what it quotes of a damaged file may be long
 log = logging.getLogger(__name__)
 
@@ -87,7 +88,7 @@ def read_chunks(
         options: as of `read_points`, whose errors these are, too.
     """
     path = Path(path)
-    file_format = _format_of(path)
+    file_format = format_of(path)
     reading = read_options(path, options)
     if chunk < 1:
         raise InputError(f"{path}: a chunk of {chunk} points can't be read; give 1 or more")
@@ -100,8 +101,12 @@ def read_chunks(
     return _chunks(path, _pieces(path, file_format, reading), gatherer, progress)
 
 
-def _format_of(path: Path) -> Format:
-    """The format of a file that exists and can be opened."""
+def format_of(path: Path) -> Format:
+    """The format of a file that exists and can be opened.
+
+    Raises:
+        InputError: it can't, or its suffix is that of no format.
+    """
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give a file in it")
     for file_format in FORMATS:
@@ -127,10 +132,22 @@ def _format_of(path: Path) -> Format:
 
 
 def _pieces(path: Path, file_format: Format, options: ReadOptions) -> Iterator[Piece]:
-    """What the reader hands over. Whatever a damaged file makes it raise leaves here as an InputError."""
+    return guarded(path, file_format, lambda reader: reader.read(path, options))
+
+
+def guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterator[Block]]) -> Iterator[Block]:
+    """What the reader of a format hands over, a block at a time.
+
+    Args:
+        path: of the file.
+        file_format: its module is the reader.
+        blocks: what to ask of the reader.
+
+    Raises:
+        InputError: whatever a damaged file makes the reader raise.
+    """
     try:
-        reader = importlib.import_module(f"topomerge.io.{file_format.module}")
-        yield from reader.read(path, options)
+        yield from blocks(importlib.import_module(f"topomerge.io.{file_format.module}"))
     except InputError as error:
         text, most = str(error), len(str(path)) + MESSAGE_LETTERS
         raise error if len(text) <= most else InputError(f"{text[:most]} ...") from error.__cause__
