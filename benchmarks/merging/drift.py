@@ -172,7 +172,7 @@ def main(maps: str = "24", target: str = "") -> None:
     out: dict[str, dict[str, float]] = {DRAWING: {"shift": 0.0, "turn": 0.0}}
     for sensor, pairs in measured.items():
         rows = classes(pairs)
-        out[sensor] = stiffness(rows, FITTED_MARKED if sensor == UNKNOWN else FITTED)
+        out[sensor] = {k: round(v, 5) for k, v in stiffness(rows, FITTED_MARKED if sensor == UNKNOWN else FITTED).items()}
         print(f"{sensor}: shift {out[sensor]['shift']:.4f} m/sqrt(m), turn {out[sensor]['turn']:.5f} rad/sqrt(m)")
         for r in rows:
             root = np.sqrt(r["distance"])

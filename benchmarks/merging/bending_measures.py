@@ -1,0 +1,95 @@
+"""What is measured of maps that are bent onto each other: errors of rooms, walls on free floor, how well poses are told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import rankdata
+from topomerge.datasets.pairs.bent_pairs import BentPair
+
+from topomerge.types import Array, Sim3
+
+MATCHED = 0.75  # m between places of both maps that are compared
+LEAST_COMMON = 2.0  # m2 of a room that both maps show
+COLUMN = 0.5  # m, of the places
+USUAL_SHARE, PRIOR_AMOUNT = 0.15, 1.0  # share of walls on free floor, and m2 of walls that weigh as much as that prior
+ROOM_LIMITS = (0.1, 1.0)  # m, degrees
+
+
+class Bending(Protocol):
+    """What moves the points of a map (`fusion.bend.deformation.Deformation`)."""
+
+    def apply(self, points: Array) -> Array: ...
+
+
+def misplaced(bent: BentPair, side: int, pose: Sim3, bending: Bending | None = None) -> tuple[Array, Array]:
+    """Places of a map in the building's frame (n, 3), and by how much (n, 3) m, in the frame of map a, they are laid beside it.
+
+    Args:
+        side: 0: map a, which stays where it is; 1: map b, laid by `pose`.
+    """
+    undrift, frames = bent.undrift[side], bent.frames
+    true = frames[side].inverse().apply(undrift.places + undrift.shifts)
+    laid = undrift.places if bending is None else bending.apply(undrift.places)
+    return true, (laid if side == 0 else pose.apply(laid)) - frames[0].apply(true)
+
+
+def room_errors(bent: BentPair, pose: Sim3, bendings: Sequence[Bending | None] = (None, None)) -> list[dict[str, float]]:
+    """Of each room that both surveyors were in: how far (m, horizontally) and by how many degrees b's lies off a's.
+
+    The mean displacement and the turn that fits best, over the places of b that are near one of a in the same room; rooms of
+    which both show less than `LEAST_COMMON` are left out.
+    """
+    (at_a, off_a), (at_b, off_b) = (misplaced(bent, side, pose, bendings[side]) for side in (0, 1))
+    out = []
+    for room in bent.shared.tolist():
+        rows_a, rows_b = (np.flatnonzero(u.rooms == room) for u in bent.undrift)
+        if not len(rows_a) or not len(rows_b):
+            continue
+        far, nearest = cKDTree(at_a[rows_a]).query(at_b[rows_b])
+        rows_b, rows_a = rows_b[far <= MATCHED], rows_a[nearest[far <= MATCHED]]
+        area = len(np.unique(np.floor(at_b[rows_b, :2] / COLUMN), axis=0)) * COLUMN**2
+        if area >= LEAST_COMMON:
+            shift, turn = shift_and_turn(bent.frames[0].apply(at_b[rows_b])[:, :2], (off_b[rows_b] - off_a[rows_a])[:, :2])
+            out.append({"room": room, "area": area, "shift": shift, "turn": turn})
+    return out
+
+
+def shift_and_turn(points: Array, off: Array) -> tuple[float, float]:
+    """Length of the mean (m), and turn (degrees) of the rigid move that explains displacements (n, 2) of points (n, 2) best."""
+    mean = off.mean(axis=0)
+    rel = (points - points.mean(axis=0)) @ (1, 1j)
+    turned = rel + (off - mean) @ (1, 1j)
+    return float(np.hypot(*mean)), float(np.degrees(abs(np.angle((np.conj(rel) * turned).sum()))))
+
+
+def within(rooms: Sequence[dict[str, float]], limits: tuple[float, float] = ROOM_LIMITS) -> bool:
+    """Is every room within m and degrees?"""
+    return all(r["shift"] <= limits[0] and r["turn"] <= limits[1] for r in rooms)
+
+
+def conflict(features: dict[str, float]) -> float:
+    """Share of the walls that stand on free floor of the other map, drawn towards what is usual where there are few."""
+    amount = features["walls"] + features["conflict"]
+    return (features["conflict_share"] * amount + USUAL_SHARE * PRIOR_AMOUNT) / (amount + PRIOR_AMOUNT)
+
+
+def area_under_curve(right: Sequence[float] | Array, wrong: Sequence[float] | Array) -> float:
+    """Share of the pairs of a right and a wrong pose in which the right one scores higher; equal ones count half."""
+    both = rankdata(np.concatenate([right, wrong]))
+    return float((both[: len(right)].sum() - len(right) * (len(right) + 1) / 2) / (len(right) * len(wrong)))
+
+
+def recall_at(right: Sequence[float] | Array, wrong: Sequence[float] | Array, false_rate: float) -> float:
+    """Share of the right poses that score higher than all but `false_rate` of the wrong ones."""
+    ordered = np.sort(np.asarray(wrong, float))[::-1]
+    threshold = ordered[min(int(false_rate * len(ordered)), len(ordered) - 1)]
+    return float((np.asarray(right) > threshold).mean())
+
+
+def medians(rows: Sequence[dict[str, Any]], key: str) -> float:
+    """Median of a value of rows."""
+    return float(np.median([r[key] for r in rows]))
