@@ -12,6 +12,7 @@ from topomerge.extraction.components import connected_components
 from topomerge.extraction.convolution import sphere
 from topomerge.extraction.floor import Floor
 from topomerge.extraction.storeys import lowest_of_column
+from topomerge.kernels.grow import steps_from
 from topomerge.types import EDGE_DTYPE, Array, VoxelGrid
 
 PASSAGE_LEAST_WIDTH = 0.4  # m: narrower gaps in which no body fits are holes in a wall
@@ -24,7 +25,7 @@ DOOR_SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
 HALF_NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
 
 
-def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceiling: Array) -> Array:
+def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceiling: Array, within: Array | None = None) -> Array:
     """Edges between rooms that have adjacent navigable cells (seeds 2.7), one for each place where they meet.
 
     Args:
@@ -32,6 +33,7 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
         room: (m,) room (or area) of each of its cells, -1 none.
         storey_of_room: (R,) storey of each room.
         floor_to_ceiling: (m,) m of empty space above each cell, 0 where nothing was seen.
+        within: (R,) what each room is part of: only edges between parts of one are asked for; None: all.
 
     Returns:
         (E,) EDGE_DTYPE, sorted by rooms and place.
@@ -44,6 +46,8 @@ def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceilin
         row = np.flatnonzero((other >= 0) & (room >= 0))
         neighbour = other[row]
         meet = (room[neighbour] >= 0) & (room[neighbour] != room[row])
+        if within is not None:
+            meet &= within[room[neighbour]] == within[room[row]]
         first.append(row[meet])
         second.append(neighbour[meet])
     a, b = np.concatenate(first), np.concatenate(second)
@@ -187,20 +191,34 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
         sides.append(np.argmax(np.where(away_enough, clearance, -1.0)))
     if clearance.flat[sides[0]] <= 1 or clearance.flat[sides[1]] <= 1:
         return None
-    apart: Array | None = None
-    for level in np.unique(clearance[clearance > 0])[::-1]:
-        parts, _ = ndimage.label(clearance >= level, np.ones((3, 3)))
-        a, b = parts.flat[sides[0]], parts.flat[sides[1]]
-        if a and b and a == b:
-            break
-        if a and b:
-            apart = np.where(parts == a, 1, np.where(parts == b, 2, 0))
-    else:
+    pass_parts = _at_the_pass(clearance, sides[0], sides[1])
+    if pass_parts is None:
         return None
-    if apart is None:
-        return None
-    saddle = _between(apart, parts == a)
+    saddle = _between(*pass_parts)
     return None if saddle is None else _across(owner >= 0, clearance, saddle, low)
+
+
+def _at_the_pass(clearance: Array, first: int, second: int) -> tuple[Array, Array, Array] | None:
+    """The parts of the first and of the second of two columns where the widest body passes that does not get from the one to the
+    other, and the part of both where the next smaller one does; None where none or all do."""
+    levels = np.unique(clearance[clearance > 0])[::-1]
+
+    def parts_at(k: int) -> tuple[Array, int, int]:
+        parts, _ = ndimage.label(clearance >= levels[k], np.ones((3, 3)))
+        return parts, int(parts.flat[first]), int(parts.flat[second])
+
+    low, high = 0, len(levels)  # the first level at which they are joined is one of low..high
+    while low < high:
+        middle = (low + high) // 2
+        _, a, b = parts_at(middle)
+        low, high = (low, middle) if a and a == b else (middle + 1, high)
+    if low in (0, len(levels)):
+        return None
+    parts, a, b = parts_at(low - 1)
+    if not a or not b:
+        return None
+    joined, both, _ = parts_at(low)
+    return parts == a, parts == b, joined == both
 
 
 def _owners(navigable: VoxelGrid, room: Array, low: Array, size: Array, contact: Array) -> Array:
@@ -215,17 +233,9 @@ def _owners(navigable: VoxelGrid, room: Array, low: Array, size: Array, contact:
     return label.reshape(len(levels), *size).max(axis=0)
 
 
-def _between(apart: Array, way: Array) -> Array | None:
-    """The cell of `way` halfway between parts 1 and 2 on the shortest connection."""
-    steps = [np.where(apart == part, 0, -1) for part in (1, 2)]
-    for distance in steps:
-        reached = distance >= 0
-        for n in range(1, way.size):
-            grown = ndimage.binary_dilation(reached, np.ones((3, 3)), mask=way) & ~reached
-            if not grown.any():
-                break
-            distance[grown] = n
-            reached |= grown
+def _between(first: Array, second: Array, way: Array) -> Array | None:
+    """The cell of `way` halfway between two parts on the shortest connection."""
+    steps = [steps_from(part, way) for part in (first, second)]
     total = np.where((steps[0] > 0) & (steps[1] > 0), steps[0] + steps[1], np.iinfo(np.int64).max)
     if not (total < np.iinfo(np.int64).max).any():
         return None

@@ -37,8 +37,7 @@ def topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> Topomet
         edge["confidence"] = floor.door_probability.get((min(a, b), max(a, b)), 1.0)
     area = np.where(number[floor.room_of_area][floor.area] >= 0, floor.area, -1) if len(floor.room_of_area) else floor.area
     areas, area = _areas(floor, label, area)
-    narrows = find_edges(floor, area, rooms["storey"][areas["room"]], above)
-    narrows = narrows[areas["room"][narrows["rooms"][:, 0]] == areas["room"][narrows["rooms"][:, 1]]]
+    narrows = find_edges(floor, area, rooms["storey"][areas["room"]], above, areas["room"])
     return TopometricMap(grid, room, floor.cells, label, rooms, edges, floor.storeys, areas, area, narrows)
 
 

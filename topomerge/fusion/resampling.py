@@ -6,17 +6,18 @@ map lies in it. So no cell is lost, and a turned or bent floor or wall gets no h
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
 from topomerge.fusion.bend.deformation import BETWEEN_STOREYS, Deformation
 from topomerge.kernels import morton
+from topomerge.kernels.resample import filled
 from topomerge.types import Array, Sim3, VoxelGrid
 
 RESAMPLED_AT_ONCE = 200_000  # cells
+SLACK = 0.02  # of a bent cell, by which neighbours overlap: each is taken as linear by itself
+JACOBIAN_STEP = 0.02  # m
 CODE_OFFSET = 1 << 20  # cells are counted from there, as Morton codes hold no negative ones
 
 
@@ -46,18 +47,18 @@ class Laying:
         back = self.pose.inverse().apply(points)
         return back if self.bend is None else self.bend.undo(back)
 
-    def undo_near(self, points: Array, places: Array, laid: Array) -> Array:
-        """`undo` of points within a cell of places whose images `laid` are at hand: one step of the fixed point from there, and
-        one more, leave less than a hundredth of a cell."""
-        back = self.pose.inverse()
-        at = back.apply(points)
+    def linear(self, places: Array, grid: VoxelGrid) -> tuple[Array, Array]:
+        """Where bending moves the middles (n, 3) of cells of a grid, and the bending about them as `kernels.resample` wants it:
+        (n, 8), or (0, 8) where nothing is bent."""
         if self.bend is None:
-            return at
-        shift = back.apply(laid)[:, :2] - places[:, :2]
-        guess = at.copy()
-        guess[:, :2] -= shift
-        out: Array = guess + at - self.bend.apply(guess)
-        return out
+            return places, np.zeros((0, 8))
+        bent = self.bend.apply(places)
+        steps = np.eye(3) * JACOBIAN_STEP
+        x, y, z = ((self.bend.apply(places + step) - bent)[:, :2] / JACOBIAN_STEP for step in steps)
+        area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
+        back = np.column_stack([y[:, 1], -y[:, 0], -x[:, 1], x[:, 0]]) / area[:, None]
+        lean = np.column_stack([(back[:, 2 * k : 2 * k + 2] * z).sum(axis=1) for k in (0, 1)])
+        return bent, np.column_stack([(bent - grid.origin)[:, :2] / grid.edge, back, lean])
 
     @property
     def stretch(self) -> float:
@@ -89,33 +90,26 @@ def resampled(grid: VoxelGrid, laying: Laying | Sim3, origin: Array, edge: float
     aligned = abs(grid.edge - edge) < 1e-9 and np.allclose(offset, np.round(offset), atol=1e-6)
     if aligned and laying.bend is None and laying.pose == Sim3():
         return grid.cells + np.round(offset).astype(np.int64), np.arange(len(grid))
-    blocks = list(_resampled_blocks(grid, laying, origin, edge))
-    if not blocks:
+    if not len(grid):
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
-    cells = np.concatenate([c for c, _ in blocks])
-    rows = np.concatenate([r for _, r in blocks])
+    parts = [_filled(grid, slice(n, n + RESAMPLED_AT_ONCE), laying, origin, edge) for n in range(0, len(grid), RESAMPLED_AT_ONCE)]
+    cells, rows = (np.concatenate(p) for p in zip(*parts, strict=True))
     _, first = np.unique(encoded(cells), return_index=True)
     return cells[first], rows[first]
 
 
-def _resampled_blocks(grid: VoxelGrid, laying: Laying, origin: Array, edge: float) -> Iterator[tuple[Array, Array]]:
-    """`resampled` of some cells at a time; cells may come twice."""
-    ratio = laying.pose.scale * grid.edge / edge
-    wide = ratio * laying.stretch * np.sqrt(0.5) + laying.pose.scale * laying.slant(grid.edge) / edge
-    wide, tall = int(wide + 0.5), int(ratio / 2 + 0.5)  # how far a cell reaches from the one its middle is in
-    flat = range(-wide, wide + 1)
-    around = np.array(list(product(flat, flat, range(-tall, tall + 1))))
-    for start in range(0, len(grid), RESAMPLED_AT_ONCE):
-        places = grid.centroids(grid.cells[start : start + RESAMPLED_AT_ONCE])
-        middles = laying.apply(places)
-        holding = np.floor((middles - origin) / edge).astype(np.int64)  # the cells that the middles lie in
-        cells = (holding[:, None] + around).reshape(-1, 3)
-        first = np.unique(encoded(cells), return_index=True)[1]
-        cells, near = cells[first], first // len(around)
-        at = laying.undo_near(origin + (cells + 0.5) * edge, places[near], middles[near])
-        rows = grid.rows(grid.locate(at))
-        yield cells[rows >= 0], rows[rows >= 0]
-        yield holding, np.arange(start, start + len(holding))
+def _filled(grid: VoxelGrid, chosen: slice, laying: Laying, origin: Array, edge: float) -> tuple[Array, Array]:
+    """`resampled` of some cells; cells may come twice."""
+    pose, ratio = laying.pose, laying.pose.scale * grid.edge / edge
+    wide = ratio * laying.stretch * np.sqrt(0.5) + pose.scale * laying.slant(grid.edge) / edge
+    places = grid.centroids(grid.cells[chosen])
+    bent, local = laying.linear(places, grid)
+    holding = np.floor((pose.apply(bent) - origin) / edge).astype(np.int64)  # the cells that the middles lie in
+    back = pose.inverse().matrix
+    matrix = np.column_stack([back[:3, :3] * edge, back[:3, :3] @ origin + back[:3, 3] - grid.origin]) / grid.edge
+    slack = SLACK if len(local) else 0.0
+    cells, rows = filled(grid.cells[chosen], holding, matrix, local, slack, int(wide + 0.5), int(ratio / 2 + 0.5))
+    return np.concatenate([cells, holding]), np.concatenate([rows, np.arange(len(holding))]) + chosen.start
 
 
 def encoded(cells: Array) -> Array:
