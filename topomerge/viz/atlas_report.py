@@ -21,13 +21,16 @@ SEEN_BY_COLOURS = ("#9a9a9a", "#4a90d9", "#4fae74", "#d9a441")  # cells that wer
 SEEN_BY_NAMES = ("assumed", "seen by one map", "seen by two maps", "seen by three or more")
 
 
-def atlas_html(result: AtlasResult, joined: Mapping[int, TopometricMap], title: str = "Atlas") -> str:
+def atlas_html(
+    result: AtlasResult, joined: Mapping[int, TopometricMap], title: str = "Atlas", more: Sequence[Markup] = ()
+) -> str:
     """The report as HTML.
 
     Args:
         result: where the maps lie, and what contradicts.
         joined: component -> its joined map; of those that are left out there is no plan.
         title: what it is called.
+        more: sections that stand behind the list of the maps.
     """
     sections = [_verdict(result), warnings(result.warnings)]
     data: dict[str, Any] = {}
@@ -40,7 +43,7 @@ def atlas_html(result: AtlasResult, joined: Mapping[int, TopometricMap], title: 
             if not data:
                 data["scene-data"] = _scene(joined[n], sheet.turn)
                 sections.append(_space(joined[n]))
-    sections += [_maps(result), _links(result)]
+    sections += [_maps(result), *more, _links(result)]
     return page(title, f"Atlas of {len(result.names)} maps", sections, data)
 
 

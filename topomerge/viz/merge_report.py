@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.fusion.bend.placement import placements
 from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row
 from topomerge.fusion.fuse import room_of_rooms
 from topomerge.fusion.registration import Registration
@@ -22,6 +23,7 @@ from topomerge.io.palette import room_colours
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.types import Array, Sim3
 from topomerge.viz.atlas_report import atlas_html
+from topomerge.viz.bend_plan import bend_table
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.merge_lines import lines_view
 from topomerge.viz.merge_plan import Drawn, blend_view, laid_alike
@@ -75,7 +77,8 @@ def merge_html(result: MergeResult) -> str:
     """The report as HTML. A result that is not believed shows its best hypothesis, said to be none."""
     if result.atlas is not None:
         names = " + ".join(Path(m.source).name or "map" for m in result.maps)
-        return atlas_html(result.atlas, {} if result.map is None else {result.atlas.component_of(0): result.map}, names)
+        joined = {} if result.map is None else {result.atlas.component_of(0): result.map}
+        return atlas_html(result.atlas, joined, names, _bends(result))
     a, b = result.maps
     registration = result.registration
     pose = registration.transform if registration else None
@@ -95,6 +98,13 @@ def merge_html(result: MergeResult) -> str:
     sections.append(_made(result))
     names = " + ".join(Path(m.source).name or "map" for m in result.maps)
     return page(names, "Merge of two maps", sections, data)
+
+
+def _bends(result: MergeResult) -> list[Markup]:
+    """Of many maps: a table of how each was bent."""
+    where = list(result.placements.values()) if result.bends else []
+    names = [f"{p.map}: {Path(p.source).name or 'map'}" for p in where]
+    return [section("How the maps were bent", bend_table(where, names, [None] * len(where)), "bent")] if where else []
 
 
 def _verdict(result: MergeResult) -> Markup:
@@ -161,7 +171,8 @@ def _within(result: MergeResult) -> tuple[Array, Array]:
     """For each room of both maps the room of the joined map in which it lies, -1 none."""
     assert result.map is not None
     a, b = result.maps
-    return room_of_rooms(a, result.map, Sim3()), room_of_rooms(b, result.map, result.transforms[1])
+    bends = result.bends
+    return room_of_rooms(a, result.map, Sim3(), bends.get(0)), room_of_rooms(b, result.map, result.transforms[1], bends.get(1))
 
 
 def _mates(result: MergeResult) -> dict[str, list[str]]:
@@ -207,7 +218,10 @@ def _over(result: MergeResult, drawn: tuple[Drawn, Drawn], pose: Sim3) -> Markup
     words = "Map b laid over map a. Move the slider to see the one, both, or the other."
     if not result.merged:
         words = "The best place that was found for map b, which is not believed. " + words
-    parts = [element("p", words, class_="note"), blend_view(a, b, drawn, pose)]
+    parts = [element("p", words, class_="note"), blend_view(a, b, drawn, pose, result.bends)]
+    if result.bends:
+        where = placements(result.maps, {1: pose}, result.bends)
+        parts.append(element("div", element("h3", "How the maps were bent"), bend_table(where, "ab", "ab"), class_="more"))
     return section("One over the other", join(parts), "over")
 
 

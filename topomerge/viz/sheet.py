@@ -37,6 +37,12 @@ class Sheet:
         turned = np.asarray(points, np.float64).reshape(-1, np.shape(points)[-1])[:, :2] @ rotation(self.turn).T
         return np.round(100 * (turned - self.corner) * (1, -1)).astype(np.int64)
 
+    def metres(self, places: Array) -> Array:
+        """(n, 2) m in the input's frame, of places (n, 2) on the paper, cm."""
+        back = np.array(self.back).reshape(2, 3)
+        out: Array = places @ back[:, :2].T + back[:, 2]
+        return out
+
     def at(self, point: Any) -> tuple[int, int]:
         """The place on the paper of one point."""
         x, y = self.cm(np.asarray([point]))[0].tolist()

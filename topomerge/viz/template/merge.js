@@ -10,6 +10,22 @@ function startBlend(slider) {
   set();
 }
 
+function startBend(slider) { // an outline has as many numbers rigid as bent, and each goes from the one to the other
+  const view = slider.closest(".plan-view"), number = /-?\d+/g;
+  let parts = null;
+  const read = (path) => {
+    const bent = path.getAttribute("d"), rigid = path.dataset.rigid;
+    return { path, words: bent.split(number), from: (rigid.match(number) || []).map(Number), to: (bent.match(number) || []).map(Number) };
+  };
+  slider.addEventListener("input", () => {
+    parts = parts || [...view.querySelectorAll("[data-rigid]")].map(read);
+    const share = Number(slider.value);
+    for (const { path, words, from, to } of parts) {
+      path.setAttribute("d", words.map((word, i) => (i < to.length ? word + Math.round(10 * (from[i] + share * (to[i] - from[i]))) / 10 : word)).join(""));
+    }
+  });
+}
+
 function startMates(data) {
   if (!data) return;
   const mates = JSON.parse(data.textContent);

@@ -20,6 +20,7 @@ startHighlights();
 document.querySelectorAll("table.sortable").forEach(startTable);
 document.querySelectorAll(".plan-view").forEach(startPlan);
 document.querySelectorAll("input[data-blend]").forEach(startBlend);
+document.querySelectorAll("input[data-bend]").forEach(startBend);
 startMates(document.getElementById("mates"));
 // The page is shown before the cells are read; that there is no 3D is said only once it is known.
 document.querySelectorAll("[data-scene]").forEach((place) => place.classList.add("waiting"));
