@@ -18,12 +18,13 @@ import os
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topomerge.datasets.pairs.bent_pairs import BentPair, bent_pairs
+from topomerge.datasets.pairs.bent_pairs import DRIFT_FACTORS, BentPair, bent_pairs, drifts
 from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
 
 from benchmarks.merging.bending_growth import timed
@@ -41,7 +42,7 @@ from topomerge.types import VoxelGrid
 
 Row = dict[str, Any]
 GROWTH_ROOMS = (10, 30, 100, 300, 1000)
-SIMULATED_PAIRS = 120
+SIMULATED_PAIRS = 40
 OFFICE = "halmstad_office_f5"
 
 
@@ -84,9 +85,17 @@ def simulated_row(bent: BentPair, split: str) -> Row:
 def simulated(split: str, pairs: str, done: set[str]) -> Iterator[Row]:
     """Rows of the pairs with drift."""
     folder = os.environ.get("TOPOMERGE_DATA", "")
-    for bent in bent_pairs(split, folder, int(pairs), PAIRS_CACHE / "bent"):
+    for bent in bent_pairs(split, folder, int(pairs), PAIRS_CACHE / "bent", partial(print, flush=True)):
         if bent.pair.name not in done:
-            yield simulated_row(bent, split)
+            row = simulated_row(bent, split)
+            yield from copies(row)  # with any factor the same pair
+            yield row
+
+
+def copies(row: Row) -> Iterator[Row]:
+    """The row of a pair without drift of which no sensor drifts, under the other factors."""
+    if not drifts(row["sensors"]):
+        yield from ({**row, "name": f"{row['name']} drift {factor:g}", "factor": factor} for factor in DRIFT_FACTORS[1:])
 
 
 def floor(done: set[str]) -> Iterator[Row]:
@@ -105,13 +114,13 @@ def floor(done: set[str]) -> Iterator[Row]:
         row: Row = {"name": pair.name, "sensors": pair.about["sensors"], "common": pair.common, "err": off, "building": "F5"}
         row |= {"probability": best.probability, "source": "halmstad", "right": right(off, ("drawing",))}
         if pose is not None:
-            row |= judged(a, b, pose, drift_of(pair), True)
-            clock.append(time.process_time())
             bent = bend(a, b, pose, drift=drift_of(pair), scaled=True)
+            clock.append(time.process_time())
+            row |= judged(a, b, pose, bent)
             here, there = points(pair.name)
             before, after = pose.apply(there), bent.transform.apply(bent.deformations[1].apply(there))
             row["key_points"] = [apart(here, before), apart(bent.deformations[0].apply(here), after)]
-            row["seconds"] = {"register": clock[1] - clock[0], "bend": time.process_time() - clock[2]}
+            row["seconds"] = {"register": clock[1] - clock[0], "bend": clock[2] - clock[1]}
         yield row
 
 
@@ -135,7 +144,8 @@ def wrong(split: str, done: set[str]) -> Iterator[Row]:
         places = places_of(names, ("halmstad", "halmstad")) if real else places_of(names)
         row: Row = {"name": pair.name, "sensors": pair.about["sensors"], "kind": pair.about["kind"], **places, "poses": []}
         for label, pose in wrong_poses(best, pair):
-            row["poses"].append({"label": label, **judged(a, b, pose, drift_of(pair), scaled)})
+            bent = bend(a, b, pose, drift=drift_of(pair), scaled=scaled)
+            row["poses"].append({"label": label, **judged(a, b, pose, bent)})
         yield row
 
 

@@ -14,8 +14,7 @@ from topomerge.datasets.real.office_floor import OFFICE_PIXEL
 from benchmarks.merging.bending_measures import conflict
 from benchmarks.merging.cached_pairs import buildings_of
 from benchmarks.merging.strangers import strangers
-from topomerge.fusion.bend.bend import bend
-from topomerge.fusion.bend.drift import Drift
+from topomerge.fusion.bend.bend import Bend
 from topomerge.fusion.judge import Judge
 from topomerge.fusion.prepared import Prepared
 from topomerge.fusion.registration import Registration
@@ -27,9 +26,8 @@ MOST_WRONG = 3  # wrong poses of a pair
 RIVAL_POSE = (1.5, 10.0)  # m, degrees off at least: between that and right a pose is neither
 
 
-def judged(a: Prepared, b: Prepared, pose: Sim3, drift: tuple[Drift, Drift], scaled: bool) -> dict[str, Any]:
+def judged(a: Prepared, b: Prepared, pose: Sim3, bent: Bend) -> dict[str, Any]:
     """What is counted under a pose, ``rigid`` and ``bent``, and what the bending itself tells (``bending``)."""
-    bent = bend(a, b, pose, drift=drift, scaled=scaled)
     features = Judge(a.storeys, b.storeys)(pose)
     after = Judge(a.storeys, bent.storeys(b.storeys))(bent.transform) if not bent.reason else features
     return {"rigid": counted(features), "bent": counted(after), "bending": {**bent.features, "reason": bent.reason}}

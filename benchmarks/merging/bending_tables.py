@@ -132,13 +132,19 @@ def growth(rows: Sequence[Row]) -> str:
     return "\n\n".join([text.GROWTH, table(text.GROWTH_HEADS, lines)])
 
 
+def measured(name: str) -> list[Row]:
+    """The rows of a file, each once: a run that was stopped may have written one twice."""
+    return list({r["name"]: r for r in rows_of(name)}.values())
+
+
 def write(target: str, split: str = "test") -> None:
     """Write the section between its marks."""
     parts = [
-        text.COMMANDS.format(split=split), "### Rooms of simulated pairs", simulated(rows_of(f"bending_simulated_{split}.jsonl")),
-        "### The office floor", office(rows_of("bending_floor.jsonl")),
-        "### Right and wrong poses", told_apart(rows_of(f"bending_wrong_{split}.jsonl")),
-        "### Time", growth(rows_of("bending_growth.jsonl")),
+        text.COMMANDS.format(split=split),
+        "### Rooms of simulated pairs", simulated(measured(f"bending_simulated_{split}.jsonl")),
+        "### The office floor", office(measured("bending_floor.jsonl")),
+        "### Right and wrong poses", told_apart(measured(f"bending_wrong_{split}.jsonl")),
+        "### Time", growth(measured("bending_growth.jsonl")),
     ]  # fmt: skip
     put(Path(target), table(text.DRIFT_HEADS, text.drift_table()), "drift")
     put(Path(target), "\n\n".join(parts), "bending")

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
-from topomerge.datasets.core.builder import make_item, refusal
+from topomerge.datasets.core.builder import Say, make_item, refusal
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.pairs.drawing import draw
@@ -27,7 +27,6 @@ from topomerge.datasets.pairs.example import candidate
 from topomerge.datasets.pairs.flat import keys, raise_flat, rooms_at, squares
 from topomerge.datasets.pairs.grid_pairs import (
     COLUMN_EDGE,
-    LONGEST_GRID_PAIR,
     WEIGHTS,
     GridPair,
     columns_seen,
@@ -48,6 +47,8 @@ from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array, PointCloud, Sim3
 
+LONGEST_BENT_PAIR = 900.0  # s
+LEAST_SPACING = 0.06  # m between points: cells are of 0.1 m
 BENT_FORMAT = 1  # raise it when the same item gives other bytes
 DRIFT_FACTORS = (0.0, 1.0, 2.0, 4.0)
 DRAWING = "drawing"
@@ -112,7 +113,8 @@ def drifted_scan(
         budget: number of rays, as of `scan`.
     """
     kind = drifting(sensor, factor)
-    cloud = scan(building, kind, rooms, np.random.default_rng(seed), budget=budget)
+    spacing = max(kind.spacing, LEAST_SPACING)
+    cloud = scan(building, kind, rooms, np.random.default_rng(seed), spacing, budget)
     straight = scan(building, exact_sensor(kind), rooms, np.random.default_rng(seed), budget=8)  # poses come before rays
     places, shifts = drift_between(cloud, straight)
     turn = Sim3(frame.yaw).matrix[:3, :3]
@@ -156,7 +158,7 @@ def bent_recipe(split: str, folder: str, pairs: int) -> Recipe:
     return Recipe(
         name="bent", split=split, pairs=pairs, seed=16, folder=folder,
         sources={"procedural": 0.7, "campus": 0.3} if folder else {"procedural": 1.0}, kinds=dict(WEIGHTS["kinds"]),
-        sensors=dict(WEIGHTS["sensors"]), overlaps=[0.4, 0.6, 0.8], rooms=[8, 20], two_storeys=0.1,
+        sensors=dict(WEIGHTS["sensors"]), overlaps=[0.4, 0.6, 0.8], rooms=[6, 14], two_storeys=0.1,
     )  # fmt: skip
 
 
@@ -171,23 +173,31 @@ def bent_items(split: str, folder: str, pairs: int) -> tuple[list[Item], Library
     return items, plans
 
 
-def bent_pairs(split: str, folder: str, pairs: int, cache: Path) -> Iterator[BentPair]:
+def bent_pairs(split: str, folder: str, pairs: int, cache: Path, say: Say = lambda text: None) -> Iterator[BentPair]:
     """The pairs of a split, each with every factor of drift, made where they are not in the cache.
 
     Args:
-        pairs: number of items drawn, of which each is made with all `DRIFT_FACTORS`; some buildings have no such pair.
+        pairs: number of items drawn, of which each is made with all `DRIFT_FACTORS`, or without drift only
+            where no sensor drifts; some buildings have no such pair.
+        say: is told what is made, and what went wrong.
     """
     items, plans = bent_items(split, folder, pairs)
     cache.mkdir(parents=True, exist_ok=True)
     for item in items:
         made = BentMaker(item, list(plans_of(item, plans)))
-        for factor in DRIFT_FACTORS:
+        for factor in DRIFT_FACTORS if drifts(item.sensors) else (0.0,):
             name = BentItem(item, factor).name
             path = cache / f"{name}.npz"
             if not path.exists() and not refusal(cache, name):
-                make_item(name, str(cache), partial(made.arrays, factor), LONGEST_GRID_PAIR)
+                row = make_item(name, str(cache), partial(made.arrays, factor), LONGEST_BENT_PAIR)
+                say(f"{'-'.join(item.sensors)} drift {factor:g}: {row.reason or 'made'} in {row.seconds:.0f} s")
             if path.exists():
                 yield load_bent(path)
+
+
+def drifts(sensors: Sequence[str]) -> bool:
+    """Does any of the sensors drift? If not, all factors give the same pair."""
+    return any(s != DRAWING and get_sensor(s).drift > 0 for s in sensors)
 
 
 @dataclass(frozen=True, eq=False)
