@@ -7,6 +7,7 @@ import io
 import json
 import shutil
 import tarfile
+import tempfile
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -36,14 +37,26 @@ def read_cloud(path: Path) -> int:
     return found
 
 
+def read_las(path: Path) -> int:
+    """Read points, and write them elsewhere with all else that the file says of them."""
+    from topomerge.io.moved_points import save_moved
+
+    found = read_cloud(path)
+    with tempfile.TemporaryDirectory() as folder:
+        save_moved(path, Path(folder) / f"moved{path.suffix}", lambda points: points, np.zeros(3))
+    return found
+
+
 def read_map(path: Path) -> int:
-    """Read a map and what `topomerge info` prints of it."""
+    """Read a map, what `topomerge info` prints of it, and how the maps that it was joined of were bent."""
+    from topomerge.fusion.bend.placement import bends_of
     from topomerge.io.listing import json_text, map_to_json, map_to_text
     from topomerge.io.maps import load_map
 
     found = load_map(path)
     map_to_text(found)
     json_text(map_to_json(found))
+    bends_of(found)
     return len(found.rooms)
 
 
@@ -84,6 +97,8 @@ READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others a
     "atlas.json": read_atlas,
     "embedder.json": read_embedder,
     "embedder.safetensors": read_embedder,
+    ".las": read_las,
+    ".laz": read_las,
     ".tmap": read_map,
 }
 
@@ -97,7 +112,10 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     """Name -> file, in a folder: those of `samples`, and pictures, a map and a folded scene."""
     from PIL import Image
 
+    from tests.fusion.bend.test_deformation import deformation
+    from topomerge.fusion.bend.placement import Placement, with_bends
     from topomerge.io.maps import save_map
+    from topomerge.types import Sim3
 
     found = samples.write_all(folder)
     pgm = found["plan.yaml"].with_suffix(".pgm")
@@ -109,7 +127,8 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     found["text.pgm"] = folder / "text.pgm"
     found["text.pgm"].write_text("P2\n8 6\n255\n" + " ".join(str(v) for v in np.tile([0, 205, 254], 16)) + "\n")
     found["map.tmap"] = folder / "map.tmap"
-    save_map(building(2, 2), found["map.tmap"])
+    turn = deformation(np.tile([0.1, 0.0, 0.01, 0.0], (4, 1)))
+    save_map(with_bends(building(2, 2), [Placement(1, "b.ply", Sim3(0.3), turn)]), found["map.tmap"])
     found["plain.npz"] = folder / "plain.npz"
     np.savez(found["plain.npz"], points=samples.box_points(50), poses=np.eye(4)[None], pose_of=np.zeros(50, np.int32))
     return found | write_plans(folder) | write_embedder(folder) | write_atlas(folder)

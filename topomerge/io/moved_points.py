@@ -13,7 +13,7 @@ import numpy as np
 from topomerge.io import frame
 from topomerge.io.atomic import replacing
 from topomerge.io.options import read_options
-from topomerge.io.piece import BLOCK_POINTS
+from topomerge.io.piece import BLOCK_POINTS, damaged
 from topomerge.io.points import Progress, format_of, guarded, read_chunks
 from topomerge.types import Array, PointCloud
 
@@ -155,6 +155,8 @@ def _save_las(
             written, beyond = written + int(near.sum()), beyond + int((~near).sum())
             if progress is not None:
                 progress(min(done, 1.0), f"writing {target.name}")
+    except laspy.errors.LaspyException as error:  # it reads what it can't write
+        raise damaged(source, "a LAS file", error) from error
     finally:
         if writer is not None:
             writer.close()
