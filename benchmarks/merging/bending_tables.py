@@ -140,7 +140,7 @@ def measured(name: str) -> list[Row]:
 def write(target: str, split: str = "test") -> None:
     """Write the section between its marks."""
     parts = [
-        text.COMMANDS.format(split=split),
+        text.BENDING_COMMANDS.format(split=split),
         "### Rooms of simulated pairs", simulated(measured(f"bending_simulated_{split}.jsonl")),
         "### The office floor", office(measured("bending_floor.jsonl")),
         "### Right and wrong poses", told_apart(measured(f"bending_wrong_{split}.jsonl")),

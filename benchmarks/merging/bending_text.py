@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from topomerge.fusion.bend.drift import sensor_drift
 
-COMMANDS = (
+BENDING_COMMANDS = (
     "`python -m benchmarks.merging.bending simulated 36000 {split}; python -m benchmarks.merging.bending floor 3600; python -m "
     "benchmarks.merging.bending wrong 3600 {split}; python -m benchmarks.merging.bending growth 3600; python -m "
     "benchmarks.merging.bending tables docs/results/bending.md {split}`. Intervals are over physical buildings: in brackets 95 % "

@@ -251,20 +251,17 @@ class BentMaker:
             out |= grid_arrays(side, grids[-1], free[-1])
             out |= {f"{side}.places": undrift.places.astype(np.float32), f"{side}.rooms": undrift.rooms}
             out |= {f"{side}.shifts": undrift.shifts.astype(np.float32)}
-        out["shared"] = np.intersect1d(
-            *(range(len(building.rooms)) if s == DRAWING else v for s, v in zip(self.item.sensors, visited, strict=True))
-        )
-        seen = [
-            columns_seen(g, f, into, building.storeys["floor"] + frames[0].translation[2])
-            for g, f, into in zip(grids, free, (Sim3(), truth), strict=True)
-        ]
+        rooms = [np.arange(len(building.rooms)) if s == DRAWING else v for s, v in zip(self.item.sensors, visited, strict=True)]
+        out["shared"] = np.intersect1d(rooms[0], rooms[1])
+        floors = building.storeys["floor"] + frames[0].translation[2]
+        seen = [columns_seen(g, f, into, floors) for g, f, into in zip(grids, free, (Sim3(), truth), strict=True)]
         about = {
             "sensors": self.item.sensors,
             "kind": "overlap",
             "building": building.name,
             "source": self.item.source,
             "overlap": self.item.overlap,
-            "common": len(np.intersect1d(*seen)) * COLUMN_EDGE**2,
+            "common": len(np.intersect1d(seen[0], seen[1])) * COLUMN_EDGE**2,
             "factor": factor,
         }
         out["about"] = np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)
