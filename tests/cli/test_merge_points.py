@@ -134,6 +134,23 @@ def test_a_refused_merge_has_no_points(run: Run) -> None:
     assert len(list(Path("m").glob("*_merged.*"))) == 2
 
 
+def test_points_of_an_earlier_merge_do_not_stay(run: Run) -> None:
+    """Nor do files of others go, nor what is an input now."""
+    for k, name in enumerate(("a.npy", "b.npy", "c.npy")):
+        write(name, SCAN + np.float32(k))
+    assert run("a.npy", "b.npy", "-o", "m", "--points", "-q")[0] == 0
+    assert json.loads(Path("m/merge.json").read_text())["points"] == {"0": "a_merged.ply", "1": "b_merged.ply"}
+    Path("m/mine_merged.ply").write_bytes(b"mine")
+    assert run("m/a_merged.ply", "c.npy", "-o", "m", "-q")[0] == 0
+    assert sorted(p.name for p in Path("m").glob("*_merged.*")) == ["a_merged.ply", "mine_merged.ply"]
+    merge = json.loads(Path("m/merge.json").read_text())
+    assert merge["points"] == {}
+    for odd in (5, {"0": 7}, {"0": "../a.npy"}, {"0": "x/../../b_merged.ply"}, {"0": "map.tmap"}):
+        Path("m/merge.json").write_text(json.dumps({"points": odd}))
+        assert run("a.npy", "c.npy", "-o", "m", "-q")[0] == 0
+        assert Path("a.npy").exists() and Path("m/mine_merged.ply").read_bytes() == b"mine"
+
+
 def test_inputs_that_are_called_alike(run: Run) -> None:
     """Also where the file system takes capitals for small letters; and only files of one suffix can be."""
     inputs = ["x/a.npy", "y/a.ply", "z/A.npy", "a_2.las", "w/a.las", "m.tmap"]

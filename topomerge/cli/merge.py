@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 import topomerge
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, check_outputs, output_folder, say, warn
-from topomerge.cli.merge_points import point_files, points_written
+from topomerge.cli.merge_points import point_files, points_written, with_points
 from topomerge.cli.options import CLOUD_OPTIONS, DESCRIPTOR, given, map_from, output, quiet, share
 from topomerge.errors import InputError
 
@@ -48,7 +47,8 @@ def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) ->
     result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices)
     result = replace(result, seconds={**result.seconds, "read": read_seconds, "extract": extract_seconds})
     warn(result.warnings)
-    with points_written(result, files, args) if args.points else nullcontext():
+    result = with_points(result, files)
+    with points_written(result, folder, args):
         result.save(folder)
     if not args.quiet:
         joined = f"; {len(result.matches)} matches, {len(result.map.rooms)} rooms in all" if result.map else ""

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,25 +37,41 @@ def point_files(inputs: Sequence[str], folder: Path) -> dict[int, Path]:
     return files
 
 
+def with_points(result: MergeResult, files: Mapping[int, Path]) -> MergeResult:
+    """The result that names the files of its points."""
+    return replace(result, points={k: path.name for k, path in files.items() if k in result.placements})
+
+
 @contextmanager
-def points_written(result: MergeResult, files: Mapping[int, Path], args: argparse.Namespace) -> Iterator[None]:
-    """Write the points of each input that is part of the joined map beside their places, and rename them on success, when what
-    else belongs to the merge is written; files of an earlier merge that nothing takes the place of are removed."""
+def points_written(result: MergeResult, folder: Path, args: argparse.Namespace) -> Iterator[None]:
+    """Write the points of each input that the result names beside their places, and rename them on success, when what else
+    belongs to the merge is written; those of an earlier merge in the folder are replaced or removed."""
     from topomerge.io.atomic import replacing
 
-    placed = result.placements
+    earlier = _earlier_points(folder, args.inputs)
     with ExitStack() as stack:
-        for k, path in files.items():
-            if k in placed:
-                _write(result, k, stack.enter_context(replacing(path)), args)
-        for k, source in enumerate(args.inputs if placed else ()):
-            if k not in files:
+        for k, name in result.points.items():
+            _write(result, k, stack.enter_context(replacing(folder / name)), args)
+        for k, source in enumerate(args.inputs if args.points and result.placements else ()):
+            if Path(source).suffix.lower() == ".tmap":
                 warn([f"{source}: is a map, which has no points; give the scan that it was made of for --points"])
-            elif k not in placed:
+            elif k not in result.placements:
                 warn([f"{source}: stands apart, its points are not written"])
-        for path in files.values():  # a kill leaves no points of another merge beside this one
-            path.resolve().unlink(missing_ok=True)
+        written = {folder / name for name in result.points.values()}
+        for path in [*(earlier - written), *(path.resolve() for path in written)]:
+            path.unlink(missing_ok=True)  # a kill leaves no points of another merge beside this one
         yield
+
+
+def _earlier_points(folder: Path, inputs: Sequence[str]) -> set[Path]:
+    """The files of points that the merge in a folder names, but for those that are inputs now."""
+    try:
+        names = json.loads((folder / "merge.json").read_text(encoding="utf-8"))["points"].values()
+        names = [name for name in names if re.fullmatch(r"[^/\\]*_merged\.(las|laz|ply)", name)]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return set()  # no merge, or one that is damaged or older
+    taken = {Path(path).resolve() for path in inputs}
+    return {path for path in (folder / name for name in names) if path.is_file() and path.resolve() not in taken}
 
 
 def _write(result: MergeResult, k: int, path: Path, args: argparse.Namespace) -> None:

@@ -55,6 +55,7 @@ class MergeResult:
         warnings: what the user should know.
         descriptor: of the rooms, by which they were matched.
         bends: k -> how map k is bent in its own frame, before its transform is applied; rigid ones are left out.
+        points: k -> name of the file beside merge.json that holds the points of map k, of those that `merge --points` wrote.
     """
 
     status: str
@@ -70,6 +71,7 @@ class MergeResult:
     warnings: tuple[str, ...] = ()
     descriptor: str = ""
     bends: Mapping[int, Deformation] = field(default_factory=dict)
+    points: Mapping[int, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.status not in ("merged", "abstained"):
@@ -115,6 +117,7 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
         "bend": {str(k): bend_to_json(result.maps[k], p) for k, p in result.placements.items() if p.bend is not None},
         "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],
         "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in MERGE_STEPS},
+        "points": {str(k): name for k, name in sorted(result.points.items())},
     }
     plain_listing: dict[str, Any] = plain(listing)
     return plain_listing
