@@ -1,4 +1,4 @@
-"""Two maps as pieces that are moved onto each other, step by step; all moves are in the frame of map a (method 4)."""
+"""Maps as pieces that are moved onto each other, step by step; all moves are in one common frame (method 4)."""
 
 from __future__ import annotations
 
@@ -17,178 +17,185 @@ from topomerge.fusion.prepared import Prepared
 from topomerge.matching.refinement import storeys_at
 from topomerge.types import Array, Sim3
 
-RIGID_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.05)  # m, m, rad, logarithm of the scale: of the mended pose
+RIGID_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.05)  # m, m, rad, logarithm of the scale: of a mended pose
 PIECE_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.02)
 SCALE_DRIFT = 0.003  # logarithm of the scale per square root of a metre
 LEAST_DRIFT = 1e-4  # m and rad, of a joint
 NEIGHBOURS = 4  # pieces of the other map that say how it is bent at a place
 REACH = 0.6 * PIECE_SIZE
+Pair = tuple[int, int]
 
 
 class Alignment:
-    """Two maps with their pieces, moved onto each other step by step; all moves are in the frame of map a."""
+    """Maps with their pieces, and the pairs of them that see each other.
 
-    def __init__(self, a: Prepared, b: Prepared, pose: Sim3, scaled: bool) -> None:
-        self.maps, self.pose, self.scaled = (a, b), pose, scaled
-        self.pieces = (a.pieces, b.pieces)
-        self.storeys = (a.storeys, b.storeys)
+    Args:
+        poses: of the maps in the common frame.
+        pairs: numbers of two maps; pieces of each are registered on the other one.
+        scaled: are the scales of all but the first map free?
+    """
+
+    def __init__(self, maps: Sequence[Prepared], poses: Sequence[Sim3], pairs: Sequence[Pair], scaled: bool) -> None:
+        self.maps, self.poses, self.scaled = tuple(maps), list(poses), scaled
+        self.pairs = [pair for i, j in pairs for pair in ((i, j), (j, i))]
         self.targets: dict[int, Target] = {}
-        self.moves = [np.zeros((len(p), 4)) for p in self.pieces]
-        self.weights = np.zeros(0)
+        self.moves = [np.zeros((len(m.pieces), 4)) for m in maps]
+        self.first = np.cumsum([0, *(len(m.pieces) for m in maps)])
 
-    def anchors(self, side: int) -> Array:
-        """(n, 2) m, in the frame of a."""
-        at = self.pieces[side].anchors
-        return at if side == 0 else flat(self.pose, at)
+    def anchors(self, k: int) -> Array:
+        """(n, 2) m of the pieces of a map, in the common frame."""
+        return flat(self.poses[k], self.maps[k].pieces.anchors)
 
-    def matched(self) -> list[tuple[int, int]]:
-        """Storeys of a and of b on one level."""
-        pairs = storeys_at(*self.storeys, self.pose.translation[2], self.pose.scale)
-        places = [{id(s): k for k, s in enumerate(storeys)} for storeys in self.storeys]
-        return [(places[0][id(v)], places[1][id(w)]) for v, w in pairs]
+    def matched(self, i: int, j: int) -> list[Pair]:
+        """Storeys of two maps on one level."""
+        a, b = self.maps[i].storeys, self.maps[j].storeys
+        pose = self.poses[i].inverse() @ self.poses[j]
+        places = [{id(s): k for k, s in enumerate(storeys)} for storeys in (a, b)]
+        return [(places[0][id(v)], places[1][id(w)]) for v, w in storeys_at(a, b, pose.translation[2], pose.scale)]
 
-    def shares(self, side: int, chosen: Array) -> tuple[Array, Array]:
-        """(m, NEIGHBOURS) pieces of the other map around the chosen ones, and their shares."""
-        other = self.pieces[1 - side]
-        here, there = self.anchors(side)[chosen], self.anchors(1 - side)
-        many = min(NEIGHBOURS, len(there))
-        out, shares = np.zeros((len(chosen), many), np.int64), np.zeros((len(chosen), many))
-        for i, j in self.matched():
-            mine, theirs = (i, j) if side == 0 else (j, i)
-            rows = np.flatnonzero(self.pieces[side].storey[chosen] == mine)
-            near = np.flatnonzero(other.storey == theirs)
+    def shares(self, i: int, j: int, chosen: Array) -> tuple[Array, Array]:
+        """(m, NEIGHBOURS) pieces of map j around the chosen ones of map i, and their shares."""
+        here, there = self.anchors(i)[chosen], self.anchors(j)
+        out, shares = np.zeros((len(chosen), NEIGHBOURS), np.int64), np.zeros((len(chosen), NEIGHBOURS))
+        for mine, theirs in self.matched(i, j):
+            rows = np.flatnonzero(self.maps[i].pieces.storey[chosen] == mine)
+            near = np.flatnonzero(self.maps[j].pieces.storey == theirs)
             if not len(rows) or not len(near):
                 continue
-            q = min(many, len(near))
-            distance, nearest = cKDTree(there[near]).query(here[rows], q)
-            distance, nearest = distance.reshape(len(rows), q), nearest.reshape(len(rows), q)
+            many = min(NEIGHBOURS, len(near))
+            distance, nearest = (x.reshape(len(rows), many) for x in cKDTree(there[near]).query(here[rows], many))
             weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * REACH**2))
-            out[rows, :q], shares[rows, :q] = near[nearest], weight / weight.sum(axis=1, keepdims=True)
+            out[rows, :many], shares[rows, :many] = near[nearest], weight / weight.sum(axis=1, keepdims=True)
         return out, shares
 
-    def relative(self, side: int) -> Array:
-        """(n, 3) moves of the pieces of a map against the other one, in the frame of a."""
-        chosen = np.arange(len(self.pieces[side]))
-        others, shares = self.shares(side, chosen)
-        here, there = self.anchors(side), self.anchors(1 - side)
-        out = self.moves[side][:, :3].copy()
-        for k in range(others.shape[1]):
-            move, gap = self.moves[1 - side][others[:, k]], here - there[others[:, k]]
+    def relative(self, i: int, j: int) -> Array:
+        """(n, 3) moves of the pieces of map i against map j."""
+        others, shares = self.shares(i, j, np.arange(len(self.maps[i].pieces)))
+        here, there = self.anchors(i), self.anchors(j)
+        out = self.moves[i][:, :3].copy()
+        for k in range(NEIGHBOURS if len(there) else 0):
+            move, gap = self.moves[j][others[:, k]], here - there[others[:, k]]
             x = move[:, 0] - move[:, 2] * gap[:, 1] + move[:, 3] * gap[:, 0]
             y = move[:, 1] + move[:, 2] * gap[:, 0] + move[:, 3] * gap[:, 1]
             out -= shares[:, k : k + 1] * np.column_stack([x, y, move[:, 2]])
         return out
 
-    def frames(self, side: int) -> tuple[Sim3, Array]:
-        """The pose that brings a map into the frame of the other one, and the matrix (3, 3) that brings moves in the frame of a
-        into its own."""
-        into = self.pose.inverse() if side == 0 else self.pose
-        own = np.eye(3)
-        if side == 1:
-            own[:2, :2] = self.pose.inverse().matrix[:2, :2]
-        return into, own
+    def own(self, k: int) -> Array:
+        """(3, 3) which brings moves in the common frame into that of a map."""
+        out = np.eye(3)
+        out[:2, :2] = self.poses[k].inverse().matrix[:2, :2]
+        return out
 
-    def by_plan(self, side: int, window: Window) -> Measurements:
-        """The pieces of a map registered on the plan of the other one."""
-        pieces, (into, own) = self.pieces[side], self.frames(side)
-        start = self.relative(side) @ own.T
-        numbers, moves, information = [], [], []
-        for i, j in self.matched():
-            mine, theirs = (i, j) if side == 0 else (j, i)
-            chosen = np.flatnonzero(pieces.storey == mine)
-            fields = self.storeys[1 - side][theirs]
-            if not len(chosen) or not len(fields.walls):
-                continue
-            target = self.targets.setdefault(id(fields), Target(fields))
-            mean, certain = measure(pieces, self.maps[side].samples, chosen, start, into, target, window)
-            numbers.append(chosen)
-            moves.append(mean)
-            information.append(certain)
-        return self._measurements(side, own, numbers, moves, information)
+    def by_plan(self, i: int, j: int, window: Window) -> Measurements:
+        """The pieces of map i registered on the plans of map j."""
+        pieces, own = self.maps[i].pieces, self.own(i)
+        into, start = self.poses[j].inverse() @ self.poses[i], self.relative(i, j) @ own.T
+        parts = []
+        for mine, theirs in self.matched(i, j):
+            chosen, fields = np.flatnonzero(pieces.storey == mine), self.maps[j].storeys[theirs]
+            if len(chosen) and len(fields.walls):
+                target = self.targets.setdefault(id(fields), Target(fields))
+                parts.append((chosen, *measure(pieces, self.maps[i].samples, chosen, start, into, target, window)))
+        return self._measurements((i, j), own, parts)
 
-    def by_surfaces(self, side: int) -> Measurements:
-        """The pieces of a map registered on the surfaces of the other one."""
-        into, own = self.frames(side)
-        start = self.relative(side) @ own.T
-        parts = self.maps[side].piece_surfaces.measure(start, into, self.maps[1 - side].surface)
-        numbers, moves, information = ([part] for part in parts)
-        return self._measurements(side, own, numbers, moves, information)
+    def by_surfaces(self, i: int, j: int) -> Measurements:
+        """The pieces of map i registered on the surfaces of map j."""
+        own = self.own(i)
+        into, start = self.poses[j].inverse() @ self.poses[i], self.relative(i, j) @ own.T
+        return self._measurements((i, j), own, [self.maps[i].piece_surfaces.measure(start, into, self.maps[j].surface)])
 
-    def _measurements(
-        self, side: int, own: Array, numbers: Sequence[Array], moves: Sequence[Array], information: Sequence[Array]
-    ) -> Measurements:
-        """Moves in a map's own frame as measurements in that of a. Information counts half: both maps see the same walls."""
-        common = np.linalg.inv(own)
-        chosen = np.concatenate([np.zeros(0, np.int64), *numbers])
-        others, shares = self.shares(side, chosen)
-        move = np.concatenate([np.zeros((0, 3)), *moves]) @ common.T
-        certain = own.T @ np.concatenate([np.zeros((0, 3, 3)), *information]) @ own / 2
-        return Measurements(chosen, self.anchors(side)[chosen], others, shares, move, certain)
+    def _measurements(self, pair: Pair, own: Array, parts: Sequence[tuple[Array, Array, Array]]) -> Measurements:
+        """Pieces, moves and information in a map's own frame as measurements in the common one. Information counts half: both
+        maps see the same walls."""
+        i, j = pair
+        chosen = np.concatenate([np.zeros(0, np.int64), *(p[0] for p in parts)])
+        others, shares = self.shares(i, j, chosen)
+        move = np.concatenate([np.zeros((0, 3)), *(p[1] for p in parts)]) @ np.linalg.inv(own).T
+        certain = own.T @ np.concatenate([np.zeros((0, 3, 3)), *(p[2] for p in parts)]) @ own / 2
+        places = self.anchors(i)[chosen]
+        return Measurements(chosen + self.first[i], places, others + self.first[j], shares, move, certain)
 
     def mend_pose(self, window: Window) -> None:
-        """The rigid pose that the pieces agree on best."""
-        parts = [self.by_plan(side, window) for side in (0, 1)]
-        places = np.concatenate([p.places for p in parts])
-        if not len(places):
+        """The rigid pose of the second of two maps that the pieces agree on best."""
+        parts = [self.by_plan(*pair, window) for pair in self.pairs]
+        sign = np.concatenate(
+            [np.full(len(p.piece), 1.0 if i == 1 else -1.0) for p, (i, _) in zip(parts, self.pairs, strict=True)]
+        )
+        measured = stacked(parts)
+        if not len(sign):
             return
-        moves = np.concatenate([-parts[0].moves, parts[1].moves])
-        information = np.concatenate([p.information for p in parts])
-        nobody = np.zeros((len(places), 0))
-        whole = Measurements(np.zeros(len(places), np.int64), places, nobody.astype(np.int64), nobody, moves, information)
-        middle = places.mean(axis=0, keepdims=True)
+        nobody = np.zeros((len(sign), 0))
+        one = np.zeros(len(sign), np.int64)
+        moves = sign[:, None] * measured.moves
+        whole = Measurements(one, measured.places, nobody.astype(np.int64), nobody, moves, measured.information)
+        middle = measured.places.mean(axis=0, keepdims=True)
         prior = np.array([[*RIGID_PRIOR[:3], RIGID_PRIOR[3] if self.scaled else 0.0]])
         none = Joints(np.zeros((0, 2), np.int64), np.zeros((0, 4)))
-        x, y, turn, size = settle(middle, none, whole, prior).moves[0].tolist()
-        about = Sim3(turn, (0.0, 0.0, 0.0), float(np.exp(size)))
-        at = middle[0] + (x, y) - flat(about, middle)[0]
-        moved = Sim3(turn, (float(at[0]), float(at[1]), 0.0), float(np.exp(size))) @ self.pose
-        self.pose = replace(moved, translation=(*moved.translation[:2], self.pose.translation[2]))
+        self._turn(1, middle[0], settle(middle, none, whole, prior).moves[0])
 
-    def settle(self, parts: Sequence[Measurements], drift: tuple[Drift, Drift]) -> Settled:
-        """Move all pieces by what was measured of those of both maps."""
-        first = len(self.pieces[0])
-        anchors = np.concatenate([self.anchors(0), self.anchors(1)])
-        offset = (0, first)
-        measured = Measurements(
-            np.concatenate([p.piece + offset[k] for k, p in enumerate(parts)]),
-            np.concatenate([p.places for p in parts]),
-            _padded([p.others + offset[1 - k] for k, p in enumerate(parts)]),
-            _padded([p.shares for p in parts]),
-            np.concatenate([p.moves for p in parts]),
-            np.concatenate([p.information for p in parts]),
-        )
-        sizes = (1.0, self.pose.scale)
-        sigma = [_joint_sigma(p, d, s, self.scaled) for p, d, s in zip(self.pieces, drift, sizes, strict=True)]
-        joints = Joints(np.concatenate([self.pieces[0].joints, self.pieces[1].joints + first]), np.concatenate(sigma))
-        prior = [_prior(p, d, self.scaled and k == 1) for k, (p, d) in enumerate(zip(self.pieces, drift, strict=True))]
-        settled = settle(anchors, joints, measured, np.concatenate(prior))
-        self.moves = [settled.moves[:first], settled.moves[first:]]
+    def _turn(self, k: int, about: Array, move: Array) -> None:
+        """Move the rigid pose of a map; heights stay."""
+        x, y, turn, size = move.tolist()
+        turned = Sim3(turn, (0.0, 0.0, 0.0), float(np.exp(size)))
+        at = about + (x, y) - flat(turned, about[None])[0]
+        pose = replace(turned, translation=(float(at[0]), float(at[1]), 0.0)) @ self.poses[k]
+        self.poses[k] = replace(pose, translation=(*pose.translation[:2], self.poses[k].translation[2]))
+
+    def fold(self, k: int) -> None:
+        """Let the pose of a map take over what its pieces have moved alike."""
+        pieces, moves = self.maps[k].pieces, self.moves[k]
+        if not len(pieces):
+            return
+        many = np.bincount(pieces.owner, minlength=len(pieces))[:, None].astype(float)
+        anchors = self.anchors(k)
+        middle = (many * anchors).sum(axis=0) / many.sum()
+        x, y = (anchors - middle).T
+        rows = np.zeros((len(pieces), 2, 3))
+        rows[:, 0, 0] = rows[:, 1, 1] = 1.0
+        rows[:, 0, 2], rows[:, 1, 2] = -y, x
+        root = np.sqrt(many)[:, :, None]
+        alike = np.linalg.lstsq((root * rows).reshape(-1, 3), (root[:, :, 0] * moves[:, :2]).ravel(), rcond=None)[0]
+        self.moves[k] = moves - np.column_stack([rows @ alike, np.full(len(moves), alike[2]), np.zeros(len(moves))])
+        self._turn(k, middle, np.append(alike, 0.0))
+
+    def settle(self, parts: Sequence[Measurements], drifts: Sequence[Drift]) -> Settled:
+        """Move all pieces by what was measured."""
+        anchors = np.concatenate([self.anchors(k) for k in range(len(self.maps))])
+        each = list(enumerate(zip((m.pieces for m in self.maps), drifts, strict=True)))
+        sigma = [_joint_sigma(p, d, self.poses[k].scale, self.scaled) for k, (p, d) in each]
+        prior = [_prior(p, d, self.scaled and k > 0) for k, (p, d) in each]
+        ends = [m.pieces.joints + n for m, n in zip(self.maps, self.first, strict=False)]
+        settled = settle(anchors, Joints(np.concatenate(ends), np.concatenate(sigma)), stacked(parts), np.concatenate(prior))
+        self.moves = np.split(settled.moves, self.first[1:-1])
         return settled
 
-    def deformation(self, side: int, covariance: Array) -> Deformation:
-        """The moves of one map in its own frame.
+    def deformations(self, covariance: Array) -> tuple[Deformation, ...]:
+        """The moves of all maps in their own frames.
 
         Args:
-            covariance: (n, 3, 3) in the frame of a.
+            covariance: (n, 3, 3) in the common frame.
         """
-        pieces, moves, (_, own) = self.pieces[side], self.moves[side].copy(), self.frames(side)
+        return tuple(self._deformation(k, c) for k, c in enumerate(np.split(covariance, self.first[1:-1])))
+
+    def _deformation(self, k: int, covariance: Array) -> Deformation:
+        pieces, own = self.maps[k].pieces, self.own(k)
+        moves = self.moves[k].copy()
         moves[:, :2] = moves[:, :2] @ own[:2, :2].T
-        floors = np.array([f.plan.floor_guess for f in self.storeys[side]])
-        return Deformation(
-            pieces.anchors, pieces.storey, floors, moves, own @ covariance @ own.T, pieces.room.astype(np.int32), REACH
-        )
+        floors = np.array([f.plan.floor_guess for f in self.maps[k].storeys])
+        turned, room = own @ covariance @ own.T, pieces.room.astype(np.int32)
+        return Deformation(pieces.anchors, pieces.storey, floors, moves, turned, room, REACH / self.poses[k].scale)
 
 
-def _padded(parts: list[Array]) -> Array:
-    wide = max(p.shape[1] for p in parts)
-    return np.concatenate([np.pad(p, ((0, 0), (0, wide - p.shape[1]))) for p in parts])
+def stacked(parts: Sequence[Measurements]) -> Measurements:
+    """All measurements as one."""
+    names = ("piece", "places", "others", "shares", "moves", "information")
+    return Measurements(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
 def _joint_sigma(pieces: Pieces, drift: Drift, scale: float, scaled: bool) -> Array:
     root = np.sqrt(pieces.lengths * scale)[:, None]
     size = SCALE_DRIFT if scaled else LEAST_DRIFT
-    steps = np.array([[drift.shift, drift.shift, drift.turn, size]])
-    return np.maximum(root * steps, LEAST_DRIFT)
+    return np.maximum(root * np.array([[drift.shift, drift.shift, drift.turn, size]]), LEAST_DRIFT)
 
 
 def _prior(pieces: Pieces, drift: Drift, scaled: bool) -> Array:

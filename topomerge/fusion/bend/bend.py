@@ -101,35 +101,33 @@ def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | N
     if reason:
         return Bend(pose, (_rigid(a), _rigid(b)), reason=reason)
     for share in STIFFER:
-        stiff = (Drift(share * usual[0].shift, share * usual[0].turn), Drift(share * usual[1].shift, share * usual[1].turn))
-        alignment = Alignment(a, b, pose, scaled)
-        settled = _settled(alignment, stiff)
+        alignment = Alignment((a, b), (Sim3(), pose), [(0, 1)], scaled)
+        for _ in range(POSE_ROUNDS):
+            alignment.mend_pose(FIRST_WINDOW)
+        settled = settle_all(alignment, [Drift(share * d.shift, share * d.turn) for d in usual])
         if settled is None:
             return Bend(pose, (_rigid(a), _rigid(b)), reason="no walls of the one map are near those of the other")
-        first = len(a.pieces)
-        covariances = settled.covariance[:first], settled.covariance[first:]
-        bent = (alignment.deformation(0, covariances[0]), alignment.deformation(1, covariances[1]))
+        bent = alignment.deformations(settled.covariance)
         if min(d.least_growth for d in bent) >= LEAST_GROWTH:
-            return Bend(alignment.pose, bent, _features(alignment, settled))
+            return Bend(alignment.poses[1], (bent[0], bent[1]), _features(alignment, settled))
     return Bend(pose, (_rigid(a), _rigid(b)), reason="bending would fold space")
 
 
-def _settled(alignment: Alignment, drift: tuple[Drift, Drift]) -> Settled | None:
-    for _ in range(POSE_ROUNDS):
-        alignment.mend_pose(FIRST_WINDOW)
+def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> Settled | None:
+    """Move the pieces of all maps in windows that shrink, last by surfaces; None where no map sees another one's walls."""
     settled = None
     for window in WINDOWS:
-        parts = [alignment.by_plan(side, window) for side in (0, 1)]
+        parts = [alignment.by_plan(*pair, window) for pair in alignment.pairs]
         if not sum(len(p.piece) for p in parts):
             return None
-        settled = alignment.settle(parts, drift)
-    if any(s.plan.sliced for m in alignment.maps for s in m.storeys):  # a slice has no planes
-        return settled
-    for _ in range(SURFACE_ROUNDS):
-        parts = [alignment.by_surfaces(side) for side in (0, 1)]
-        if not sum(len(p.piece) for p in parts):
-            break
-        settled = alignment.settle(parts, drift)
+        settled = alignment.settle(parts, drifts)
+    for k in range(1, len(alignment.maps)):
+        alignment.fold(k)
+    sliced = [any(s.plan.sliced for s in m.storeys) for m in alignment.maps]  # a slice has no planes
+    solid = [pair for pair in alignment.pairs if not (sliced[pair[0]] or sliced[pair[1]])]
+    for _ in range(SURFACE_ROUNDS if solid else 0):
+        parts = [alignment.by_surfaces(*p) if p in solid else alignment.by_plan(*p, WINDOWS[-1]) for p in alignment.pairs]
+        settled = alignment.settle(parts, drifts)
     return settled
 
 
@@ -153,7 +151,7 @@ def _rigid(map: Prepared) -> Deformation:
 
 
 def _features(alignment: Alignment, settled: Settled) -> dict[str, float]:
-    moved = np.linalg.norm(alignment.relative(1)[:, :2], axis=1)
+    moved = np.linalg.norm(alignment.relative(1, 0)[:, :2], axis=1)
     return {
         "strain": float(np.sqrt(settled.strain.sum() / max(3 * len(settled.strain), 1))),
         "bent": float(np.sqrt((moved**2).mean())),

@@ -14,7 +14,7 @@ from topomerge.types import Array, TopometricMap
 
 PIECE_SIZE = 5.0  # m, of a piece along a main direction; rooms up to `WHOLE_SIZE` are not cut
 WHOLE_SIZE = 7.5
-WALL_REACH = 0.6  # m around a room's floor: the walls there are its walls
+ROOM_WALL_REACH = 0.6  # m around a room's floor: the walls there are its walls
 LEAST_WALLS = 8  # columns of walls, without which a piece can't be registered and gets none
 THROUGH_WALL = 2.0  # times the length of a joint between pieces that no door joins
 STOREY_LENGTH = 10.0  # m of walk from a storey to the next one
@@ -124,7 +124,7 @@ def _bridges(joints: Array, anchors: Array) -> Array:
 
 
 def _rooms_of_walls(fields: PlanFields, map: TopometricMap) -> Array:
-    """(w,) int32 room whose floor is nearest to each wall column of a storey, -1 where none is within `WALL_REACH`."""
+    """(w,) int32 room whose floor is nearest to each wall column of a storey, -1 where none is within `ROOM_WALL_REACH`."""
     plan, labels = fields.plan, np.full(fields.plan.wall.shape, -1, np.int32)
     inside = map.navigable_room >= 0
     places = map.navigable.centroids(map.navigable.cells[inside])
@@ -138,7 +138,7 @@ def _rooms_of_walls(fields: PlanFields, map: TopometricMap) -> Array:
         return np.full(int(plan.wall.sum()), -1, np.int32)
     distance, nearest = ndimage.distance_transform_edt(labels < 0, return_indices=True)
     nearest_room = labels[tuple(nearest)]
-    out: Array = np.where(distance * plan.edge <= WALL_REACH, nearest_room, -1)[plan.wall].astype(np.int32)
+    out: Array = np.where(distance * plan.edge <= ROOM_WALL_REACH, nearest_room, -1)[plan.wall].astype(np.int32)
     return out
 
 
