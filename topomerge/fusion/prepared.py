@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from topomerge.fusion.bend.drift import Drift, map_drift
-from topomerge.fusion.bend.local import samples
+from topomerge.fusion.bend.drift import map_sensor
+from topomerge.fusion.bend.lines import WallLines, wall_lines
+from topomerge.fusion.bend.local import Target, samples
 from topomerge.fusion.bend.pieces import Pieces, pieces_of
-from topomerge.fusion.bend.surfaces import PieceSurfaces
 from topomerge.fusion.cell_means import cell_middles
 from topomerge.fusion.refine import Surface, surface
 from topomerge.fusion.storey_plan import plans
@@ -52,9 +52,9 @@ class Prepared:
         return surface(self.grid)
 
     @cached_property
-    def drift(self) -> Drift:
-        """How much its sensor goes astray."""
-        return map_drift(self.map)
+    def sensor(self) -> str:
+        """What it was measured by, as far as one can say."""
+        return map_sensor(self.map)
 
     @cached_property
     def pieces(self) -> Pieces:
@@ -67,11 +67,15 @@ class Prepared:
         return samples(self.pieces)
 
     @cached_property
-    def piece_surfaces(self) -> PieceSurfaces:
-        """The surface points of each piece."""
-        floors = np.array([s.plan.floor_guess for s in self.storeys])
-        storey = np.searchsorted(floors + 0.3, self.surface.points[:, 2]) - 1
-        return PieceSurfaces(self.pieces, self.surface, storey)
+    def lines(self) -> tuple[WallLines, ...]:
+        """The walls of each storey as lines."""
+        middles = cell_middles(self.grid)
+        return tuple(wall_lines(s, middles) for s in self.storeys)
+
+    @cached_property
+    def targets(self) -> tuple[Target, ...]:
+        """The storeys, for pieces of other maps to be registered on."""
+        return tuple(Target(s) for s in self.storeys)
 
 
 def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:

@@ -10,13 +10,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.fusion.bend.bend import Bend
+from topomerge.fusion.bend.judged import judged_as_bent
 from topomerge.fusion.judge import Judge
 from topomerge.fusion.prepared import Map, Prepared, prepare
 from topomerge.fusion.refine import refine_pose
 from topomerge.fusion.scale import search_scaled
 from topomerge.fusion.search import search
 from topomerge.fusion.verify import MARGIN_CAP, model, probability, rank
-from topomerge.fusion.winner_features import winner_features
 from topomerge.matching.poses import PoseHypothesis, wrapped
 from topomerge.matching.refinement import refine
 from topomerge.types import Sim3, VoxelGrid
@@ -35,6 +36,7 @@ class Registration:
         probability: that it is right, calibrated on simulated pairs; 0 without a hypothesis.
         accepted: is the probability above the threshold of the calibration?
         features: what it was judged by (`Judge`, `winner_features`), with ``margin`` and ``rmse`` (m).
+        bend: how the maps are bent onto each other under the transform; None where a rigid pose was asked for.
         alternatives: the hypotheses, best first, their scores the log odds of each seen by itself (`verify.rank`); the first one
             is the best before its fine registration.
         reason: in words.
@@ -46,6 +48,7 @@ class Registration:
     accepted: bool
     features: dict[str, float] = field(default_factory=dict)
     alternatives: tuple[PoseHypothesis, ...] = ()
+    bend: Bend | None = None
     reason: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -60,6 +63,7 @@ def register(
     yaws: Sequence[float] = (),
     refined: bool = True,
     searched: bool = True,
+    rigid: bool = False,
 ) -> Registration:
     """The pose of map b in map a's frame. `register(b, a)` gives its inverse.
 
@@ -71,6 +75,8 @@ def register(
         yaws: further turns of b to try, rad.
         refined: finish with the fine registration? Without it the pose is right to a cell.
         searched: look for poses by correlation? Else the proposed ones are all there is.
+        rigid: give the best rigid pose? Else both maps are bent, too. They are judged as bent all the same: drift is no
+            contradiction.
 
     Raises:
         InputError: an empty map, or another word for the scale.
@@ -82,7 +88,7 @@ def register(
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
         poses, turns = [pose.inverse() for pose in proposed], [-y for y in yaws]
-        swapped = register(b, a, scale=scale, proposed=poses, yaws=turns, refined=refined, searched=searched)
+        swapped = register(b, a, scale=scale, proposed=poses, yaws=turns, refined=refined, searched=searched, rigid=rigid)
         return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
     first, second = a.storeys, b.storeys
     if searched:
@@ -93,15 +99,15 @@ def register(
     if not hypotheses:
         reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
         return Registration(None, 0.0, False, reason=reason, seconds=clock.seconds)
-    judge = Judge(first, second)
-    ranked = rank(hypotheses, judge)
-    winner = winner_features(judge, ranked[0].transform)
+    ranked = rank(hypotheses, Judge(first, second))
     clock("verify")
-    pose, rmse = ranked[0].transform, float("nan")
-    if refined and not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
-        pose, rmse = fine(a, b, pose, scale == "free")
+    bent, winner = judged_as_bent(a, b, ranked[0].transform, scale == "free")
+    clock("bend")
+    pose, rmse = bent.transform, winner.get("rmse", float("nan"))
+    if (rigid or bent.reason) and refined and not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
+        pose, rmse = fine(a, b, ranked[0].transform, scale == "free")
     clock("refine")
-    return _verdict(ranked, winner, pose, rmse, clock.seconds)
+    return replace(_verdict(ranked, winner, pose, rmse, clock.seconds), bend=None if rigid else bent)
 
 
 class _Clock:
@@ -121,7 +127,8 @@ def _verdict(
 ) -> Registration:
     """The best of ranked hypotheses, refined to `pose`, with its probability and the reason in words."""
     margin = ranked[0].score - ranked[1].score if len(ranked) > 1 else MARGIN_CAP
-    features = {**ranked[0].features, **winner, "margin": margin, "rmse": rmse}
+    rigid_conflict = ranked[0].features["conflict_share"]
+    features = {**ranked[0].features, **winner, "rigid_conflict_share": rigid_conflict, "margin": margin, "rmse": rmse}
     chance, chances = probability(ranked, winner)
     accepted = chance >= model()["threshold"]
     share = 100 * features["conflict_share"]
@@ -148,4 +155,5 @@ def _inverse(registration: Registration) -> Registration:
     """The same registration seen from the other map."""
     others = tuple(replace(h, transform=h.transform.inverse()) for h in registration.alternatives)
     transform = None if registration.transform is None else registration.transform.inverse()
-    return replace(registration, transform=transform, alternatives=others)
+    bent = registration.bend and registration.bend.inverse()
+    return replace(registration, transform=transform, alternatives=others, bend=bent)

@@ -93,14 +93,16 @@ def probability(ranked: Sequence[PoseHypothesis], winner: Features) -> tuple[flo
     """Probability that the first of ranked hypotheses is right, at most its share of the odds of all; and of each of them.
 
     Args:
-        winner: `winner_features` of the first one.
+        winner: what the first one is judged by once the maps are bent (`bend.judged`).
     """
     models = _models(ranked[0].features)
     pose = models["pose"]
     vectors = np.array([vector(h.features) for h in ranked])
     scores = np.array([h.score for h in ranked])
     leads = lead(scores, vectors, np.array(pose["weight"]), np.array(pose["scale"]))
-    odds = _logit(models["winner"], np.concatenate([vectors[0], leads[:3], winner_vector({**ranked[0].features, **winner})]))
+    features = {**ranked[0].features, **winner}
+    seen = np.concatenate([vector(features), leads[:3], winner_vector(features), bend_vector(features)])
+    odds = _logit(models["winner"], seen)
     shares = np.exp(scores - scores[0]) / np.exp(scores - scores[0]).sum()
     first = min(1 / (1 + np.exp(-odds)), leads[3])
     return float(first), (first * shares / shares[0]).tolist()
@@ -115,6 +117,23 @@ WINNER_VECTOR = (
     "tall", "crossing", "worst_ratio", "squares", "bad_squares", "in_place", "out_of_place", "kept", "moved_walls", "hanging",
     "fallen", "held",
 )  # fmt: skip
+
+
+BEND_VECTOR = ("strain", "bent", "doubted", "straightened")
+
+
+def bend_vector(f: Features) -> Array:
+    """(4,) what the model of the best hypothesis sees of the bending, named `BEND_VECTOR`: how much more the joints give way than
+    usual, how far the pieces moved, how many were voted out, and how much of the conflict the bending took away."""
+    rigid = f.get("rigid_conflict_share", f["conflict_share"])
+    return np.array(
+        [
+            np.log(f["strain"] + 0.1),
+            np.log(f["bent"] + 0.02),
+            f["doubted"],
+            max(rigid - f["conflict_share"], 0.0),
+        ]
+    )
 
 
 def winner_vector(f: Features) -> Array:

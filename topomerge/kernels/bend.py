@@ -40,3 +40,89 @@ def move_scores(points, sector, start, places, turns, yaws, shifts, gain, origin
                         if v >= 0 and v < gain.shape[2]:
                             out[k, a, i, j] += gain[q, u, v]
     return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def line_normals(row, points, columns, reach, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(n, 2) unit normals of the lines through the points within `reach` columns of each one, and (n,) how straight these are
+    (0 to 1); 0 where fewer than `least` points are near.
+
+    Args:
+        row: (nx, ny) int32 row of the point in each column, -1 none.
+        points: (n, 2) m; columns (n, 2) int, where they are.
+    """
+    out, straight = np.zeros((len(points), 2)), np.zeros(len(points))
+    for k in range(len(points)):
+        n, mx, my, xx, xy, yy = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(max(columns[k, 0] - reach, 0), min(columns[k, 0] + reach + 1, row.shape[0])):
+            for j in range(max(columns[k, 1] - reach, 0), min(columns[k, 1] + reach + 1, row.shape[1])):
+                r = row[i, j]
+                if r >= 0:
+                    dx, dy = points[r, 0] - points[k, 0], points[r, 1] - points[k, 1]
+                    n += 1
+                    mx, my = mx + dx, my + dy
+                    xx, xy, yy = xx + dx * dx, xy + dx * dy, yy + dy * dy
+        if n < least:
+            continue
+        xx, xy, yy = xx / n - mx * mx / (n * n), xy / n - mx * my / (n * n), yy / n - my * my / (n * n)
+        mean, half = (xx + yy) / 2, np.sqrt((xx - yy) ** 2 / 4 + xy * xy)
+        if half <= 0 or mean + half <= 1e-12:
+            continue
+        angle = np.arctan2(2 * xy, xx - yy) / 2  # along the line
+        out[k, 0], out[k, 1] = -np.sin(angle), np.cos(angle)
+        straight[k] = 1.0 - max(mean - half, 0.0) / (mean + half)
+    return out, straight
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def line_steps(points, normal, faced, start, places, turns, row, target, target_normal, target_faced, origin, edge, reach, sigma):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Normal equations of a shift and a turn of each piece: each of its points and the nearest one of the target whose normal is
+    alike, within `reach` columns; two sides of a wall are not alike.
+
+    Args:
+        points: (n, 2) m about the anchor of their piece; normal (n, 2), towards empty space where `faced` (n,).
+        start: (K + 1,) first point of each piece; places (K, 2) m, where anchors are; turns (K,) rad.
+        row: (nx, ny) int32 row of the target's point in each column, -1 none; target (m, 2), its normals, and are they faced?
+        sigma: m, of the robust weights (Geman-McClure).
+
+    Returns:
+        H (K, 3, 3), g (K, 3), partners (K,), sums of weights and of weighted squared distances (K, 2).
+    """
+    many = len(places)
+    h, g, partners, sums = np.zeros((many, 3, 3)), np.zeros((many, 3)), np.zeros(many, np.int64), np.zeros((many, 2))
+    jac = np.zeros(3)
+    for k in range(many):
+        c, s = np.cos(turns[k]), np.sin(turns[k])
+        for p in range(start[k], start[k + 1]):
+            dx, dy = c * points[p, 0] - s * points[p, 1], s * points[p, 0] + c * points[p, 1]
+            nx, ny = c * normal[p, 0] - s * normal[p, 1], s * normal[p, 0] + c * normal[p, 1]
+            x, y = places[k, 0] + dx, places[k, 1] + dy
+            i0, j0 = int(np.floor((x - origin[0]) / edge)), int(np.floor((y - origin[1]) / edge))
+            best, near, sign = -1, (reach * edge) ** 2, 1.0
+            for i in range(max(i0 - reach, 0), min(i0 + reach + 1, row.shape[0])):
+                for j in range(max(j0 - reach, 0), min(j0 + reach + 1, row.shape[1])):
+                    r = row[i, j]
+                    if r < 0:
+                        continue
+                    dot = nx * target_normal[r, 0] + ny * target_normal[r, 1]
+                    if abs(dot) < 0.8 or (dot < 0 and faced[p] and target_faced[r]):
+                        continue
+                    far = (target[r, 0] - x) ** 2 + (target[r, 1] - y) ** 2
+                    if far < near:
+                        best, near, sign = r, far, 1.0 if dot > 0 else -1.0
+            if best < 0:
+                continue
+            ux, uy = sign * nx + target_normal[best, 0], sign * ny + target_normal[best, 1]  # of both: neither map is the truth
+            length = np.sqrt(ux * ux + uy * uy)
+            ux, uy = ux / length, uy / length
+            d = ux * (x - target[best, 0]) + uy * (y - target[best, 1])
+            w = 1.0 / (1.0 + (d / sigma) ** 2) ** 2
+            jac[0], jac[1], jac[2] = ux, uy, uy * dx - ux * dy
+            for u in range(3):
+                g[k, u] += w * d * jac[u]
+                for v in range(3):
+                    h[k, u, v] += w * jac[u] * jac[v]
+            partners[k] += 1
+            sums[k, 0] += w
+            sums[k, 1] += w * d * d
+    return h, g, partners, sums

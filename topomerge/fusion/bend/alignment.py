@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.bend.drift import Drift
 from topomerge.fusion.bend.graph import Joints, Measurements, Settled, settle
-from topomerge.fusion.bend.local import Target, Window, measure
+from topomerge.fusion.bend.lines import measure_lines
+from topomerge.fusion.bend.local import Window, measure
 from topomerge.fusion.bend.pieces import PIECE_SIZE, Pieces
 from topomerge.fusion.prepared import Prepared
 from topomerge.matching.refinement import storeys_at
@@ -20,6 +21,7 @@ from topomerge.types import Array, Sim3
 RIGID_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.05)  # m, m, rad, logarithm of the scale: of a mended pose
 PIECE_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.02)
 SCALE_DRIFT = 0.003  # logarithm of the scale per square root of a metre
+LEAST_SHARE = 0.4  # of the usual drift, that a map is taken to have at least
 LEAST_DRIFT = 1e-4  # m and rad, of a joint
 NEIGHBOURS = 4  # pieces of the other map that say how it is bent at a place
 REACH = 0.6 * PIECE_SIZE
@@ -38,8 +40,9 @@ class Alignment:
     def __init__(self, maps: Sequence[Prepared], poses: Sequence[Sim3], pairs: Sequence[Pair], scaled: bool) -> None:
         self.maps, self.poses, self.scaled = tuple(maps), list(poses), scaled
         self.pairs = [pair for i, j in pairs for pair in ((i, j), (j, i))]
-        self.targets: dict[int, Target] = {}
         self.moves = [np.zeros((len(m.pieces), 4)) for m in maps]
+        self.drift_shares = [1.0] * len(self.maps)
+        self.misfit = np.zeros(2)  # sums of weights, and of weighted squared distances of walls, m2
         self.first = np.cumsum([0, *(len(m.pieces) for m in maps)])
 
     def anchors(self, k: int) -> Array:
@@ -94,17 +97,31 @@ class Alignment:
         for mine, theirs in self.matched(i, j):
             chosen, fields = np.flatnonzero(pieces.storey == mine), self.maps[j].storeys[theirs]
             if len(chosen) and len(fields.walls):
-                target = self.targets.setdefault(id(fields), Target(fields))
+                target = self.maps[j].targets[theirs]
                 parts.append((chosen, *measure(pieces, self.maps[i].samples, chosen, start, into, target, window)))
         return self._measurements((i, j), own, parts)
 
-    def by_surfaces(self, i: int, j: int) -> Measurements:
-        """The pieces of map i registered on the surfaces of map j."""
-        own = self.own(i)
+    def by_lines(self, i: int, j: int, sigma: float) -> Measurements:
+        """The pieces of map i registered on the walls' lines of map j."""
+        pieces, own = self.maps[i].pieces, self.own(i)
         into, start = self.poses[j].inverse() @ self.poses[i], self.relative(i, j) @ own.T
-        return self._measurements((i, j), own, [self.maps[i].piece_surfaces.measure(start, into, self.maps[j].surface)])
+        parts = []
+        for mine, theirs in self.matched(i, j):
+            chosen, fields = np.flatnonzero(pieces.storey == mine), self.maps[j].storeys[theirs]
+            if len(chosen) and len(fields.walls):
+                lines, target = self.maps[i].lines[mine], self.maps[j].lines[theirs]
+                *part, misfit = measure_lines(pieces, chosen, lines, start, into, fields, target, sigma)
+                self.misfit += misfit
+                parts.append(tuple(part))
+        return self._measurements((i, j), own, parts)
 
-    def _measurements(self, pair: Pair, own: Array, parts: Sequence[tuple[Array, Array, Array]]) -> Measurements:
+    @property
+    def rmse(self) -> float:
+        """Root mean square distance of the walls that met last, m; nan where none did."""
+        weight, square = self.misfit
+        return float(np.sqrt(square / weight)) if weight > 0 else float("nan")
+
+    def _measurements(self, pair: Pair, own: Array, parts: Sequence[tuple[Array, ...]]) -> Measurements:
         """Pieces, moves and information in a map's own frame as measurements in the common one. Information counts half: both
         maps see the same walls."""
         i, j = pair
@@ -159,14 +176,22 @@ class Alignment:
         self._turn(k, middle, np.append(alike, 0.0))
 
     def settle(self, parts: Sequence[Measurements], drifts: Sequence[Drift]) -> Settled:
-        """Move all pieces by what was measured."""
+        """Move all pieces by what was measured; and estimate by how much less than usual each map drifts (a step of expectation
+        maximisation), so that what needs no bending is not bent by noise."""
         anchors = np.concatenate([self.anchors(k) for k in range(len(self.maps))])
-        each = list(enumerate(zip((m.pieces for m in self.maps), drifts, strict=True)))
+        weaker = [Drift(s * d.shift, s * d.turn) for s, d in zip(self.drift_shares, drifts, strict=True)]
+        each = list(enumerate(zip((m.pieces for m in self.maps), weaker, strict=True)))
         sigma = [_joint_sigma(p, d, self.poses[k].scale, self.scaled) for k, (p, d) in each]
         prior = [_prior(p, d, self.scaled and k > 0) for k, (p, d) in each]
         ends = [m.pieces.joints + n for m, n in zip(self.maps, self.first, strict=False)]
         settled = settle(anchors, Joints(np.concatenate(ends), np.concatenate(sigma)), stacked(parts), np.concatenate(prior))
         self.moves = np.split(settled.moves, self.first[1:-1])
+        owner = np.repeat(np.arange(len(self.maps)), [len(e) for e in ends])
+        for k in range(len(self.maps)):
+            expected = settled.expected_strain[owner == k]
+            if np.isfinite(expected).any():
+                share = np.sqrt(np.nanmean(expected) / (4.0 if self.scaled and k else 3.0))
+                self.drift_shares[k] = float(np.clip(self.drift_shares[k] * share, LEAST_SHARE, 1.0))
         return settled
 
     def deformations(self, covariance: Array) -> tuple[Deformation, ...]:

@@ -1,9 +1,9 @@
 """Two maps bent onto each other: pieces registered by themselves, moved by as much as drift explains (method 4).
 
 First the rigid pose is mended by what all pieces say; then, in windows that shrink, each piece is registered locally and a graph
-of joints and measurements settles the moves of both maps (`graph`); last, maps with heights are held against each other by their
-surfaces. What no usual drift explains is not bent: joints give way by a few standard deviations only, and a bending that nearly
-folds space is refused.
+of joints and measurements settles the moves of both maps (`graph`); last, walls are held against each other as lines. What no
+usual drift explains is not bent: joints give way by a few standard deviations only, and a bending that nearly folds space is
+refused.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ import numpy as np
 from topomerge.fusion.bend.alignment import Alignment
 from topomerge.fusion.bend.bent_plan import bent_plan
 from topomerge.fusion.bend.deformation import Deformation
-from topomerge.fusion.bend.drift import Drift
+from topomerge.fusion.bend.drift import Drift, drifts_of
 from topomerge.fusion.bend.graph import Settled
+from topomerge.fusion.bend.lines import LINE_SIGMAS
 from topomerge.fusion.bend.local import Window
+from topomerge.fusion.bend.shift_field import ShiftField
 from topomerge.fusion.prepared import Prepared
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.refinement import storeys_at
@@ -31,9 +33,9 @@ WINDOWS = (
     Window(0.4, 0.15, float(np.radians(1.0))),
     Window(0.2, 0.1, float(np.radians(0.5))),
 )
-SURFACE_ROUNDS = 3
 LEAST_GROWTH = 0.6  # of a small area: below, space nearly folds
 STIFFER = (1.0, 0.5, 0.25)  # times the drift, tried in turn until space does not fold
+SHIFT_STEPS, MOST_MOVED = 0.5, 1.5  # m between the places at which the bending of a plan is computed, and around it
 DOUBTED = 0.25  # weight of a measurement that is voted out
 
 
@@ -46,7 +48,8 @@ class Bend:
         deformations: of a and of b, each in its own frame.
         features: what the bending itself tells of the pose: ``strain`` (misfit of the joints, in standard deviations of the usual
             drift), ``bent`` (m, root mean square of how far pieces of b moved against a), ``farthest`` (m, most of them),
-            ``doubted`` (share of the pieces that were voted out), ``pieces`` (number of those that were registered).
+            ``doubted`` (share of the pieces that were voted out), ``pieces`` (number of those that were registered), ``rmse`` (m,
+            root mean square distance of walls; nan where there are none).
         reason: why the maps stay as they are; empty where they are bent.
     """
 
@@ -74,15 +77,16 @@ class Bend:
         return tuple(self._bent(fields) for fields in b) if not self.reason else tuple(b)
 
     def _bent(self, fields: PlanFields) -> PlanFields:
-        level = fields.plan.floor_guess
-
-        def forward(places: Array) -> Array:
-            return self.relative(np.column_stack([places, np.full(len(places), level)]))[:, :2]
-
-        def back(places: Array) -> Array:
-            return self.back(np.column_stack([places, np.full(len(places), level)]))[:, :2]
-
-        return PlanFields(bent_plan(fields.plan, forward, back))
+        level, plan = fields.plan.floor_guess, fields.plan
+        span = np.array(plan.wall.shape) * plan.edge
+        rim = SHIFT_STEPS * np.ceil(MOST_MOVED / SHIFT_STEPS)
+        low = plan.origin - rim
+        nodes = np.ceil((span + 2 * rim) / SHIFT_STEPS).astype(int) + 1
+        places = low + SHIFT_STEPS * np.stack(np.meshgrid(*(np.arange(n) for n in nodes), indexing="ij"), axis=-1).reshape(-1, 2)
+        raised = np.column_stack([places, np.full(len(places), level)])
+        moved = [(move(raised)[:, :2] - places).reshape(*nodes, 2) for move in (self.relative, self.back)]
+        forward, back = (ShiftField(low, SHIFT_STEPS, shifts).apply for shifts in moved)
+        return PlanFields(bent_plan(plan, forward, back))
 
 
 def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | None = None, scaled: bool = False) -> Bend:
@@ -96,7 +100,7 @@ def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | N
     """
     if b.order < a.order:  # so that nothing depends on which comes first
         return bend(b, a, pose.inverse(), drift=drift and drift[::-1], scaled=scaled).inverse()
-    usual = drift or (a.drift, b.drift)
+    usual = drift or drifts_of((a.sensor, b.sensor))
     reason = _why_rigid(a, b, pose, usual)
     if reason:
         return Bend(pose, (_rigid(a), _rigid(b)), reason=reason)
@@ -114,7 +118,7 @@ def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | N
 
 
 def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> Settled | None:
-    """Move the pieces of all maps in windows that shrink, last by surfaces; None where no map sees another one's walls."""
+    """Move the pieces of all maps in windows that shrink, last by the lines of walls; None where no map sees walls of another."""
     settled = None
     for window in WINDOWS:
         parts = [alignment.by_plan(*pair, window) for pair in alignment.pairs]
@@ -123,15 +127,13 @@ def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> Settled | None:
         settled = alignment.settle(parts, drifts)
     for k in range(1, len(alignment.maps)):
         alignment.fold(k)
-    sliced = [any(s.plan.sliced for s in m.storeys) for m in alignment.maps]  # a slice has no planes
-    solid = [pair for pair in alignment.pairs if not (sliced[pair[0]] or sliced[pair[1]])]
-    for _ in range(SURFACE_ROUNDS if solid else 0):
-        parts = [alignment.by_surfaces(*p) if p in solid else alignment.by_plan(*p, WINDOWS[-1]) for p in alignment.pairs]
-        settled = alignment.settle(parts, drifts)
+    for sigma in LINE_SIGMAS:
+        alignment.misfit[:] = 0.0
+        settled = alignment.settle([alignment.by_lines(*pair, sigma) for pair in alignment.pairs], drifts)
     return settled
 
 
-def _why_rigid(a: Prepared, b: Prepared, pose: Sim3, drift: tuple[Drift, Drift]) -> str:
+def _why_rigid(a: Prepared, b: Prepared, pose: Sim3, drift: Sequence[Drift]) -> str:
     """Why two maps can't be bent onto each other; empty where they can."""
     if drift[0].rigid and drift[1].rigid:
         return "neither map bends"
@@ -158,4 +160,5 @@ def _features(alignment: Alignment, settled: Settled) -> dict[str, float]:
         "farthest": float(moved.max()),
         "doubted": float((settled.weights < DOUBTED).mean()) if len(settled.weights) else 0.0,
         "pieces": float(len(settled.weights)) / 2,
+        "rmse": alignment.rmse,
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from topomerge.errors import InputError
@@ -36,16 +37,23 @@ def sensor_drift(sensor: str) -> Drift:
     return Drift(float(sensors[sensor]["shift"]), float(sensors[sensor]["turn"]))
 
 
-def map_drift(map: TopometricMap | VoxelGrid) -> Drift:
-    """The drift of a map: of the sensor that its parameters name, of a drawing or a slice where it looks like one, else of an
-    unknown sensor."""
-    grid = map
-    if isinstance(map, TopometricMap):
-        grid = map.grid
-        sensor = map.parameters.get("sensor")
-        if isinstance(sensor, str) and sensor:
-            return sensor_drift(sensor)
-    assert isinstance(grid, VoxelGrid)
+def map_sensor(map: TopometricMap | VoxelGrid) -> str:
+    """The sensor of a map: the one that its parameters name; else a drawing or a slice where it looks like one, or unknown."""
+    named = map.parameters.get("sensor") if isinstance(map, TopometricMap) else None
+    if isinstance(named, str) and named:
+        return named
+    grid = map.grid if isinstance(map, TopometricMap) else map
     if extruded(grid):
-        return sensor_drift("drawing")
-    return sensor_drift("laser2d" if slices(grid) else "unknown")
+        return "raised"
+    return "laser2d" if slices(grid) else "unknown"
+
+
+def drifts_of(sensors: Sequence[str]) -> list[Drift]:
+    """The drift of each of several maps. One that was raised from lines is taken for a drawing, which does not bend, among maps
+    that were measured in space; among maps of lines alone, nobody knows which ones were measured.
+
+    Raises:
+        InputError: a sensor that is not in `drift.json`.
+    """
+    flat = all(s == "raised" for s in sensors)
+    return [sensor_drift(("unknown" if flat else "drawing") if s == "raised" else s) for s in sensors]

@@ -18,6 +18,7 @@ from topomerge.types import Array
 UNKNOWNS = 4  # of a piece: shift x, y, turn, logarithm of the scale
 CONVEX_ROUNDS = 10  # of graduated non-convexity
 OUTLIER = 9.0  # square of the misfit, in standard deviations, from which a measurement is doubted
+SAMPLED_JOINTS = 120  # joints of which it is said how sure they are
 HELD = 1e9  # information of what may not move
 
 
@@ -53,12 +54,13 @@ class Measurements:
 @dataclass(frozen=True, eq=False)
 class Settled:
     """(n, 4) moves; (n, 3, 3) covariance of shift and turn; (m,) weight 0..1 of each measurement; (j,) squared misfit of each
-    joint, in variances."""
+    joint, in variances; and (j,) what that is expected to be, as far as the moves are uncertain."""
 
     moves: Array
     covariance: Array
     weights: Array
     strain: Array
+    expected_strain: Array
 
 
 def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array) -> Settled:
@@ -86,9 +88,23 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
         chi = (misfit**2).sum(axis=1)
         relaxed = max(2 * chi.max(initial=0) / OUTLIER, 1.0) if k == 0 else max(relaxed / 1.6, 1.0)
         weights = (relaxed * OUTLIER / (chi + relaxed * OUTLIER)) ** 2
-    return Settled(
-        moves.reshape(n, UNKNOWNS), _covariance(factor, n), weights, ((jointed @ moves).reshape(-1, 4) ** 2).sum(axis=1)
-    )
+    strain = ((jointed @ moves).reshape(-1, UNKNOWNS) ** 2).sum(axis=1)
+    uncertain = strain + _joint_variance(factor, jointed)
+    return Settled(moves.reshape(n, UNKNOWNS), _covariance(factor, n), weights, strain, uncertain)
+
+
+def _joint_variance(factor: object, jointed: sparse.csr_matrix) -> Array:
+    """(j,) variance that is left to each joint, in its variances before anything was measured; nan for those beyond a sample."""
+    many = jointed.shape[0] // UNKNOWNS
+    out = np.full(many, np.nan)
+    if not many:
+        return out
+    chosen = np.arange(many)[:: max(many // SAMPLED_JOINTS, 1)]
+    rows = (UNKNOWNS * chosen[:, None] + np.arange(UNKNOWNS)).ravel()
+    sampled = jointed[rows].toarray()
+    left = np.einsum("ij,ji->i", sampled, factor.solve(np.ascontiguousarray(sampled.T)))  # type: ignore[attr-defined]
+    out[chosen] = left.reshape(-1, UNKNOWNS).sum(axis=1)
+    return out
 
 
 def _covariance(factor: object, n: int) -> Array:

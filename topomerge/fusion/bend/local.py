@@ -12,12 +12,13 @@ import numpy as np
 
 from topomerge.fusion.bend.pieces import Pieces
 from topomerge.kernels.bend import move_scores
-from topomerge.matching.plan_fields import PlanFields
+from topomerge.matching.plan_fields import DISTANCE_CAP, PlanFields, distance_to
 from topomerge.types import Array, Sim3
 
 SECTORS = 4  # of the directions that walls face; what faces none, or away from all, is compared with all walls
 FACES_ALIKE = -0.3  # cosine, below which two faces are two sides of a wall
 PIECE_POINTS = 400  # wall columns that a piece is registered by
+LEAST_TALL = 0.2  # share of the walls around a piece, below which all of them are taken
 CONTEXT = 1.0  # m around the walls of a piece that are registered with it
 MISSED = 0.05  # of a wall's likelihood, where no wall is near
 INDIFFERENT = 0.3  # likelihood that speaks neither for nor against
@@ -26,6 +27,7 @@ EVIDENCE = 0.12  # of a column of walls: neighbours are not independent
 MOVE_FLOOR = (0.02, float(np.radians(0.2)))  # m, rad: no move is known better
 SHIFT_STEP = 0.05  # m, least step of the tried shifts
 TURNS = 5  # tried ones
+DISTANCE_STEPS = np.linspace(0.0, DISTANCE_CAP, 201)  # m, to which distances are rounded
 
 
 @dataclass(frozen=True)
@@ -43,16 +45,16 @@ class Target:
     def __init__(self, fields: PlanFields) -> None:
         self.fields = fields
         self.main = np.radians(float(fields.profile.argmax()) / 2)
-        self._distances = _distances(fields, self.main)
+        self._rasters = _rasters(fields, self.main)
 
     def gain(self, sigma: float) -> tuple[Array, Array]:
         """(5, nx, ny) float32 what a wall column that faces each sector, or none, gains there; the corner of the raster, m."""
-        distance, origin = self._distances
-        likelihood = np.log(MISSED + (1 - MISSED) * np.exp(-(distance**2) / (2 * sigma**2))) - np.log(INDIFFERENT)
-        rim = (distance.shape[1] - self.fields.plan.wall.shape[0]) // 2
-        seen, free = np.pad(self.fields.kind != 0, rim), np.pad(self.fields.core, rim)
-        gain = np.where(seen | (likelihood > 0), likelihood - ON_FREE_FLOOR * free, 0.0)
-        return (EVIDENCE * gain).astype(np.float32), origin
+        likelihood = np.log(MISSED + (1 - MISSED) * np.exp(-(DISTANCE_STEPS**2) / (2 * sigma**2))) - np.log(INDIFFERENT)
+        level, origin, on_free, seen = self._rasters
+        gain = (EVIDENCE * likelihood).astype(np.float32)[level]
+        positive = gain > 0
+        gain -= on_free
+        return np.where(seen | positive, gain, np.float32(0)), origin
 
     def sectors(self, faces: Array) -> Array:
         """(n,) sector of the faces (n, 2), `SECTORS` where there is none."""
@@ -61,20 +63,21 @@ class Target:
         return np.where(np.abs(faces).max(axis=1) > 0, sector, SECTORS)
 
 
-def _distances(fields: PlanFields, main: float) -> tuple[Array, Array]:
-    """(5, nx, ny) m to walls that may face each sector, and to any."""
-    from topomerge.matching.plan_fields import DISTANCE_CAP, distance_to
-
+def _rasters(fields: PlanFields, main: float) -> tuple[Array, Array, Array, Array]:
+    """With a rim of `DISTANCE_CAP`: (5, nx, ny) uint8 steps of distance to walls that may face each sector, and to any; the
+    corner of the raster, m; (nx, ny) float32 what a wall on free floor loses; and (nx, ny) bool, was it seen?"""
     rim = int(np.ceil(DISTANCE_CAP / fields.plan.edge))
     wall, face = np.pad(fields.plan.wall, rim), np.pad(fields.face, ((rim, rim), (rim, rim), (0, 0)))
     two_sided = np.abs(face).max(axis=2) == 0
-    out = []
+    walls = []
     for k in range(SECTORS):
         angle = main + k * 2 * np.pi / SECTORS
         alike = face @ np.array([np.cos(angle), np.sin(angle)], np.float32) > FACES_ALIKE
-        out.append(distance_to(wall & (alike | two_sided), fields.plan.edge))
-    out.append(distance_to(wall, fields.plan.edge))
-    return np.stack(out), fields.plan.origin - rim * fields.plan.edge
+        walls.append(wall & (alike | two_sided))
+    distance = np.stack([distance_to(w, fields.plan.edge) for w in (*walls, wall)])
+    level = np.round(distance * ((len(DISTANCE_STEPS) - 1) / DISTANCE_CAP)).astype(np.uint8)
+    lost = (EVIDENCE * ON_FREE_FLOOR * np.pad(fields.core, rim)).astype(np.float32)
+    return level, fields.plan.origin - rim * fields.plan.edge, lost, np.pad(fields.kind != 0, rim)
 
 
 def samples(pieces: Pieces) -> tuple[Array, Array]:
@@ -89,7 +92,8 @@ def samples(pieces: Pieces) -> tuple[Array, Array]:
             & (pieces.walls >= own.min(axis=0) - CONTEXT).all(axis=1)
             & (pieces.walls <= own.max(axis=0) + CONTEXT).all(axis=1)
         )
-        chosen = np.flatnonzero(near)
+        tall = near & pieces.tall  # furniture is moved, and no wall
+        chosen = np.flatnonzero(tall if tall.sum() >= LEAST_TALL * near.sum() else near)
         if len(chosen) > PIECE_POINTS:
             chosen = np.sort(rng.permutation(chosen)[:PIECE_POINTS])
         rows.append(chosen)

@@ -30,6 +30,7 @@ class Pieces:
         room: (n,) int32, -1 where the map has no rooms.
         walls: (w, 2) m, columns of walls; of all storeys.
         faces: (w, 2) towards empty space, 0 unknown.
+        tall: (w,) bool, higher than furniture.
         owner: (w,) piece of each.
         joints: (j, 2) neighbouring pieces.
         lengths: (j,) m of walk between them.
@@ -40,6 +41,7 @@ class Pieces:
     room: Array
     walls: Array
     faces: Array
+    tall: Array
     owner: Array
     joints: Array
     lengths: Array
@@ -81,7 +83,7 @@ def _storey_pieces(fields: PlanFields, number: int, rooms: Array | None) -> Piec
     np.minimum.at(first, owner, np.arange(len(owner)))
     faces = fields.face[fields.plan.wall].astype(np.float64)
     joints, lengths = _joints(walls, owner, anchors)
-    return Pieces(anchors, np.full(many, number), room[first], walls, faces, owner, joints, lengths)
+    return Pieces(anchors, np.full(many, number), room[first], walls, faces, fields.tall, owner, joints, lengths)
 
 
 def _large_enough(walls: Array, owner: Array) -> Array:
@@ -146,16 +148,15 @@ def _stacked(parts: Sequence[Pieces]) -> Pieces:
     """The pieces of all storeys, each joined with the nearest one of the storey below."""
     if not parts:
         none = np.zeros(0, np.int64)
-        return Pieces(
-            np.zeros((0, 2)), none, none, np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros((0, 2), np.int64), np.zeros(0)
-        )
+        flat = np.zeros((0, 2))
+        return Pieces(flat, none, none, flat, flat, none.astype(bool), none, flat.astype(np.int64), np.zeros(0))
     first = np.cumsum([0, *(len(p) for p in parts)])
     joints, lengths = [p.joints + n for p, n in zip(parts, first, strict=False)], [p.lengths for p in parts]
     for k in range(1, len(parts)):
         gap, below = cKDTree(parts[k - 1].anchors).query(parts[k].anchors)
         joints.append(np.column_stack([first[k] + np.arange(len(parts[k])), first[k - 1] + below]))
         lengths.append(STOREY_LENGTH + gap)
-    rows = ("anchors", "storey", "room", "walls", "faces")
+    rows = ("anchors", "storey", "room", "walls", "faces", "tall")
     whole = {name: np.concatenate([getattr(p, name) for p in parts]) for name in rows}
     owner = np.concatenate([p.owner + n for p, n in zip(parts, first, strict=False)])
     return Pieces(**whole, owner=owner, joints=np.concatenate(joints), lengths=np.concatenate(lengths))
