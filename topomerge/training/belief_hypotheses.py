@@ -15,14 +15,12 @@ import numpy as np
 from topomerge.datasets.core.derived import derive, read_derived
 from topomerge.datasets.pairs.grid_drawings import build_drawings
 from topomerge.datasets.pairs.grid_pairs import GridPair, GridRecipe, build_grids, load_grids
+from topomerge.fusion.bend.judged import judged_as_bent
 from topomerge.fusion.judge import Judge
-from topomerge.fusion.prepared import registration_order as order
+from topomerge.fusion.prepared import prepare
 from topomerge.fusion.scale import search_scaled
 from topomerge.fusion.search import search
-from topomerge.fusion.storey_plan import plans
 from topomerge.fusion.verify import rank
-from topomerge.fusion.winner_features import winner_features
-from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.poses import wrapped
 from topomerge.metrics import pose_right
 from topomerge.training.task_settings import MergeBelief
@@ -83,16 +81,22 @@ def together(first: GridPair, second: GridPair) -> GridPair:
 
 
 def judged(pair: GridPair, hypotheses: int, inspected: int) -> list[dict[str, Any]]:
-    """Hypotheses with what they are judged by and their errors; the first ones with what only the best one is asked."""
-    a, b = ([PlanFields(p) for p in plans(g, f)] for g, f in ((pair.a, pair.free[0]), (pair.b, pair.free[1])))
-    find = search_scaled if pair.about.get("scaled") else search
-    turn = order(pair.b) < order(pair.a)
-    first, second = (b, a) if turn else (a, b)
-    judge = Judge(first, second)
+    """Hypotheses with what they are judged by and their errors; the first ones with what the maps show once they are bent
+    (``bent``), which only the best one is asked."""
+    first, second = (prepare(g, f) for g, f in zip((pair.a, pair.b), pair.free, strict=True))
+    scaled = bool(pair.about.get("scaled"))
+    turn = second.order < first.order
+    if turn:
+        first, second = second, first
     rows = []
-    for k, h in enumerate(rank(find(first, second), judge)[:hypotheses]):
+    poses = (search_scaled if scaled else search)(first.storeys, second.storeys)
+    for k, h in enumerate(rank(poses, Judge(first.storeys, second.storeys))[:hypotheses]):
         pose = h.transform.inverse() if turn else h.transform
-        closely = {**winner_features(judge, h.transform), "pose": h.transform.matrix.tolist()} if k < inspected else {}
+        closely: dict[str, Any] = {}
+        if k < inspected:
+            bent = judged_as_bent(first, second, h.transform, scaled)[1]
+            closely = {"bent": {**h.features, **bent, "rigid_conflict_share": h.features["conflict_share"]}}
+            closely["pose"] = h.transform.matrix.tolist()
         rows.append({**h.features, **closely, "err": error(pose, pair)})
     return rows
 

@@ -16,7 +16,17 @@ import numpy as np
 from scipy.optimize import minimize
 
 from topomerge.errors import InputError
-from topomerge.fusion.verify import LEAD_VECTOR, POSE_VECTOR, WINNER_VECTOR, lead, vector, winner_vector
+from topomerge.fusion.verify import (
+    BEND_VECTOR,
+    LEAD_VECTOR,
+    POSE_VECTOR,
+    WINNER_VECTOR,
+    bend_vector,
+    lead,
+    model,
+    vector,
+    winner_vector,
+)
 from topomerge.training.belief_hypotheses import belief_rows, fair, kind_of, right
 from topomerge.training.belief_lookalikes import lookalike_rows, lookalike_scores
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
@@ -25,12 +35,13 @@ from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array
 
 BENT = (1.5, 5.0)  # m, degrees: a map that is bent by drift fits in no one pose; neither right nor wrong
-BELIEF_FEATURES = [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR]
+BENT_FEATURES = (*POSE_VECTOR, *WINNER_VECTOR, *BEND_VECTOR)  # of the best hypothesis, once the maps are bent
+BELIEF_FEATURES = [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR, *BEND_VECTOR]
 SIGN = {
     "ratio": 1, "walls": 1, "conflict": -1, "worst": -1, "free": 1, "opposed": -1, "lift": 1, "met": 1, "missed": -1, "share": 1,
     "level": -1, "ceilings": -1, "margin": 1, "ahead": 1, "tall": -1, "crossing": 1, "worst_ratio": 1, "squares": 1,
     "bad_squares": -1, "in_place": 1, "out_of_place": -1, "kept": 1, "moved_walls": -1, "hanging": 1, "fallen": -1, "held": 1,
-    "alone": 1,
+    "alone": 1, "odds": 1, "strain": -1, "bent": -1, "doubted": -1,
 }  # fmt: skip
 
 
@@ -114,13 +125,18 @@ class Table:
 def tabled(rows: list[dict[str, Any]]) -> Table:
     """Hypotheses as arrays."""
     hypotheses = [(i, h) for i, row in enumerate(rows) for h in row["hyps"]]
-    near = [winner_vector(h) if "pieces" in h else np.full(len(WINNER_VECTOR), np.nan) for _, h in hypotheses]
+    near = [_closely(h["bent"]) if "bent" in h else np.full(len(BENT_FEATURES), np.nan) for _, h in hypotheses]
     names = [f"{int('lookalike' in row)}{row['building'].split(' + ')[0]}" for row in rows]  # ordinary ones first
     y = np.array([label(h, rows[i]) for i, h in hypotheses])
     x = np.array([vector(h) for _, h in hypotheses])
     trains = np.array([not row.get("judged_only") for row in rows], bool)
     owner, building = np.array([i for i, _ in hypotheses]), np.unique(names, return_inverse=True)[1]
     return Table(rows, owner, x, y, np.array(near), building, trains, len({name for name in names if name[0] == "0"}))
+
+
+def _closely(bent: dict[str, float]) -> Array:
+    """What the second model sees of a hypothesis, but for how far it is ahead."""
+    return np.concatenate([vector(bent), winner_vector(bent), bend_vector(bent)])
 
 
 def best(t: Table, scores: Array, pose: dict[str, Any], i: int, wrong: bool = False) -> tuple[int, Array, float] | None:
@@ -131,7 +147,8 @@ def best(t: Table, scores: Array, pose: dict[str, Any], i: int, wrong: bool = Fa
     if not len(rows) or np.isnan(t.near[rows[0]]).any():
         return None
     leads = lead(scores[rows], t.x[rows], np.array(pose["weight"]), np.array(pose["scale"]))
-    return int(rows[0]), np.concatenate([t.x[rows[0]], leads[:3], t.near[rows[0]]]), leads[3]
+    near, whole = t.near[rows[0]], len(POSE_VECTOR)
+    return int(rows[0]), np.concatenate([near[:whole], leads[:3], near[whole:]]), leads[3]
 
 
 def folds(groups: Array, count: int, ordinary: int) -> Iterator[tuple[Array, Array]]:
@@ -155,7 +172,10 @@ def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) ->
     if len(np.unique(t.building)) < 2 or len(np.unique(t.y[sure] > 0)) < 2:
         raise InputError("data.sets: too few pairs: right and wrong hypotheses of two buildings are needed")
     pose, scores = fitted(t.x[sure], t.y[sure] > 0, POSE_VECTOR, settings.pose_strength), np.zeros(len(t.y))
-    for train, test in folds(t.building[t.owner], settings.folds, t.ordinary):
+    if settings.refit == "bending":
+        pose = model()["flat" if flat else "solid"]["pose"]
+        scores = logits(pose, t.x)
+    for train, test in folds(t.building[t.owner], settings.folds, t.ordinary) if settings.refit == "all" else ():
         train = train[sure[train]]
         scores[test] = logits(fitted(t.x[train], t.y[train] > 0, POSE_VECTOR, settings.pose_strength), t.x[test])
     first = [(i, b) for i in range(len(t.rows)) if (b := best(t, scores, pose, i)) is not None]
@@ -171,13 +191,32 @@ def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) ->
     believed = np.zeros(len(y))
     for train, test in folds(building, settings.folds, t.ordinary):
         train = train[certain[train]]
-        model = fitted(x[train], y[train] > 0, BELIEF_FEATURES, settings.winner_strength, weight[train])
-        believed[test] = 1 / (1 + np.exp(-logits(model, x[test])))
-    winner = fitted(x[certain], y[certain] > 0, BELIEF_FEATURES, settings.winner_strength, weight[certain])
+        left_out = _winner(x[train], y[train] > 0, weight[train], flat, settings)
+        believed[test] = 1 / (1 + np.exp(-logits(left_out, x[test])))
+    winner = _winner(x[certain], y[certain] > 0, weight[certain], flat, settings)
     same_kind = np.array([is_flat(t.rows[i]) == flat for i, _ in first], bool)
     scored = [t.rows[i] for (i, _), so in zip(first, same_kind, strict=True) if so]
-    model = {"pairs": int(sum(t.trains[i] for i, _ in first)), "pose": pose, "winner": winner}
-    return model, (scored, np.minimum(believed[: len(first)], share)[same_kind], y[: len(first)][same_kind])
+    fit_of = {"pairs": int(sum(t.trains[i] for i, _ in first)), "pose": pose, "winner": winner}
+    return fit_of, (scored, np.minimum(believed[: len(first)], share)[same_kind], y[: len(first)][same_kind])
+
+
+def _winner(x: Array, y: Array, weight: Array, flat: bool, settings: MergeBelief) -> dict[str, Any]:
+    """The model of the best hypothesis: all of it, or (`refit` "bending") the one that is there, with what bending adds and a new
+    scale of its log odds: five numbers, for which a few hundred pairs are enough."""
+    if settings.refit == "all":
+        return fitted(x, y, BELIEF_FEATURES, settings.winner_strength, weight)
+    whole = len(BELIEF_FEATURES) - len(BEND_VECTOR)
+    before = model()["flat" if flat else "solid"]["winner"]
+    before = {**before, **{k: before[k][:whole] for k in ("mean", "scale", "weight")}}
+    odds = logits(before, x[:, :whole])
+    added = fitted(np.column_stack([odds, x[:, whole:]]), y, ["odds", *BEND_VECTOR], settings.winner_strength, weight)
+    slope = added["weight"][0] / added["scale"][0]
+    return {
+        "mean": [*before["mean"], *added["mean"][1:]],
+        "scale": [*before["scale"], *added["scale"][1:]],
+        "weight": [*(slope * np.array(before["weight"])).tolist(), *added["weight"][1:]],
+        "bias": float(slope * (before["bias"] - added["mean"][0]) + added["bias"]),
+    }
 
 
 def belief_scores(rows: Sequence[dict[str, Any]], believed: Array, true: Array, threshold: float) -> dict[str, float]:

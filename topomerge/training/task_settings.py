@@ -144,6 +144,7 @@ class MergeBelief(TaskSettings):
     strict: weight of a wrong hypothesis where a slice or a drawing hides what tells storeys apart: rather refused than wrong.
     folds: of buildings, for the scores.
     threshold: probability from which on a merge is believed.
+    refit: all, or bending (the model that is there, with what the bending of maps adds to it).
     lookalikes: none, judged (left-out models are tried on them) or fitted (they train, too; `belief_lookalikes`).
     alike, alike_heldout: the look-alikes to fit to and to judge on.
     """
@@ -160,6 +161,7 @@ class MergeBelief(TaskSettings):
     strict: float = 1.25
     folds: int = 8
     threshold: float = 0.8
+    refit: str = "all"
     lookalikes: str = "none"
     alike: LookalikeRecipe = field(default_factory=LookalikeRecipe)
     alike_heldout: LookalikeRecipe = field(default_factory=LookalikeRecipe)
@@ -214,6 +216,8 @@ def check_task(settings: TaskSettings) -> None:
         raise InputError(f"threshold must be 0 to 1, not {settings.threshold}")  # type: ignore[attr-defined]
     if isinstance(settings, MergeBelief) and settings.lookalikes not in LOOKALIKES_TAKEN:
         raise InputError(f"lookalikes must be {', '.join(LOOKALIKES_TAKEN)}, not {settings.lookalikes!r}")
+    if isinstance(settings, MergeBelief) and settings.refit not in ("all", "bending"):
+        raise InputError(f"refit must be all or bending, not {settings.refit!r}")
     if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
         raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
     if isinstance(settings, PlanSegmentation):
