@@ -36,11 +36,11 @@ class Registration:
         probability: that it is right, calibrated on simulated pairs; 0 without a hypothesis.
         accepted: is the probability above the threshold of the calibration?
         features: what it was judged by (`Judge`, `winner_features`), with ``margin`` and ``rmse`` (m).
-        bend: how the maps are bent onto each other under the transform; None where a rigid pose was asked for.
         alternatives: the hypotheses, best first, their scores the log odds of each seen by itself (`verify.rank`); the first one
             is the best before its fine registration.
         reason: in words.
         seconds: step -> s.
+        bend: how the maps are bent onto each other under the transform; None where a rigid pose was asked for.
     """
 
     transform: Sim3 | None
@@ -48,9 +48,9 @@ class Registration:
     accepted: bool
     features: dict[str, float] = field(default_factory=dict)
     alternatives: tuple[PoseHypothesis, ...] = ()
-    bend: Bend | None = None
     reason: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
+    bend: Bend | None = None
 
 
 def register(

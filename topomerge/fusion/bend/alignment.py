@@ -158,8 +158,14 @@ class Alignment:
         pose = replace(turned, translation=(float(at[0]), float(at[1]), 0.0)) @ self.poses[k]
         self.poses[k] = replace(pose, translation=(*pose.translation[:2], self.poses[k].translation[2]))
 
-    def fold(self, k: int) -> None:
-        """Let the pose of a map take over what its pieces have moved alike."""
+    def fold(self) -> None:
+        """Let the poses of the maps take over what their pieces have moved alike; the first map stays where it is."""
+        for k in range(len(self.maps)):
+            self._fold(k)
+        back = self.poses[0].inverse()
+        self.poses = [back @ pose for pose in self.poses]
+
+    def _fold(self, k: int) -> None:
         pieces, moves = self.maps[k].pieces, self.moves[k]
         if not len(pieces):
             return

@@ -48,7 +48,7 @@ class Bend:
         deformations: of a and of b, each in its own frame.
         features: what the bending itself tells of the pose: ``strain`` (misfit of the joints, in standard deviations of the usual
             drift), ``bent`` (m, root mean square of how far pieces of b moved against a), ``farthest`` (m, most of them),
-            ``doubted`` (share of the pieces that were voted out), ``pieces`` (number of those that were registered), ``rmse`` (m,
+            ``doubted`` (share of the pieces that were voted out), ``bent_pieces`` (number of those that were registered), ``rmse`` (m,
             root mean square distance of walls; nan where there are none).
         reason: why the maps stay as they are; empty where they are bent.
     """
@@ -125,8 +125,7 @@ def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> Settled | None:
         if not sum(len(p.piece) for p in parts):
             return None
         settled = alignment.settle(parts, drifts)
-    for k in range(1, len(alignment.maps)):
-        alignment.fold(k)
+    alignment.fold()
     for sigma in LINE_SIGMAS:
         alignment.misfit[:] = 0.0
         settled = alignment.settle([alignment.by_lines(*pair, sigma) for pair in alignment.pairs], drifts)
@@ -159,6 +158,6 @@ def _features(alignment: Alignment, settled: Settled) -> dict[str, float]:
         "bent": float(np.sqrt((moved**2).mean())),
         "farthest": float(moved.max()),
         "doubted": float((settled.weights < DOUBTED).mean()) if len(settled.weights) else 0.0,
-        "pieces": float(len(settled.weights)) / 2,
+        "bent_pieces": float(len(settled.weights)) / 2,
         "rmse": alignment.rmse,
     }

@@ -88,6 +88,7 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
         chi = (misfit**2).sum(axis=1)
         relaxed = max(2 * chi.max(initial=0) / OUTLIER, 1.0) if k == 0 else max(relaxed / 1.6, 1.0)
         weights = (relaxed * OUTLIER / (chi + relaxed * OUTLIER)) ** 2
+    moves = np.where(prior.ravel() > 0, moves, 0.0)
     strain = ((jointed @ moves).reshape(-1, UNKNOWNS) ** 2).sum(axis=1)
     uncertain = strain + _joint_variance(factor, jointed)
     return Settled(moves.reshape(n, UNKNOWNS), _covariance(factor, n), weights, strain, uncertain)

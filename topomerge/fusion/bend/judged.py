@@ -8,7 +8,7 @@ from topomerge.fusion.prepared import Prepared
 from topomerge.fusion.winner_features import winner_features
 from topomerge.types import Sim3
 
-RIGID_FEATURES = {"strain": 0.0, "bent": 0.0, "farthest": 0.0, "doubted": 0.0, "pieces": 0.0, "rmse": float("nan")}
+RIGID_FEATURES = {"strain": 0.0, "bent": 0.0, "farthest": 0.0, "doubted": 0.0, "bent_pieces": 0.0, "rmse": float("nan")}
 
 
 def judged_as_bent(a: Prepared, b: Prepared, pose: Sim3, scaled: bool) -> tuple[Bend, dict[str, float]]:
