@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -15,11 +15,13 @@ from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, solve
+from topomerge.fusion.bend.bend import NEITHER_BENDS
+from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import fuse, rooms_in_common
 from topomerge.fusion.inputs import check_pair, check_poses, check_scale, checked_threshold, pair_warnings
 from topomerge.fusion.prepared import registration_order
-from topomerge.fusion.registration import register
+from topomerge.fusion.registration import Registration, register
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
 from topomerge.fusion.thesis.fpfh import check_open3d
 from topomerge.fusion.thesis.room_poses import room_poses
@@ -83,7 +85,9 @@ def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> Merge
     threshold = checked_threshold(settings.threshold)
     clock = _Clock()
     hypotheses = _room_hypotheses(a, b, settings, clock)
-    registration = register(a, b, scale=settings.scale, proposed=hypotheses, searched=settings.poses == "search")
+    registration = register(
+        a, b, scale=settings.scale, proposed=hypotheses, searched=settings.poses == "search", rigid=settings.rigid
+    )
     believed = registration.transform is not None and registration.probability >= threshold
     result = MergeResult(
         "merged" if believed else "abstained",
@@ -91,15 +95,22 @@ def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> Merge
         why(registration, threshold, settings.force),
         maps=(a, b),
         registration=registration,
-        warnings=tuple(pair_warnings(a, b, settings.scale)),
+        warnings=(*pair_warnings(a, b, settings.scale), *_not_bent(registration)),
         descriptor=descriptor_name(settings.embedder),
     )
     pose = registration.transform
     if pose is None or not (believed or settings.force):
         return replace(result, seconds=clock.all())
-    joined = fuse((a, b), [(0, Sim3()), (1, pose)])
-    matches = tuple(_room_matches((a, b), (0, 1), pose, registration.probability))
-    return replace(result, transforms={1: pose}, matches=matches, map=joined, seconds=clock.all())
+    bends = {} if registration.bend is None else {k: d for k, d in enumerate(registration.bend.deformations) if len(d)}
+    joined = fuse((a, b), [(0, Sim3()), (1, pose)], bends)
+    matches = tuple(_room_matches((a, b), (0, 1), pose, registration.probability, bends))
+    return replace(result, transforms={1: pose}, bends=bends, matches=matches, map=joined, seconds=clock.all())
+
+
+def _not_bent(registration: Registration) -> Iterator[str]:
+    """Why maps that could have been bent were not."""
+    if registration.bend is not None and registration.bend.reason not in ("", NEITHER_BENDS):
+        yield f"the maps were not bent: {registration.bend.reason}"
 
 
 def _merge_several(maps: Sequence[TopometricMap], settings: _Settings) -> MergeResult:
@@ -107,7 +118,7 @@ def _merge_several(maps: Sequence[TopometricMap], settings: _Settings) -> MergeR
     began = time.perf_counter()
     registrations: RegistrationsByPair = {}
     descriptor = None if settings.embedder == DEFAULT else settings.embedder  # the default only says which pairs to try first
-    atlas_settings = AtlasSettings(settings.scale, settings.threshold, descriptor)
+    atlas_settings = AtlasSettings(settings.scale, settings.threshold, descriptor, settings.rigid)
     atlas = solve(maps, atlas_settings, registrations)
     reason, status = atlas.words(), "merged" if _with_first(atlas)[1:] else "abstained"
     if status == "abstained" and atlas.status != "abstained":
@@ -120,13 +131,14 @@ def _merge_several(maps: Sequence[TopometricMap], settings: _Settings) -> MergeR
     for n, k in enumerate(members):
         for m in members[n + 1 :]:
             pose = atlas.transforms[k].inverse() @ atlas.transforms[m]
-            matches += _room_matches(maps, (k, m), pose, atlas.probability(component))
+            matches += _room_matches(maps, (k, m), pose, atlas.probability(component), atlas.bends)
     joined = atlas.joined(component) if len(members) > 1 else None
     return MergeResult(
         status,
         atlas.probability(component),
         reason,
         transforms={k: atlas.transforms[k] for k in members[1:]},
+        bends={k: atlas.bends[k] for k in members if k in atlas.bends},
         matches=tuple(matches),
         seconds={**dict.fromkeys(MERGE_STEPS, 0.0), "fuse": time.perf_counter() - began},
         map=joined,
@@ -143,11 +155,11 @@ def _with_first(atlas: AtlasResult) -> tuple[int, ...]:
 
 
 def _room_matches(
-    maps: Sequence[TopometricMap], pair: tuple[int, int], pose: Sim3, merge_probability: float
+    maps: Sequence[TopometricMap], pair: tuple[int, int], pose: Sim3, merge_probability: float, bends: Mapping[int, Deformation]
 ) -> Iterator[RoomMatch]:
     """Rooms of two maps that lie in each other; a match is as probable as the merge times `match_probability`."""
     a, b = maps[pair[0]], maps[pair[1]]
-    rooms, shared_floor = rooms_in_common(a, b, pose)
+    rooms, shared_floor = rooms_in_common(a, b, pose, (bends.get(pair[0]), bends.get(pair[1])))
     probabilities = merge_probability * match_probability(a, b, rooms, shared_floor)
     for (i, j), p in zip(rooms.tolist(), probabilities.tolist(), strict=True):
         yield RoomMatch(pair, (i, j), p)

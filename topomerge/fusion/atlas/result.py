@@ -8,6 +8,7 @@ from pathlib import Path
 
 from topomerge.fusion.atlas.assembly import Link
 from topomerge.fusion.atlas.maps import Maps
+from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.fuse import fuse
 from topomerge.types import Sim3, TopometricMap
 
@@ -24,6 +25,7 @@ class AtlasResult:
         transforms: k -> T_0k into the first map of its component; of all maps, the first ones' is the identity.
         links: hypotheses that hold the components together.
         rejected: hypotheses that were believed by themselves and thrown out, as others contradict them.
+        bends: k -> how map k is bent in its own frame, before it is posed; rigid ones are left out.
         residuals: k -> root mean square, m, by which the measured poses of map k miss the solution.
         registered: pairs that were searched in each other, of all.
         seconds: of the whole.
@@ -37,6 +39,7 @@ class AtlasResult:
     links: tuple[Link, ...] = ()
     rejected: tuple[Link, ...] = ()
     residuals: dict[int, float] = field(default_factory=dict)
+    bends: dict[int, Deformation] = field(default_factory=dict)
     registered: tuple[int, int] = (0, 0)
     seconds: float = 0.0
     warnings: tuple[str, ...] = ()
@@ -68,7 +71,7 @@ class AtlasResult:
         Raises:
             InputError: more maps together than provenance can tell apart.
         """
-        return fuse(self.maps, [(k, self.transforms[k]) for k in self.components[component]])
+        return fuse(self.maps, [(k, self.transforms[k]) for k in self.components[component]], self.bends)
 
     def words(self) -> str:
         """What came out, in a sentence or two."""

@@ -20,6 +20,8 @@ from topomerge.fusion.atlas.maps import Maps, map_key
 from topomerge.fusion.atlas.pairs import Checks, hypotheses, promise
 from topomerge.fusion.atlas.pose_graph import residual
 from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.bend.bend import bend_together
+from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.inputs import check_cells, check_scale, check_units, checked_threshold, without_rooms
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
@@ -37,6 +39,7 @@ class AtlasSettings:
     scale: str = "fixed"
     threshold: float | None = None
     embedder: str | Descriptor | None = None
+    rigid: bool = False
 
 
 def atlas(
@@ -45,6 +48,7 @@ def atlas(
     scale: str = "fixed",
     threshold: float | None = None,
     embedder: str | Descriptor | None = None,
+    rigid: bool = False,
     registrations: RegistrationsByPair | None = None,
 ) -> AtlasResult:
     """Bring maps together, as many as belong together.
@@ -55,6 +59,7 @@ def atlas(
         threshold: probability from which a link is believed; that of the calibration if None.
         embedder: "learned", "engineered", "shapedna", "feather", the folder of a trained one, or a callable map -> (R, D):
             matched rooms propose poses, too. None: the learned descriptors only say which pairs to try first.
+        rigid: leave the maps as they are? Else all that belong together are bent together, each by as much as its sensor drifts.
         registrations: made before, by the keys of both maps; those made now are added.
 
     Raises:
@@ -62,7 +67,7 @@ def atlas(
     """
     if len(maps) < 2:
         raise InputError(f"an atlas needs two or more maps, not {len(maps)}; give another one")
-    return solve(maps, AtlasSettings(scale, threshold, embedder), registrations)
+    return solve(maps, AtlasSettings(scale, threshold, embedder, rigid), registrations)
 
 
 def solve(
@@ -90,7 +95,7 @@ def solve(
     registrations = {} if registrations is None else registrations
     explorer = _Explorer(ordered, [map_keys[k] for k in order], settings.scale, threshold, registrations)
     assembly = explorer.explored()
-    result = _result(assembly, explorer, names, order)
+    result = _result(assembly, explorer, names, order, settings.rigid)
     return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=tuple(warnings))
 
 
@@ -173,12 +178,18 @@ class _Explorer:
         return self.registrations[pair]
 
 
-def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order: Sequence[int]) -> AtlasResult:
+def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order: Sequence[int], rigid: bool) -> AtlasResult:
     """All by the places of the maps as they were given, in the frames of the first ones."""
     transforms: dict[int, Sim3] = {}
     residuals: dict[int, float] = {}
+    bends: dict[int, Deformation] = {}
     for component in assembly.components:
         poses, edges = explorer.assembler.settled(component, assembly.links, fine=True)
+        if not rigid and len(component) > 1:
+            pairs = sorted({link.maps for link in assembly.links if link.maps[0] in component})
+            prepared = {k: explorer.maps.prepared(k) for k in component}
+            poses, deformations = bend_together(prepared, poses, pairs, explorer.scale == "free")
+            bends |= {order[k]: d for k, d in deformations.items()}
         first = min(component, key=lambda k: order[k])
         back = poses[first].inverse()
         for k in component:
@@ -195,6 +206,7 @@ def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order
         _reordered(assembly.links, order),
         _reordered(assembly.rejected, order),
         residuals,
+        bends,
         (len(explorer.tried), len(names) * (len(names) - 1) // 2),
     )
 

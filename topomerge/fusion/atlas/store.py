@@ -88,7 +88,7 @@ def read_atlas(folder: str | Path) -> Stored:
             written = f"is of format {listing['format']!r}, this topomerge reads format {ATLAS_FORMAT}"
             raise InputError(f"{path}: {written}; update topomerge")
         entries = tuple(Entry(m["name"], m["key"], m["source"], int(m["rooms"]), int(m["storeys"])) for m in listing["maps"])
-        settings = {name: listing["settings"][name] for name in asdict(AtlasSettings())}
+        settings = {name: listing["settings"].get(name, usual) for name, usual in asdict(AtlasSettings()).items()}
         if any(Path(e.file).parent != Path("maps") or not isinstance(e.key, str) for e in entries):
             raise ValueError("a map lies elsewhere")
         stored = Stored(folder, entries, settings, listing)

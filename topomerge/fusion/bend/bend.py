@@ -8,7 +8,7 @@ refused.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -36,6 +36,7 @@ WINDOWS = (
 LEAST_GROWTH = 0.6  # of a small area: below, space nearly folds
 STIFFER = (1.0, 0.5, 0.25)  # times the drift, tried in turn until space does not fold
 SHIFT_STEPS, MOST_MOVED = 0.5, 1.5  # m between the places at which the bending of a plan is computed, and around it
+NEITHER_BENDS = "neither map bends"
 DOUBTED = 0.25  # weight of a measurement that is voted out
 
 
@@ -48,8 +49,8 @@ class Bend:
         deformations: of a and of b, each in its own frame.
         features: what the bending itself tells of the pose: ``strain`` (misfit of the joints, in standard deviations of the usual
             drift), ``bent`` (m, root mean square of how far pieces of b moved against a), ``farthest`` (m, most of them),
-            ``doubted`` (share of the pieces that were voted out), ``bent_pieces`` (number of those that were registered), ``rmse`` (m,
-            root mean square distance of walls; nan where there are none).
+            ``doubted`` (share of the pieces that were voted out), ``bent_pieces`` (number of those that were registered),
+            ``rmse`` (m, root mean square distance of walls; nan where there are none).
         reason: why the maps stay as they are; empty where they are bent.
     """
 
@@ -117,6 +118,38 @@ def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | N
     return Bend(pose, (_rigid(a), _rigid(b)), reason="bending would fold space")
 
 
+def bend_together(
+    maps: Mapping[int, Prepared], poses: Mapping[int, Sim3], pairs: Sequence[tuple[int, int]], scaled: bool = False
+) -> tuple[dict[int, Sim3], dict[int, Deformation]]:
+    """Bend maps that lie in one frame, all together: what two of them say moves the others, too, and cycles close.
+
+    Args:
+        poses: of the maps in the common frame.
+        pairs: maps that see each other.
+        scaled: are the scales of all but the first map free?
+
+    Returns:
+        The poses of the bent maps, the first one as it was, and the deformations of those that are bent.
+    """
+    names = sorted(maps)
+    place = {name: k for k, name in enumerate(names)}
+    first = poses[names[0]]
+    usual = drifts_of([maps[name].sensor for name in names])
+    if all(d.rigid for d in usual):
+        return dict(poses), {}
+    for share in STIFFER:
+        start = [first.inverse() @ poses[name] for name in names]
+        alignment = Alignment([maps[n] for n in names], start, [(place[i], place[j]) for i, j in pairs], scaled)
+        settled = settle_all(alignment, [Drift(share * d.shift, share * d.turn) for d in usual])
+        if settled is None:
+            return dict(poses), {}
+        bent = alignment.deformations(settled.covariance)
+        if min(d.least_growth for d in bent) >= LEAST_GROWTH:
+            moved = {name: first @ alignment.poses[place[name]] for name in names}
+            return moved, {name: bent[k] for name, k in place.items() if len(bent[k]) and not usual[k].rigid}
+    return dict(poses), {}
+
+
 def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> Settled | None:
     """Move the pieces of all maps in windows that shrink, last by the lines of walls; None where no map sees walls of another."""
     settled = None
@@ -135,7 +168,7 @@ def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> Settled | None:
 def _why_rigid(a: Prepared, b: Prepared, pose: Sim3, drift: Sequence[Drift]) -> str:
     """Why two maps can't be bent onto each other; empty where they can."""
     if drift[0].rigid and drift[1].rigid:
-        return "neither map bends"
+        return NEITHER_BENDS
     if not storeys_at(a.storeys, b.storeys, pose.translation[2], pose.scale):
         return "no storeys lie on one level"
     if min(len(a.pieces), len(b.pieces)) == 0:
