@@ -9,6 +9,7 @@ from tests.fusion.plans_of import MOVE, grid_of, off, office, part
 from tests.scenes import Scene
 from topomerge.fusion.registration import register
 from topomerge.fusion.verify import (
+    BEND_VECTOR,
     LEAD_VECTOR,
     MARGIN_CAP,
     POSE_VECTOR,
@@ -31,7 +32,7 @@ def points():
 
 def test_the_calibration_fits_its_features():
     found = model()
-    assert found["names"] == [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR]
+    assert found["names"] == [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR, *BEND_VECTOR]
     for kind in ("solid", "flat"):
         winner, pose = (found[kind][which]["weight"] for which in ("winner", "pose"))
         assert len(winner) == len(found["names"]) and len(pose) == len(POSE_VECTOR)
@@ -118,6 +119,7 @@ def test_the_lead_over_rivals_by_hand():
 def test_the_probability_is_at_most_the_share_of_the_odds():
     """A second hypothesis that is as good halves what the first may be believed; the rest share as their odds do."""
     quiet = {"tall_conflict": 0.0, "crossing": 30.0, "worst_ratio": 0.95, "squares": 60.0, "bad_squares": 0.0, "in_place": 20.0}
+    quiet |= {"strain": 0.1, "bent": 0.02, "doubted": 0.0}
     quiet |= {"pieces": 20.0, "by_chance": 1.0, "moved_walls": 0.0, "hanging": 9.0, "hanging_met": 9.0}
     good = {**FEATURES, "conflict_share": 0.0, "worst_conflict": 0.0, "conflict": 0.0, "met": 0.95, "walls": 80.0, "free": 400.0}
     first, second, third = (PoseHypothesis(Sim3(), score, features=good) for score in (9.0, 9.0, 8.0))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -23,43 +24,34 @@ Map = TopometricMap | VoxelGrid
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A map with what is drawn from it.
+    """What is drawn from a map; the map itself may be loaded again when it is needed.
 
     Args:
-        map: topometric, or occupied cells.
+        load: gives the map, topometric or occupied cells.
         storeys: their plans, lowest first.
         order: larger maps come first; among equal ones the order is arbitrary, but always the same.
+        middle: (3,) of its cells, m.
+        sensor: what it was measured by, as far as one can say.
+        make_surface: its points and normals, for the fine registration.
     """
 
-    map: Map
+    load: Callable[[], Map]
     storeys: tuple[PlanFields, ...]
     order: tuple[int, str]
+    middle: Array
+    sensor: str
+    make_surface: Callable[[], Surface]
 
     @property
-    def grid(self) -> VoxelGrid:
-        """Its occupied cells."""
-        return grid_of(self.map)
-
-    @cached_property
-    def middle(self) -> Array:
-        """(3,) of its cells, m."""
-        middle: Array = cell_middles(self.grid).mean(axis=0)
-        return middle
-
-    @cached_property
     def surface(self) -> Surface:
-        """Its points and normals, for the fine registration."""
-        return surface(self.grid)
-
-    @cached_property
-    def sensor(self) -> str:
-        """What it was measured by, as far as one can say."""
-        return map_sensor(self.map)
+        """Its points and normals."""
+        return self.make_surface()
 
     @cached_property
     def pieces(self) -> Pieces:
         """The pieces that it is bent by."""
-        return pieces_of(self.storeys, self.map if isinstance(self.map, TopometricMap) else None)
+        map = self.load()
+        return pieces_of(self.storeys, map if isinstance(map, TopometricMap) else None)
 
     @cached_property
     def samples(self) -> tuple[Array, Array]:
@@ -69,7 +61,7 @@ class Prepared:
     @cached_property
     def lines(self) -> tuple[WallLines, ...]:
         """The walls of each storey as lines."""
-        middles = cell_middles(self.grid)
+        middles = cell_middles(grid_of(self.load()))
         return tuple(wall_lines(s, middles) for s in self.storeys)
 
     @cached_property
@@ -87,7 +79,10 @@ def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
     Raises:
         InputError: an empty map.
     """
-    return Prepared(map, tuple(PlanFields(p) for p in plans(map, free)), registration_order(map))
+    storeys = tuple(PlanFields(p) for p in plans(map, free))
+    grid = grid_of(map)
+    make_surface = cache(lambda: surface(grid))
+    return Prepared(lambda: map, storeys, registration_order(map), cell_middles(grid).mean(axis=0), map_sensor(map), make_surface)
 
 
 def grid_of(map: Map) -> VoxelGrid:

@@ -53,7 +53,7 @@ class Maps:
     def prepared(self, k: int) -> Prepared:
         """Plans, for registration."""
         if k not in self._prepared:
-            self._prepared[k] = replace(prepare(self[k]), surface=lambda: self.surface(k))
+            self._prepared[k] = replace(prepare(self[k]), load=lambda: self[k], make_surface=lambda: self.surface(k))
         return self._prepared[k]
 
     def surface(self, k: int) -> Surface:
