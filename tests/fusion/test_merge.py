@@ -79,7 +79,6 @@ def test_the_joined_map_has_the_rooms_of_the_whole(merged, points):
     assert merged.map.source == "a.ply + b.ply" and merged.map.free is not None
 
 
-@pytest.mark.xfail(strict=True, reason="a crossing of corridors is one room in the joined map and two in the whole")
 def test_the_joined_map_has_as_many_rooms_as_the_whole(merged, points):
     assert len(merged.map.rooms) == len(map_of(points, "whole").rooms)
 
