@@ -32,7 +32,8 @@ from benchmarks.merging.bending_measures import room_errors
 from benchmarks.merging.bending_poses import judged, marked, stranger_pairs, wrong_poses
 from benchmarks.merging.cached_pairs import PAIRS_CACHE, buildings_of, pair_files, places_of
 from benchmarks.merging.register import real_pairs
-from benchmarks.merging.tables import RESULTS_CACHE
+from benchmarks.merging.tables import RESULTS_CACHE, rows_of
+from topomerge.code_digest import code_digest
 from topomerge.fusion.bend.bend import bend
 from topomerge.fusion.bend.drift import Drift, sensor_drift
 from topomerge.fusion.prepared import Prepared, prepare
@@ -166,7 +167,10 @@ def main(what: str, *words: str) -> None:
     suffix = f"_{split}" if what in ("simulated", "wrong") else ""
     target = RESULTS_CACHE / f"bending_{what}{suffix}.jsonl"
     target.parent.mkdir(parents=True, exist_ok=True)
-    done = {json.loads(line)["name"] for line in target.read_text().splitlines()} if target.exists() else set()
+    code, earlier = code_digest("topomerge.fusion.bend.bend"), rows_of(target.name)
+    done = {row["name"] for row in earlier}
+    if any(row.get("code") != code for row in earlier):
+        print(f"{target}: some of its rows are of another state of the code; delete it to measure them again")
     runs = {"floor": floor, "growth": growth}
     if what == "simulated":
         rows = simulated(split, (*words[2:], str(SIMULATED_PAIRS))[0], done)
@@ -174,7 +178,7 @@ def main(what: str, *words: str) -> None:
         rows = wrong(split, done) if what == "wrong" else runs[what](done)
     for row in rows:
         with target.open("a") as out:
-            out.write(json.dumps(row) + "\n")
+            out.write(json.dumps({**row, "code": code}) + "\n")
         if time.monotonic() - began > float(words[0]):
             print(f"{target}: {words[0]} s are over; run it again for the rest")
             break

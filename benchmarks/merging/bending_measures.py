@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import rankdata
 from topomerge.datasets.pairs.bent_pairs import BentPair
 
+from topomerge.statistics import FEWEST_GROUPS, OUTSIDE
 from topomerge.types import Array, Sim3
 
 MATCHED = 0.75  # m between places of both maps that are compared
 LEAST_COMMON = 2.0  # m2 of a room that both maps show
 COLUMN = 0.5  # m, of the places
 USUAL_SHARE, PRIOR_AMOUNT = 0.15, 1.0  # share of walls on free floor, and m2 of walls that weigh as much as that prior
+DRAWS = 400
 ROOM_LIMITS = (0.1, 1.0)  # m, degrees
 
 
@@ -90,6 +92,19 @@ def recall_at(right: Sequence[float] | Array, wrong: Sequence[float] | Array, fa
     return float((np.asarray(right) > threshold).mean())
 
 
-def medians(rows: Sequence[dict[str, Any]], key: str) -> float:
-    """Median of a value of rows."""
-    return float(np.median([r[key] for r in rows]))
+def with_interval(statistic: Callable[[Array], float], groups: Sequence[str], digits: int) -> str:
+    """What a statistic of chosen rows is of all rows, with its 95 % interval by drawing whole groups (buildings) with
+    replacement; without one where there are fewer than `FEWEST_GROUPS`.
+
+    Args:
+        statistic: of row numbers (n,), which may come more than once.
+        groups: of each row.
+    """
+    names, owner = np.unique(np.asarray(groups), return_inverse=True)
+    every = f"{statistic(np.arange(len(owner))):.{digits}f}"
+    if len(names) < FEWEST_GROUPS:
+        return every
+    members, rng = [np.flatnonzero(owner == k) for k in range(len(names))], np.random.default_rng(0)
+    drawn = [np.concatenate([members[k] for k in rng.integers(len(names), size=len(names))]) for _ in range(DRAWS)]
+    low, high = np.nanquantile([statistic(rows) for rows in drawn], [OUTSIDE, 1 - OUTSIDE])
+    return f"{every} [{low:.{digits}f}, {high:.{digits}f}]"

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.merging import bending_text as text
-from benchmarks.merging.bending_measures import area_under_curve, recall_at, within
+from benchmarks.merging.bending_measures import area_under_curve, recall_at, with_interval, within
 from benchmarks.merging.tables import physical_of, put, rows_of, share, table
 from topomerge.statistics import interval_text
+from topomerge.training.belief_hypotheses import right
+from topomerge.types import Array
 
 Row = dict[str, Any]
 LARGE_COMMON = 80.0  # m2
@@ -28,12 +30,27 @@ def rooms(rows: Sequence[Row], key: str, value: str) -> tuple[list[float], list[
 
 def median_of(rows: Sequence[Row], key: str, value: str, digits: int) -> str:
     """Median over rooms."""
-    values, _ = rooms(rows, key, value)
-    return f"{np.median(values):.{digits}f}" if values else "–"
+    values, groups = rooms(rows, key, value)
+    return with_interval(lambda k: float(np.median(np.array(values)[k])), groups, digits) if values else "–"
+
+
+def area_of(high: Sequence[float], low: Sequence[float], groups: Sequence[str]) -> str:
+    """Area under the curve, with its interval.
+
+    Args:
+        groups: buildings of the right poses, then of the wrong ones.
+    """
+    both = np.array([*high, *low])
+
+    def area(k: Array) -> float:
+        some, other = both[k[k < len(high)]], both[k[k >= len(high)]]
+        return area_under_curve(some, other) if len(some) and len(other) else float("nan")
+
+    return with_interval(area, groups, 3)
 
 
 def of_rooms(rows: Sequence[Row], key: str = "named") -> list[object]:
-    """Pairs, shares of those with every shared room within the limits before and after, medians of rooms before and after."""
+    """Pairs, those whose rigid pose is wrong, shares of those with every shared room within the limits before and after, medians of rooms before and after."""
     rows = [r for r in rows if r["rooms"] or r["err"] is None]  # pairs without a room in common say nothing
 
     def all_right(name: str) -> Callable[[Row], bool]:
@@ -42,13 +59,14 @@ def of_rooms(rows: Sequence[Row], key: str = "named") -> list[object]:
     shares = [share(rows, all_right(name)) if rows else "–" for name in ("rooms", key)]
     shifts = [median_of(rows, name, "shift", 3) for name in ("rooms", key)]
     turns = [median_of(rows, name, "turn", 2) for name in ("rooms", key)]
-    return [len(rows), *shares, *shifts, *turns]
+    wrong = sum(not right(r["err"], r["sensors"]) for r in rows)
+    return [len(rows), wrong, *shares, *shifts, *turns]
 
 
 def simulated(rows: Sequence[Row]) -> str:
     """Tables of the pairs with drift."""
     large = [r for r in rows if r["common"] >= LARGE_COMMON]
-    heads = ("pairs", *(f"{what} {when}" for what in text.ROOM_HEADS for when in ("rigid", "bent")))
+    heads = ("pairs", "pose wrong", *(f"{what} {when}" for what in text.ROOM_HEADS for when in ("rigid", "bent")))
     factors = sorted({r["factor"] for r in large})
     by_factor = [[f"{f:g}", *of_rooms([r for r in large if r["factor"] == f])] for f in factors]
     unnamed = [[f"{f:g}", *of_rooms([r for r in large if r["factor"] == f], "unnamed")] for f in factors]
@@ -110,13 +128,14 @@ def told_apart(rows: Sequence[Row]) -> str:
     for title, belongs in kinds.items():
         poses = [(p, r) for r in rows if belongs(r) for p in r["poses"]]
         yes, no = ([p for p, _ in poses if p["label"] == label] for label in ("right", "wrong"))
+        groups = [physical_of(r) for label in ("right", "wrong") for p, r in poses if p["label"] == label]
         if not yes or not no:
             continue
         for way, sign in (("drawn", -1.0), ("score", 1.0)):
             for how in ("rigid", "bent"):
                 high, low = ([sign * p[how][way] for p in some] for some in (yes, no))
                 recall = [f"{100 * recall_at(high, low, f):.0f}" for f in FALSE_RATES]
-                lines.append([title, text.WAYS[way], how, len(yes), len(no), f"{area_under_curve(high, low):.3f}", *recall])
+                lines.append([title, text.WAYS[way], how, len(yes), len(no), area_of(high, low, groups), *recall])
     return "\n\n".join(
         [text.APART, table((*text.APART_HEADS, *(f"recall at {100 * f:.0f} % false" for f in FALSE_RATES)), lines)]
     )

@@ -148,3 +148,11 @@ def test_drift_of_a_scan_is_undone_and_grows_with_the_factor() -> None:
         assert (inside > corners.min(axis=0) - 0.4).all() and (inside < corners.max(axis=0) + 0.4).all()
         assert np.isin(undrift.rooms[undrift.rooms >= 0], np.arange(len(building.rooms))).all() and len(cloud) > 1000
     assert sizes[0] < 0.03 < sizes[1]
+
+
+def test_the_interval_of_a_statistic_is_over_buildings(measures) -> None:
+    values = np.repeat(np.arange(10.0), 50)
+    text = measures.with_interval(lambda k: float(values[k].mean()), [f"b{v:.0f}" for v in values], 1)
+    mean, low, high = (float(v) for v in text.replace("[", "").replace("]", "").replace(",", "").split())
+    assert mean == 4.5 and 2.3 < low < 3.4 and 5.6 < high < 6.7
+    assert measures.with_interval(lambda k: float(len(k)), ["one", "two"], 0) == "2"
