@@ -50,7 +50,8 @@ def area_of(high: Sequence[float], low: Sequence[float], groups: Sequence[str]) 
 
 
 def of_rooms(rows: Sequence[Row], key: str = "named") -> list[object]:
-    """Pairs, those whose rigid pose is wrong, shares of those with every shared room within the limits before and after, medians of rooms before and after."""
+    """Pairs, those whose rigid pose is wrong, shares with every shared room within the limits, and medians of rooms: each before
+    and after bending."""
     rows = [r for r in rows if r["rooms"] or r["err"] is None]  # pairs without a room in common say nothing
 
     def all_right(name: str) -> Callable[[Row], bool]:

@@ -15,8 +15,9 @@ SIMULATED = (
     "Pairs of two sensors (all pairs of tls, lidar, depth, tablet, laser2d, and each with a drawing) that share 80 m² or more, "
     "each with 0, 1, 2 and 4 times the usual drift of its sensors. A room's error is how far, and how much turned, the second "
     "map's lies beside the first's, both undrifted: the mean over places of half a metre, horizontally. Rooms are those that "
-    "both surveyors were in and of which both maps show 2 m² or more. *Rigid*: the pose that registration gives, wrong or "
-    "right (0.5 m, 5°); where it gives none, no room is right. *Bent*: from that pose on, both sensors being known. Medians are over rooms."
+    "both surveyors were in and of which both maps show 2 m² or more. *Rigid*: the pose that registration gives, wrong or right "
+    "(0.5 m, 5°); where it gives none, no room is right. *Bent*: from that pose on, both sensors being known. Medians are over "
+    "rooms."
 )
 BY_SENSOR = "By sensor, at the usual drift; each pair stands in the lines of both its sensors:"
 UNNAMED = "The same where bending does not know the sensors and takes cells for those of an unknown one:"
