@@ -21,7 +21,7 @@ from topomerge.types import Array, Sim3
 RIGID_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.05)  # m, m, rad, logarithm of the scale: of a mended pose
 PIECE_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.02)
 SCALE_DRIFT = 0.003  # logarithm of the scale per square root of a metre
-LEAST_SHARE = 0.4  # of the usual drift, that a map is taken to have at least
+LEAST_SHARE = 0.25  # of the usual drift, that a map is taken to have at least
 LEAST_DRIFT = 1e-4  # m and rad, of a joint
 NEIGHBOURS = 4  # pieces of the other map that say how it is bent at a place
 REACH = 0.6 * PIECE_SIZE
@@ -41,7 +41,7 @@ class Alignment:
         self.maps, self.poses, self.scaled = tuple(maps), list(poses), scaled
         self.pairs = [pair for i, j in pairs for pair in ((i, j), (j, i))]
         self.moves = [np.zeros((len(m.pieces), 4)) for m in maps]
-        self.drift_shares = [1.0] * len(self.maps)
+        self.drift_shares = [np.ones(2) for _ in self.maps]  # of shift and turn
         self.misfit = np.zeros(2)  # sums of weights, and of weighted squared distances of walls, m2
         self.first = np.cumsum([0, *(len(m.pieces) for m in maps)])
 
@@ -181,11 +181,11 @@ class Alignment:
         self.moves[k] = moves - np.column_stack([rows @ alike, np.full(len(moves), alike[2]), np.zeros(len(moves))])
         self._turn(k, middle, np.append(alike, 0.0))
 
-    def settle(self, parts: Sequence[Measurements], drifts: Sequence[Drift]) -> Settled:
-        """Move all pieces by what was measured; and estimate by how much less than usual each map drifts (a step of expectation
-        maximisation), so that what needs no bending is not bent by noise."""
+    def settle(self, parts: Sequence[Measurements], drifts: Sequence[Drift], estimated: bool = False) -> Settled:
+        """Move all pieces by what was measured; and (`estimated`) find by how much less than usual each map drifts, a step of
+        expectation maximisation, so that what needs no bending is not bent by noise."""
         anchors = np.concatenate([self.anchors(k) for k in range(len(self.maps))])
-        weaker = [Drift(s * d.shift, s * d.turn) for s, d in zip(self.drift_shares, drifts, strict=True)]
+        weaker = [Drift(s[0] * d.shift, s[1] * d.turn) for s, d in zip(self.drift_shares, drifts, strict=True)]
         each = list(enumerate(zip((m.pieces for m in self.maps), weaker, strict=True)))
         sigma = [_joint_sigma(p, d, self.poses[k].scale, self.scaled) for k, (p, d) in each]
         prior = [_prior(p, d, self.scaled and k > 0) for k, (p, d) in each]
@@ -193,11 +193,12 @@ class Alignment:
         settled = settle(anchors, Joints(np.concatenate(ends), np.concatenate(sigma)), stacked(parts), np.concatenate(prior))
         self.moves = np.split(settled.moves, self.first[1:-1])
         owner = np.repeat(np.arange(len(self.maps)), [len(e) for e in ends])
-        for k in range(len(self.maps)):
+        for k in range(len(self.maps) if estimated else 0):
             expected = settled.expected_strain[owner == k]
             if np.isfinite(expected).any():
-                share = np.sqrt(np.nanmean(expected) / (4.0 if self.scaled and k else 3.0))
-                self.drift_shares[k] = float(np.clip(self.drift_shares[k] * share, LEAST_SHARE, 1.0))
+                x, y, turn, _ = np.nanmean(expected, axis=0)
+                self.drift_shares[k] *= np.sqrt([(x + y) / 2, turn])
+                self.drift_shares[k] = np.clip(self.drift_shares[k], LEAST_SHARE, 1.0)
         return settled
 
     def deformations(self, covariance: Array) -> tuple[Deformation, ...]:

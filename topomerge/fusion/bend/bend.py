@@ -28,6 +28,7 @@ from topomerge.types import Array, Sim3
 
 FIRST_WINDOW = Window(1.2, 0.3, float(np.radians(3.0)))  # in which the rigid pose is mended
 POSE_ROUNDS = 2
+COARSE_LINES = 1  # rounds by lines before the drift of the maps is estimated
 WINDOWS = (
     Window(0.8, 0.2, float(np.radians(2.0))),
     Window(0.4, 0.15, float(np.radians(1.0))),
@@ -159,9 +160,10 @@ def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> Settled | None:
             return None
         settled = alignment.settle(parts, drifts)
     alignment.fold()
-    for sigma in LINE_SIGMAS:
+    for k, sigma in enumerate(LINE_SIGMAS):
         alignment.misfit[:] = 0.0
-        settled = alignment.settle([alignment.by_lines(*pair, sigma) for pair in alignment.pairs], drifts)
+        parts = [alignment.by_lines(*pair, sigma) for pair in alignment.pairs]
+        settled = alignment.settle(parts, drifts, estimated=k >= COARSE_LINES)
     return settled
 
 

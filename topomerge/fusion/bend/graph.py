@@ -54,7 +54,7 @@ class Measurements:
 @dataclass(frozen=True, eq=False)
 class Settled:
     """(n, 4) moves; (n, 3, 3) covariance of shift and turn; (m,) weight 0..1 of each measurement; (j,) squared misfit of each
-    joint, in variances; and (j,) what that is expected to be, as far as the moves are uncertain."""
+    joint, in variances; and (j, 4) what it is expected to be in each unknown, as far as the moves are uncertain."""
 
     moves: Array
     covariance: Array
@@ -89,22 +89,22 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
         relaxed = max(2 * chi.max(initial=0) / OUTLIER, 1.0) if k == 0 else max(relaxed / 1.6, 1.0)
         weights = (relaxed * OUTLIER / (chi + relaxed * OUTLIER)) ** 2
     moves = np.where(prior.ravel() > 0, moves, 0.0)
-    strain = ((jointed @ moves).reshape(-1, UNKNOWNS) ** 2).sum(axis=1)
-    uncertain = strain + _joint_variance(factor, jointed)
-    return Settled(moves.reshape(n, UNKNOWNS), _covariance(factor, n), weights, strain, uncertain)
+    squares = (jointed @ moves).reshape(-1, UNKNOWNS) ** 2
+    expected = squares + _joint_variance(factor, jointed)
+    return Settled(moves.reshape(n, UNKNOWNS), _covariance(factor, n), weights, squares.sum(axis=1), expected)
 
 
 def _joint_variance(factor: object, jointed: sparse.csr_matrix) -> Array:
-    """(j,) variance that is left to each joint, in its variances before anything was measured; nan for those beyond a sample."""
+    """(j, 4) variance that is left to each joint, in its variances before anything was measured; nan for those beyond a sample."""
     many = jointed.shape[0] // UNKNOWNS
-    out = np.full(many, np.nan)
+    out = np.full((many, UNKNOWNS), np.nan)
     if not many:
         return out
     chosen = np.arange(many)[:: max(many // SAMPLED_JOINTS, 1)]
     rows = (UNKNOWNS * chosen[:, None] + np.arange(UNKNOWNS)).ravel()
     sampled = jointed[rows].toarray()
     left = np.einsum("ij,ji->i", sampled, factor.solve(np.ascontiguousarray(sampled.T)))  # type: ignore[attr-defined]
-    out[chosen] = left.reshape(-1, UNKNOWNS).sum(axis=1)
+    out[chosen] = left.reshape(-1, UNKNOWNS)
     return out
 
 
