@@ -54,7 +54,7 @@ def lookalike_row(pair: GridPair) -> Row:
     """What `register` says of a pair."""
     began = time.process_time()
     scale = "free" if pair.about["scaled"] else "fixed"
-    registration = register(pair.a, pair.b, free=pair.free, scale=scale, refined=False)
+    registration = register(pair.a, pair.b, free=pair.free, scale=scale)
     seconds = time.process_time() - began
     about = {"name": pair.name, **{key: pair.about[key] for key in COPIED}}
     alike = None if pair.about["alike"] is None else sim3_of(np.array(pair.about["alike"]))

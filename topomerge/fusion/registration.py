@@ -61,7 +61,6 @@ def register(
     proposed: Sequence[Sim3] = (),
     free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
     yaws: Sequence[float] = (),
-    refined: bool = True,
     searched: bool = True,
     rigid: bool = False,
 ) -> Registration:
@@ -73,7 +72,6 @@ def register(
         proposed: poses T_ab of matched rooms, tried beside those of the correlation.
         free: cells of a and of b known to be empty; topometric maps bring their own.
         yaws: further turns of b to try, rad.
-        refined: finish with the fine registration? Without it the pose is right to a cell.
         searched: look for poses by correlation? Else the proposed ones are all there is.
         rigid: give the best rigid pose? Else both maps are bent, too. They are judged as bent all the same: drift is no
             contradiction.
@@ -88,7 +86,7 @@ def register(
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
         poses, turns = [pose.inverse() for pose in proposed], [-y for y in yaws]
-        swapped = register(b, a, scale=scale, proposed=poses, yaws=turns, refined=refined, searched=searched, rigid=rigid)
+        swapped = register(b, a, scale=scale, proposed=poses, yaws=turns, searched=searched, rigid=rigid)
         return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
     first, second = a.storeys, b.storeys
     if searched:
@@ -104,7 +102,7 @@ def register(
     bent, winner = judged_as_bent(a, b, ranked[0].transform, scale == "free")
     clock("bend")
     pose, rmse = bent.transform, winner.get("rmse", float("nan"))
-    if (rigid or bent.reason) and refined and not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
+    if (rigid or bent.reason) and not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
         pose, rmse = fine(a, b, ranked[0].transform, scale == "free")
     clock("refine")
     return replace(_verdict(ranked, winner, pose, rmse, clock.seconds), bend=None if rigid else bent)

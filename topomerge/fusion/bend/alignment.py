@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -91,29 +91,32 @@ class Alignment:
 
     def by_plan(self, i: int, j: int, window: Window) -> Measurements:
         """The pieces of map i registered on the plans of map j."""
-        pieces, own = self.maps[i].pieces, self.own(i)
+        own = self.own(i)
         into, start = self.poses[j].inverse() @ self.poses[i], self.relative(i, j) @ own.T
         parts = []
-        for mine, theirs in self.matched(i, j):
-            chosen, fields = np.flatnonzero(pieces.storey == mine), self.maps[j].storeys[theirs]
-            if len(chosen) and len(fields.walls):
-                target = self.maps[j].targets[theirs]
-                parts.append((chosen, *measure(pieces, self.maps[i].samples, chosen, start, into, target, window)))
+        for _, theirs, chosen in self._facing(i, j):
+            target = self.maps[j].targets[theirs]
+            parts.append((chosen, *measure(self.maps[i].pieces, self.maps[i].samples, chosen, start, into, target, window)))
         return self._measurements((i, j), own, parts)
 
     def by_lines(self, i: int, j: int, sigma: float) -> Measurements:
         """The pieces of map i registered on the walls' lines of map j."""
-        pieces, own = self.maps[i].pieces, self.own(i)
+        own, maps = self.own(i), self.maps
         into, start = self.poses[j].inverse() @ self.poses[i], self.relative(i, j) @ own.T
         parts = []
-        for mine, theirs in self.matched(i, j):
-            chosen, fields = np.flatnonzero(pieces.storey == mine), self.maps[j].storeys[theirs]
-            if len(chosen) and len(fields.walls):
-                lines, target = self.maps[i].lines[mine], self.maps[j].lines[theirs]
-                *part, misfit = measure_lines(pieces, chosen, lines, start, into, fields, target, sigma)
-                self.misfit += misfit
-                parts.append(tuple(part))
+        for mine, theirs, chosen in self._facing(i, j):
+            target = (maps[j].storeys[theirs], maps[j].lines[theirs])
+            *part, misfit = measure_lines(maps[i].pieces, chosen, maps[i].lines[mine], start, into, target, sigma)
+            self.misfit += misfit
+            parts.append(tuple(part))
         return self._measurements((i, j), own, parts)
+
+    def _facing(self, i: int, j: int) -> Iterator[tuple[int, int, Array]]:
+        """Storeys of two maps on one level, of i and of j, with the pieces of i there; those with walls in both."""
+        for mine, theirs in self.matched(i, j):
+            chosen = np.flatnonzero(self.maps[i].pieces.storey == mine)
+            if len(chosen) and len(self.maps[j].storeys[theirs].walls):
+                yield mine, theirs, chosen
 
     @property
     def rmse(self) -> float:

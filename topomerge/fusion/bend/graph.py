@@ -95,7 +95,7 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
 
 
 def _joint_variance(factor: object, jointed: sparse.csr_matrix) -> Array:
-    """(j, 4) variance that is left to each joint, in its variances before anything was measured; nan for those beyond a sample."""
+    """(j, 4) variance that is left to each joint, in its variances before all measurements; nan for those beyond a sample."""
     many = jointed.shape[0] // UNKNOWNS
     out = np.full((many, UNKNOWNS), np.nan)
     if not many:

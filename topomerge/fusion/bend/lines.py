@@ -73,7 +73,7 @@ def wall_lines(fields: PlanFields, middles: Array) -> WallLines:
 
 
 def measure_lines(
-    pieces: Pieces, chosen: Array, lines: WallLines, moves: Array, into: Sim3, fields: PlanFields, target: WallLines, sigma: float
+    pieces: Pieces, chosen: Array, lines: WallLines, moves: Array, into: Sim3, onto: tuple[PlanFields, WallLines], sigma: float
 ) -> tuple[Array, Array, Array, Array]:
     """The chosen pieces of a storey that have partners (k,), their moves (k, 3) in their own frame, the information (k, 3, 3);
     and (2,) sums of weights and of weighted squared distances, m2.
@@ -82,9 +82,10 @@ def measure_lines(
         lines: of the pieces' storey, whose walls are rows of `pieces.walls` from the first one of the storey on.
         moves: (n, 3) shift and turn from which to start.
         into: the pieces' frame -> that of the target.
-        fields, target: the storey of the other map.
+        onto: the storey of the other map.
         sigma: m, of the robust weights.
     """
+    fields, target = onto
     first = int(np.flatnonzero(np.isin(pieces.owner, chosen)).min())
     owner = pieces.owner[first : first + len(lines.points)]
     rows = np.flatnonzero(lines.straight)
