@@ -46,9 +46,13 @@ def test_provenance_tells_who_saw_each_cell():
     of_a, of_b, both = lattice(a), lattice(b, 3.0), lattice(joined)
     assert joined.provenance.dtype == np.uint32 and len(both) == len(joined.grid)
     offset = np.round(joined.grid.origin / 0.1)
+    drawn = 0  # to a wall of a that b shows a cell aside
     for cell, bits in zip((joined.grid.cells + offset).astype(int).tolist(), joined.provenance.tolist(), strict=True):
-        assert bits == (tuple(cell) in of_a) + 2 * (tuple(cell) in of_b)
-    assert len((of_a | of_b) - both) < 0.01 * len(both)  # cells that the extraction takes for noise
+        seen = (tuple(cell) in of_a) + 2 * (tuple(cell) in of_b)
+        assert bits == seen or (bits == 3 and seen == 1)
+        drawn += bits != seen
+    assert drawn < 0.02 * len(both)
+    assert len((of_a | of_b) - both) < 0.05 * len(both)  # the copies, and cells that the extraction takes for noise
 
 
 def test_bits_of_joined_maps_follow(halves, joined):

@@ -191,7 +191,7 @@ def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -
         sides.append(np.argmax(np.where(away_enough, clearance, -1.0)))
     if clearance.flat[sides[0]] <= 1 or clearance.flat[sides[1]] <= 1:
         return None
-    pass_parts = _at_the_pass(clearance, sides[0], sides[1])
+    pass_parts = _at_the_pass(clearance, int(sides[0]), int(sides[1]))
     if pass_parts is None:
         return None
     saddle = _between(*pass_parts)

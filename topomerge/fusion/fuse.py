@@ -23,6 +23,7 @@ from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.resampling import Laying, decoded, encoded, resampled
+from topomerge.fusion.single_walls import copies
 from topomerge.fusion.storey_levels import extruded
 from topomerge.matching.consistency import matches_under
 from topomerge.matching.room_plans import room_plans
@@ -117,9 +118,13 @@ class _JoinedCells:
         if assumed and len(cells):
             added = self._contains(cells) | ~self._surveyed(cells)
             cells, provenance = cells[added], provenance[added]
+        free_cells = None if map.free is None else resampled(map.free, laying, self.origin, 2 * self.edge)[0]
+        if free_cells is not None and len(self.free_codes) and len(cells):
+            occupied = decoded(self.codes)
+            copy_of = copies((occupied, decoded(self.free_codes)), (cells, free_cells), self.edge)
+            cells = np.where(copy_of[:, None] >= 0, occupied[copy_of], cells)
         self._add(cells, provenance)
-        if map.free is not None:
-            free_cells = resampled(map.free, laying, self.origin, 2 * self.edge)[0]
+        if free_cells is not None:
             self.free_codes = np.union1d(self.free_codes, encoded(free_cells))
 
     def _add(self, cells: Array, provenance: Array) -> None:

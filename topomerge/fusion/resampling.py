@@ -63,11 +63,12 @@ class Laying:
     @property
     def stretch(self) -> float:
         """By what factor a length in the plane grows at most, the scale of the pose apart."""
-        steep = [0.0]
+        steep = 0.0
         for field in self.bend.fields if self.bend is not None else ():
             if field is not None:
-                steep += [float(np.linalg.norm(np.diff(field.shifts, axis=k), axis=-1).max()) / field.step for k in (0, 1)]
-        return 1.0 + float(np.hypot(*sorted(steep)[-2:])) if len(steep) > 1 else 1.0
+                both = [np.linalg.norm(np.diff(field.shifts, axis=k), axis=-1).max(initial=0.0) for k in (0, 1)]
+                steep = max(steep, float(max(both)) / field.step)
+        return 1.0 + 1.4143 * steep
 
     def slant(self, edge: float) -> float:
         """m in the plane by which the ends of a cell as high as `edge` part from its middle, between storeys that move apart."""

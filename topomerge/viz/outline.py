@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy import ndimage
 
@@ -14,9 +16,11 @@ ROOM_HOLE = 6.0  # m2: holes in a room up to this are furniture or shadows, larg
 SMOOTH = 0.8  # pixels: standard deviation of the blur before an outline is traced
 TOLERANCE = 0.5  # pixels that an outline may be off for having fewer corners
 WALL_TRACE = (0.6, 0.36)  # blur and level for walls: lines of one pixel stay whole, single pixels go
+DRAWN_AGAIN = 8  # plans whose outlines are kept: a report draws those of two maps several times
 SPECK = 0.3  # m2: smaller patches of what was seen outside rooms are left out
 
 
+@lru_cache(maxsize=DRAWN_AGAIN)
 def whole_rooms(plan: StoreyPlan, frame: Frame) -> Array:
     """(nx, ny) int32 room of each pixel, -1 none, with small gaps and holes filled; no pixel changes from room to room."""
     reach = max(round(CLOSED / frame.size), 1)
@@ -41,6 +45,7 @@ def _without_holes(mask: Array, most: float) -> Array:
     return mask | small[holes]
 
 
+@lru_cache(maxsize=DRAWN_AGAIN)
 def room_outlines(plan: StoreyPlan, sheet: Sheet) -> dict[int, str]:
     """Room -> its outline as the `d` of an SVG path."""
     room = whole_rooms(plan, sheet.frame)
@@ -53,6 +58,7 @@ def room_outlines(plan: StoreyPlan, sheet: Sheet) -> dict[int, str]:
     return outlines
 
 
+@lru_cache(maxsize=DRAWN_AGAIN)
 def wall_outline(plan: StoreyPlan, sheet: Sheet) -> str:
     """Walls as the `d` of an SVG path; the two faces of a thin wall are drawn as one."""
     near = round(0.1 / sheet.frame.size)
