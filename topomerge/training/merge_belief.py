@@ -35,13 +35,14 @@ from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array
 
 BENT = (1.5, 5.0)  # m, degrees: a map that is bent by drift fits in no one pose; neither right nor wrong
+BENDING_STRENGTH = 10.0  # of five numbers: next to free
 BENT_FEATURES = (*POSE_VECTOR, *WINNER_VECTOR, *BEND_VECTOR)  # of the best hypothesis, once the maps are bent
 BELIEF_FEATURES = [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR, *BEND_VECTOR]
 SIGN = {
     "ratio": 1, "walls": 1, "conflict": -1, "worst": -1, "free": 1, "opposed": -1, "lift": 1, "met": 1, "missed": -1, "share": 1,
     "level": -1, "ceilings": -1, "margin": 1, "ahead": 1, "tall": -1, "crossing": 1, "worst_ratio": 1, "squares": 1,
     "bad_squares": -1, "in_place": 1, "out_of_place": -1, "kept": 1, "moved_walls": -1, "hanging": 1, "fallen": -1, "held": 1,
-    "alone": 1, "odds": 1, "strain": -1, "bent": -1, "doubted": -1,
+    "alone": 1, "odds": 1, "strain": -1, "doubted": -1,
 }  # fmt: skip
 
 
@@ -209,7 +210,7 @@ def _winner(x: Array, y: Array, weight: Array, flat: bool, settings: MergeBelief
     before = model()["flat" if flat else "solid"]["winner"]
     before = {**before, **{k: before[k][:whole] for k in ("mean", "scale", "weight")}}
     odds = logits(before, x[:, :whole])
-    added = fitted(np.column_stack([odds, x[:, whole:]]), y, ["odds", *BEND_VECTOR], settings.winner_strength, weight)
+    added = fitted(np.column_stack([odds, x[:, whole:]]), y, ["odds", *BEND_VECTOR], BENDING_STRENGTH, weight)
     slope = added["weight"][0] / added["scale"][0]
     return {
         "mean": [*before["mean"], *added["mean"][1:]],
