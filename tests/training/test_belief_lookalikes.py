@@ -27,6 +27,7 @@ def tempting(*_: Any) -> list[dict[str, Any]]:
     for k, row in enumerate(tiny.belief_rows()[:24]):
         first, *others = row["hyps"]
         first |= {"walls": 30.5, "conflict": 8.0, "err": None}
+        first["bent"] |= {"walls": 30.5, "conflict": 8.0}
         about = {"kind": "lookalike", "lookalike": "modules", "tellable": k % 3 > 0, "repeats": k % 2 == 0, "common": 0.0}
         rows.append({**row, **about, "building": f"modules-{k}", "hyps": [first, *({**h, "err": None} for h in others)]})
     return rows
@@ -87,3 +88,19 @@ def test_none_are_built_where_none_are_taken(monkeypatch) -> None:
     settings = settings_of(["task=merge_belief"])
     assert lookalike_rows(settings.alike, settings, quiet) == []
     assert settings.alike.split == "train" and settings.alike_heldout.split == "test"
+
+
+def test_refitting_the_bending_keeps_what_the_model_says(words: list[str]) -> None:
+    """Five numbers are fitted: the old log odds are scaled, so that hypotheses keep their order but for what bending adds."""
+    settings = settings_of([*words, "name=bending", "refit=bending"])
+    rows = [row for row in tiny.belief_rows() if "drawing" not in row["sensors"]]
+    weights, _ = merge_belief.fit_models(rows, False, settings)
+    before = merge_belief.model()["solid"]["winner"]
+    slopes = np.array(weights["winner"]["weight"][:-2]) / np.array(before["weight"][:-2])
+    assert np.allclose(slopes, slopes[0]) and slopes[0] >= 0
+    assert weights["winner"]["mean"][:-2] == before["mean"][:-2]
+
+
+def test_another_word_for_what_is_refitted_is_refused(words: list[str]) -> None:
+    with pytest.raises(InputError, match="refit must be all or bending"):
+        train(settings_of([*words, "refit=some"]), quiet)

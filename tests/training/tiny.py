@@ -68,7 +68,7 @@ def belief_rows(*_: Any) -> list[dict[str, Any]]:
             features = {name: float(abs(rng.normal())) for name in AMOUNTS} | {n: float(rng.uniform(0.2, 0.5)) for n in SHARES}
             features |= {"walls": 10.0 + 20 * right + rng.random(), "conflict": 1.0, "met": 0.5, "chance": 0.3}
             features["sliced"] = float(flat)
-            closely = {name: float(rng.uniform(0.1, 1.0)) for name in WINNER_INPUTS}
+            closely = {"bent": {**features, **{name: float(rng.uniform(0.1, 1.0)) for name in WINNER_INPUTS}}}
             error = [0.1, 0.0, 1.0] if right else [5.0, 0.0, 90.0]
             hypotheses.append({**features, **(closely if number < 2 else {}), "err": error})
         row = {"name": str(k), "common": 30.0 + k, "kind": "overlap", "building": f"b{k}", "hyps": hypotheses}
@@ -80,7 +80,7 @@ AMOUNTS = ("free", "clutter", "level", "ceilings", "ceiling_area")
 SHARES = ("ratio", "opposed", "conflict_share", "worst_conflict", "share")
 WINNER_INPUTS = (
     "in_place", "by_chance", "pieces", "free", "tall_conflict", "crossing", "worst_ratio", "squares", "bad_squares",
-    "moved_walls", "hanging_met", "hanging",
+    "moved_walls", "hanging_met", "hanging", "strain", "doubted",
 )  # fmt: skip
 
 
