@@ -65,7 +65,7 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     for n in order:
         k, pose = poses[n]
-        laying = Laying.of(pose, (bends or {}).get(k))
+        laying = Laying.of(pose, (bends or {}).get(k), maps[k].grid.edge)
         cells.add_map(maps[k], laying, int(first_bits[n]), parts[n].assumed and n != order[0])
     name = " + ".join(maps[k].source or "map" for k, _ in poses)
     return _extracted(cells, min(part.neighbours for part in parts), name)

@@ -17,6 +17,7 @@ from topomerge.types import Array, Sim3, VoxelGrid
 
 RESAMPLED_AT_ONCE = 200_000  # cells
 SLACK = 0.02  # of a bent cell, by which neighbours overlap: each is taken as linear by itself
+TELLABLE = 0.2  # of a cell, by which bending must move a place of a map
 JACOBIAN_STEP = 0.02  # m
 CODE_OFFSET = 1 << 20  # cells are counted from there, as Morton codes hold no negative ones
 
@@ -34,9 +35,13 @@ class Laying:
     bend: Deformation | None = None
 
     @staticmethod
-    def of(pose: Sim3, bend: Deformation | None) -> Laying:
-        """Bent only where the deformation moves anything."""
-        return Laying(pose, bend if bend is not None and len(bend) and bend.moves.any() else None)
+    def of(pose: Sim3, bend: Deformation | None, edge: float = 0.0) -> Laying:
+        """Bent only if the deformation moves anything, or, where cells have an `edge` of so many m, if they can tell:
+        resampling thickens walls, and what a stiff map gives way by is less than that."""
+        if bend is None or not len(bend) or not bend.moves.any():
+            return Laying(pose)
+        farthest = max(float(np.linalg.norm(f.shifts, axis=-1).max()) for f in bend.fields if f is not None)
+        return Laying(pose, bend if farthest > TELLABLE * edge else None)
 
     def apply(self, points: Array) -> Array:
         """Points (n, 3) of the map in the other frame."""
