@@ -70,7 +70,7 @@ def belief_rows(*_: Any) -> list[dict[str, Any]]:
             features["sliced"] = float(flat)
             closely = {"bent": {**features, **{name: float(rng.uniform(0.1, 1.0)) for name in WINNER_INPUTS}}}
             error = [0.1, 0.0, 1.0] if right else [5.0, 0.0, 90.0]
-            hypotheses.append({**features, **(closely if number < 2 else {}), "err": error})
+            hypotheses.append({**features, **closely, "err": error})
         row = {"name": str(k), "common": 30.0 + k, "kind": "overlap", "building": f"b{k}", "hyps": hypotheses}
         rows.append({**row, "sensors": ["tls", "laser2d" if flat else "depth"]})
     return rows

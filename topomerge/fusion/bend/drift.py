@@ -10,7 +10,6 @@ from topomerge.fusion.storey_levels import extruded, slices
 from topomerge.io.weight_files import read_weights_json
 from topomerge.types import TopometricMap, VoxelGrid
 
-
 SOFTER = 2.0  # times the fitted drift of a sensor: rooms that drifted within themselves are no rigid pieces (validation pairs)
 
 
