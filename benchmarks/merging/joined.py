@@ -132,7 +132,7 @@ def main(*words: str) -> None:
     if writes:
         if not listed:
             raise SystemExit(f"{target}: nothing was measured yet")
-        command = f"`python -m benchmarks.merging.joined {len(listed)} 3600 {split}`"
+        command = f"`python -m benchmarks.merging.joined 30 3600 {split}`"
         put(Path(words[1]), f"{command}: {len(listed)} simulated pairs. {ABOUT}\n\n{summary(listed)}", "joined")
         return
     began = time.monotonic()
