@@ -50,6 +50,6 @@ def drift_table() -> list[list[object]]:
     """Sensor, shift and turn over a metre of way."""
     rows: list[list[object]] = []
     for sensor in ("tls", "lidar", "depth", "tablet", "laser2d", "drawing", "unknown"):
-        usual = sensor_drift(sensor)
+        usual = sensor_drift(sensor, fitted=True)
         rows.append([sensor, f"{1000 * usual.shift:.1f}", f"{usual.turn * 57.29578:.2f}"])
     return rows

@@ -24,11 +24,10 @@ def bent_plan(plan: StoreyPlan, forward: Callable[[Array], Array], back: Callabl
     high = np.ceil((rim.max(axis=0) - plan.origin) / plan.edge).astype(np.int64)
     shape = np.maximum(high - low, 1)
     origin = plan.origin + low * plan.edge
-    middles = (
-        origin + (np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) * plan.edge
-    )
+    columns = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 2)
+    middles = origin + (columns + 0.5) * plan.edge
     source = np.floor((back(middles) - plan.origin) / plan.edge).astype(np.int64)
-    inside = ((source >= 0) & (source < (nx, ny))).all(axis=1)
+    inside: Array = ((source >= 0) & (source < (nx, ny))).all(axis=1)
     i, j = np.where(inside[:, None], source, 0).T
 
     def drawn(raster: Array, outside: float | bool | int) -> Array:

@@ -27,8 +27,8 @@ class Drift:
         return self.shift <= 0
 
 
-def sensor_drift(sensor: str) -> Drift:
-    """The usual drift of a sensor.
+def sensor_drift(sensor: str, fitted: bool = False) -> Drift:
+    """The drift that joints of a sensor's maps are as stiff as; `fitted`: as it was fitted.
 
     Raises:
         InputError: none that is listed in `drift.json`.
@@ -36,7 +36,7 @@ def sensor_drift(sensor: str) -> Drift:
     sensors = read_weights_json("topomerge.fusion.bend", "drift.json")
     if sensor not in sensors:
         raise InputError(f"sensor must be one of {', '.join(sorted(sensors))}, not {sensor!r}")
-    softer = 1.0 if sensor == "unknown" else SOFTER
+    softer = 1.0 if sensor == "unknown" or fitted else SOFTER
     return Drift(softer * float(sensors[sensor]["shift"]), softer * float(sensors[sensor]["turn"]))
 
 
