@@ -27,7 +27,7 @@ def bent_plan(plan: StoreyPlan, forward: Callable[[Array], Array], back: Callabl
     columns = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 2)
     middles = origin + (columns + 0.5) * plan.edge
     source = np.floor((back(middles) - plan.origin) / plan.edge).astype(np.int64)
-    inside: Array = ((source >= 0) & (source < (nx, ny))).all(axis=1)
+    inside = np.asarray(((source >= 0) & (source < (nx, ny))).all(axis=1))
     i, j = np.where(inside[:, None], source, 0).T
 
     def drawn(raster: Array, outside: float | bool | int) -> Array:
