@@ -140,7 +140,7 @@ def wrong(split: str, done: set[str]) -> Iterator[Row]:
         a, b = prepared(pair)
         real = pair.about["source"] == "halmstad"
         scaled = bool(real or pair.about.get("scaled"))
-        best = register(a, b, scale="free" if scaled else "fixed", refined=False)
+        best = register(a, b, scale="free" if scaled else "fixed")
         names: Any = ("F5", "F5") if real else pair.about.get("buildings") or buildings_of(pair, split)
         places = places_of(names, ("halmstad", "halmstad")) if real else places_of(names)
         row: Row = {"name": pair.name, "sensors": pair.about["sensors"], "kind": pair.about["kind"], **places, "poses": []}
