@@ -82,7 +82,7 @@ def of_strangers(split: str, many: int, done: Collection[str]) -> Iterator[Row]:
             a, b = maps(first, split)[0], maps(second, split)[1]
             kind = kind_of_two(a, b)
             if kind:
-                yield _row({**about_two(a, b), "name": name, "kind": kind}, partial(register, a.map, b.map, refined=False))
+                yield _row({**about_two(a, b), "name": name, "kind": kind}, partial(register, a.map, b.map))
 
 
 def about_two(a: Side, b: Side) -> Row:
@@ -119,7 +119,7 @@ def of_real(many: int, done: Collection[str]) -> Iterator[Row]:
             if name not in done:
                 scale = "free" if {a.source, b.source} & set(SCALELESS) else "fixed"
                 about = {**about_two(a, b), "name": name, "kind": kind_of_two(a, b)}
-                yield _row(about, partial(register, a.map, b.map, scale=scale, refined=False))
+                yield _row(about, partial(register, a.map, b.map, scale=scale))
 
 
 def of_drawings(split: str, done: Collection[str]) -> Iterator[Row]:
@@ -133,7 +133,7 @@ def of_drawings(split: str, done: Collection[str]) -> Iterator[Row]:
         keys = ("kind", "sensors", "differs", "walls_differ", "scaled")
         about = {k: pair.about[k] for k in keys if k in pair.about} | {"hard": hard_of(pair)}
         scale = "free" if pair.about["scaled"] else "fixed"
-        run = partial(register, pair.a, pair.b, free=pair.free, scale=scale, refined=False)
+        run = partial(register, pair.a, pair.b, free=pair.free, scale=scale)
         yield _row({"name": path.stem, **about, **places_of(buildings_of(pair, split))}, run)
 
 
