@@ -80,8 +80,8 @@ def test_what_walls_on_free_floor_say(monkeypatch):
 
 
 def test_hypotheses_share_the_probability_that_one_of_them_is_right(monkeypatch):
-    def registered(*_: object, scale: str, proposed: list[Sim3], refined: bool) -> Registration:
-        assert scale == "free" and proposed == [] and not refined
+    def registered(*_: object, scale: str, proposed: list[Sim3]) -> Registration:
+        assert scale == "free" and proposed == []
         places = [PoseHypothesis(Sim3(0.0, (float(k), 0.0, 0.0)), score) for k, score in enumerate((5.0, 4.0, 4.9, 1.0))]
         return Registration(Sim3(0.0, (0.01, 0.0, 0.0)), 0.6, False, {"walls": 9.0}, tuple(places))
 
