@@ -54,7 +54,7 @@ def test_a_bent_corridor_is_straightened(points, straightened):
     rigid = bowed(points)[:, 1] - points[:, 1]
     assert np.ptp(rigid) > 0.25
     assert np.median(misfit(straightened, points)) < 0.02
-    assert np.percentile(misfit(straightened, points), 95) < 0.05
+    assert np.percentile(misfit(straightened, points), 95) < 0.06
 
 
 def test_what_speaks_against_a_bent_map_is_drift(straight, bent_map, straightened):
