@@ -91,7 +91,7 @@ def test_none_are_built_where_none_are_taken(monkeypatch) -> None:
 
 
 def test_refitting_the_bending_keeps_what_the_model_says(words: list[str]) -> None:
-    """Five numbers are fitted: the old log odds are scaled, so that hypotheses keep their order but for what bending adds."""
+    """Four numbers are fitted: the old log odds are scaled, so that hypotheses keep their order but for what bending adds."""
     settings = settings_of([*words, "name=bending", "refit=bending"])
     rows = [row for row in tiny.belief_rows() if "drawing" not in row["sensors"]]
     weights, _ = merge_belief.fit_models(rows, False, settings)

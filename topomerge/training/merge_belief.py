@@ -35,7 +35,7 @@ from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array
 
 BENT = (1.5, 5.0)  # m, degrees: a map that is bent by drift fits in no one pose; neither right nor wrong
-BENDING_STRENGTH = 10.0  # of five numbers: next to free
+BENDING_STRENGTH = 10.0  # of four numbers: next to free
 BENT_FEATURES = (*POSE_VECTOR, *WINNER_VECTOR, *BEND_VECTOR)  # of the best hypothesis, once the maps are bent
 BELIEF_FEATURES = [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR, *BEND_VECTOR]
 SIGN = {
@@ -203,7 +203,7 @@ def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) ->
 
 def _winner(x: Array, y: Array, weight: Array, flat: bool, settings: MergeBelief) -> dict[str, Any]:
     """The model of the best hypothesis: all of it, or (`refit` "bending") the one that is there, with what bending adds and a new
-    scale of its log odds: five numbers, for which a few hundred pairs are enough."""
+    scale of its log odds: four numbers, for which a few hundred pairs are enough."""
     if settings.refit == "all":
         return fitted(x, y, BELIEF_FEATURES, settings.winner_strength, weight)
     whole = len(BELIEF_FEATURES) - len(BEND_VECTOR)
