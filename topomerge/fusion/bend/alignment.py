@@ -195,22 +195,22 @@ class Alignment:
         ends = [m.pieces.joints + n for m, n in zip(self.maps, self.first, strict=False)]
         settled = settle(anchors, Joints(np.concatenate(ends), np.concatenate(sigma)), stacked(parts), np.concatenate(prior))
         self.moves = np.split(settled.moves, self.first[1:-1])
-        owner = np.repeat(np.arange(len(self.maps)), [len(e) for e in ends])
-        for k in range(len(self.maps) if estimated else 0):
-            expected = settled.expected_strain[owner == k]
-            if np.isfinite(expected).any():
-                x, y, turn, _ = np.nanmean(expected, axis=0)
-                self.drift_shares[k] *= np.sqrt([(x + y) / 2, turn])
-                self.drift_shares[k] = np.clip(self.drift_shares[k], LEAST_SHARE, 1.0)
+        if estimated:
+            self._estimate_drift(settled, np.repeat(np.arange(len(self.maps)), [len(e) for e in ends]))
         return settled
 
-    def deformations(self, covariance: Array) -> tuple[Deformation, ...]:
-        """The moves of all maps in their own frames.
+    def _estimate_drift(self, settled: Settled, owner: Array) -> None:
+        """Of each map, by how much less than usual its shifts and turns drift; `owner` (j,): the map of each joint."""
+        expected_strain = settled.expected_strain
+        for k in range(len(self.maps)):
+            expected = expected_strain[owner == k]
+            if np.isfinite(expected).any():
+                x, y, turn, _ = np.nanmean(expected, axis=0)
+                self.drift_shares[k] = np.clip(self.drift_shares[k] * np.sqrt([(x + y) / 2, turn]), LEAST_SHARE, 1.0)
 
-        Args:
-            covariance: (n, 3, 3) in the common frame.
-        """
-        return tuple(self._deformation(k, c) for k, c in enumerate(np.split(covariance, self.first[1:-1])))
+    def deformations(self, settled: Settled) -> tuple[Deformation, ...]:
+        """The moves of all maps in their own frames."""
+        return tuple(self._deformation(k, c) for k, c in enumerate(np.split(settled.covariance, self.first[1:-1])))
 
     def _deformation(self, k: int, covariance: Array) -> Deformation:
         pieces, own = self.maps[k].pieces, self.own(k)

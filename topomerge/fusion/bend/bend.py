@@ -8,7 +8,7 @@ refused.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -106,14 +106,13 @@ def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | N
     reason = _why_rigid(a, b, pose, usual)
     if reason:
         return Bend(pose, (_rigid(a), _rigid(b)), reason=reason)
-    for share in STIFFER:
-        alignment = Alignment((a, b), (Sim3(), pose), [(0, 1)], scaled)
-        for _ in range(POSE_ROUNDS):
-            alignment.mend_pose(FIRST_WINDOW)
-        settled = settle_all(alignment, [Drift(share * d.shift, share * d.turn) for d in usual])
+    mended = Alignment((a, b), (Sim3(), pose), [(0, 1)], scaled)
+    for _ in range(POSE_ROUNDS):
+        mended.mend_pose(FIRST_WINDOW)
+    for alignment, settled in _ever_stiffer((a, b), mended.poses, [(0, 1)], scaled, usual):
         if settled is None:
             return Bend(pose, (_rigid(a), _rigid(b)), reason="no walls of the one map are near those of the other")
-        bent = alignment.deformations(settled.covariance)
+        bent = alignment.deformations(settled)
         if min(d.least_growth for d in bent) >= LEAST_GROWTH:
             return Bend(alignment.poses[1], (bent[0], bent[1]), _features(alignment, settled))
     return Bend(pose, (_rigid(a), _rigid(b)), reason="bending would fold space")
@@ -138,17 +137,25 @@ def bend_together(
     usual = drifts_of([maps[name].sensor for name in names])
     if all(d.rigid for d in usual):
         return dict(poses), {}
-    for share in STIFFER:
-        start = [first.inverse() @ poses[name] for name in names]
-        alignment = Alignment([maps[n] for n in names], start, [(place[i], place[j]) for i, j in pairs], scaled)
-        settled = settle_all(alignment, [Drift(share * d.shift, share * d.turn) for d in usual])
+    start = [first.inverse() @ poses[name] for name in names]
+    seen = [(place[i], place[j]) for i, j in pairs]
+    for alignment, settled in _ever_stiffer([maps[name] for name in names], start, seen, scaled, usual):
         if settled is None:
             return dict(poses), {}
-        bent = alignment.deformations(settled.covariance)
+        bent = alignment.deformations(settled)
         if min(d.least_growth for d in bent) >= LEAST_GROWTH:
             moved = {name: first @ alignment.poses[place[name]] for name in names}
             return moved, {name: bent[k] for name, k in place.items() if len(bent[k]) and not usual[k].rigid}
     return dict(poses), {}
+
+
+def _ever_stiffer(
+    maps: Sequence[Prepared], poses: Sequence[Sim3], pairs: Sequence[tuple[int, int]], scaled: bool, usual: Sequence[Drift]
+) -> Iterator[tuple[Alignment, Settled | None]]:
+    """The maps settled with their usual drift, then with less and less of it, for as long as they are asked for."""
+    for share in STIFFER:
+        alignment = Alignment(maps, poses, pairs, scaled)
+        yield alignment, settle_all(alignment, [Drift(share * d.shift, share * d.turn) for d in usual])
 
 
 def settle_all(alignment: Alignment, drifts: Sequence[Drift]) -> Settled | None:

@@ -8,10 +8,11 @@ one, with graduated non-convexity (Yang et al. 2020, RA-L 5(2); Geman-McClure), 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from topomerge.types import Array
 
@@ -53,14 +54,37 @@ class Measurements:
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """(n, 4) moves; (n, 3, 3) covariance of shift and turn; (m,) weight 0..1 of each measurement; (j,) squared misfit of each
-    joint, in variances; and (j, 4) what it is expected to be in each unknown, as far as the moves are uncertain."""
+    """Moves that settled, and what is computed of them when it is asked for: inverting costs more than solving.
+
+    Args:
+        moves: (n, 4).
+        weights: (m,) 0..1 of each measurement.
+        squares: (j, 4) squared misfit of each joint in each unknown, in variances.
+        factor: of the normal equations.
+        jointed: rows of the joints.
+    """
 
     moves: Array
-    covariance: Array
     weights: Array
-    strain: Array
-    expected_strain: Array
+    squares: Array
+    factor: SuperLU
+    jointed: sparse.csr_matrix
+
+    @property
+    def strain(self) -> Array:
+        """(j,) squared misfit of each joint, in variances."""
+        out: Array = self.squares.sum(axis=1)
+        return out
+
+    @property
+    def expected_strain(self) -> Array:
+        """(j, 4) what the squares are expected to be, as far as the moves are uncertain; nan for joints beyond a sample."""
+        return self.squares + _joint_variance(self.factor, self.jointed)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(n, 3, 3) of shift and turn of each piece."""
+        return _covariance(self.factor, len(self.moves))
 
 
 def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array) -> Settled:
@@ -90,11 +114,10 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
         weights = (relaxed * OUTLIER / (chi + relaxed * OUTLIER)) ** 2
     moves = np.where(prior.ravel() > 0, moves, 0.0)
     squares = (jointed @ moves).reshape(-1, UNKNOWNS) ** 2
-    expected = squares + _joint_variance(factor, jointed)
-    return Settled(moves.reshape(n, UNKNOWNS), _covariance(factor, n), weights, squares.sum(axis=1), expected)
+    return Settled(moves.reshape(n, UNKNOWNS), weights, squares, factor, jointed)
 
 
-def _joint_variance(factor: object, jointed: sparse.csr_matrix) -> Array:
+def _joint_variance(factor: SuperLU, jointed: sparse.csr_matrix) -> Array:
     """(j, 4) variance that is left to each joint, in its variances before all measurements; nan for those beyond a sample."""
     many = jointed.shape[0] // UNKNOWNS
     out = np.full((many, UNKNOWNS), np.nan)
@@ -103,12 +126,12 @@ def _joint_variance(factor: object, jointed: sparse.csr_matrix) -> Array:
     chosen = np.arange(many)[:: max(many // SAMPLED_JOINTS, 1)]
     rows = (UNKNOWNS * chosen[:, None] + np.arange(UNKNOWNS)).ravel()
     sampled = jointed[rows].toarray()
-    left = np.einsum("ij,ji->i", sampled, factor.solve(np.ascontiguousarray(sampled.T)))  # type: ignore[attr-defined]
+    left = np.einsum("ij,ji->i", sampled, factor.solve(np.ascontiguousarray(sampled.T)))
     out[chosen] = left.reshape(-1, UNKNOWNS)
     return out
 
 
-def _covariance(factor: object, n: int) -> Array:
+def _covariance(factor: SuperLU, n: int) -> Array:
     """(n, 3, 3) of each piece by itself."""
     out = np.zeros((n, 3, 3))
     for k in range(3):
@@ -117,7 +140,7 @@ def _covariance(factor: object, n: int) -> Array:
             ones = np.zeros((n * UNKNOWNS, many))
             at = UNKNOWNS * (start + np.arange(many))
             ones[at + k, np.arange(many)] = 1.0
-            solved = factor.solve(ones)  # type: ignore[attr-defined]
+            solved = factor.solve(ones)
             for j in range(3):
                 out[start : start + many, j, k] = solved[at + j, np.arange(many)]
     return out

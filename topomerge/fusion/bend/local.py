@@ -83,17 +83,17 @@ def _rasters(fields: PlanFields, main: float) -> tuple[Array, Array, Array, Arra
 def samples(pieces: Pieces) -> tuple[Array, Array]:
     """Rows of walls by which each piece is registered, with those near it, and where each piece's begin: (n + 1,)."""
     rng = np.random.default_rng(0)
+    along = np.argsort(pieces.walls[:, 0], kind="stable")  # so that a piece is compared with the walls of its own strip only
+    x = pieces.walls[along, 0]
+    own = np.split(np.argsort(pieces.owner, kind="stable"), np.cumsum(np.bincount(pieces.owner, minlength=len(pieces)))[:-1])
     rows, start = [], [0]
     for k in range(len(pieces)):
-        own = pieces.walls[pieces.owner == k]
-        same = pieces.storey[pieces.owner] == pieces.storey[k]
-        near = (
-            same
-            & (pieces.walls >= own.min(axis=0) - CONTEXT).all(axis=1)
-            & (pieces.walls <= own.max(axis=0) + CONTEXT).all(axis=1)
-        )
-        tall = near & pieces.tall  # furniture is moved, and no wall
-        chosen = np.flatnonzero(tall if tall.sum() >= LEAST_TALL * near.sum() else near)
+        low, high = pieces.walls[own[k]].min(axis=0) - CONTEXT, pieces.walls[own[k]].max(axis=0) + CONTEXT
+        strip = np.sort(along[np.searchsorted(x, low[0]) : np.searchsorted(x, high[0], side="right")])
+        y = pieces.walls[strip, 1]
+        near = strip[(y >= low[1]) & (y <= high[1]) & (pieces.storey[pieces.owner[strip]] == pieces.storey[k])]
+        tall = near[pieces.tall[near]]  # furniture is moved, and no wall
+        chosen = tall if len(tall) >= LEAST_TALL * len(near) else near
         if len(chosen) > PIECE_POINTS:
             chosen = np.sort(rng.permutation(chosen)[:PIECE_POINTS])
         rows.append(chosen)
