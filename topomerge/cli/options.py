@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,11 +75,17 @@ DESCRIPTOR = option(
     metavar="NAME",
     help="learned (default: the embedder that ships), engineered, shapedna, feather, or the folder of a trained embedder",
 )
+SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of fusion/bend/drift.json
 CONTEXT_STEPS = option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)")
 CLOUD_OPTIONS = (
     option("--voxel-size", type=above_zero, metavar="E", help="edge length of a cell where a cloud is given, m (default 0.1)"),
     UP,
     UNIT,
+    option(
+        "--sensor",
+        choices=SENSORS,
+        help="what measured the clouds, by which merge knows how much a map may bend (default: unknown, like a phone)",
+    ),
 )
 
 
@@ -100,6 +107,7 @@ def map_from(path: str, args: argparse.Namespace) -> TopometricMap:
             with Bars(enabled=not getattr(args, "quiet", False)) as bars:
                 chunks = read_chunks(path, **given(args, "up", "unit"), progress=bars.task("read"))
                 topomap = extract(chunks, **given(args, "voxel_size"), name=path, progress=bars.task("extract"))
+            topomap = replace(topomap, parameters={**topomap.parameters, **given(args, "sensor")})
     except InputError as error:
         raise InputError(str(error) if path in str(error) else f"{path}: {error}") from error
     warn(topomap.warnings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from topomerge.errors import InputError
 from topomerge.fusion.storey_levels import extruded, slices
@@ -33,17 +34,22 @@ def sensor_drift(sensor: str, fitted: bool = False) -> Drift:
     Raises:
         InputError: none that is listed in `drift.json`.
     """
-    sensors = read_weights_json("topomerge.fusion.bend", "drift.json")
+    sensors = _fitted_drifts()
     if sensor not in sensors:
         raise InputError(f"sensor must be one of {', '.join(sorted(sensors))}, not {sensor!r}")
     softer = 1.0 if sensor == "unknown" or fitted else SOFTER
     return Drift(softer * float(sensors[sensor]["shift"]), softer * float(sensors[sensor]["turn"]))
 
 
+def _fitted_drifts() -> dict[str, Any]:
+    return read_weights_json("topomerge.fusion.bend", "drift.json")
+
+
 def map_sensor(map: TopometricMap | VoxelGrid) -> str:
-    """The sensor of a map: the one that its parameters name; else a drawing or a slice where it looks like one, or unknown."""
+    """The sensor of a map: the one that its parameters name; else a drawing or a slice where it looks like one, or unknown. A
+    name that nobody fitted a drift to says nothing."""
     named = map.parameters.get("sensor") if isinstance(map, TopometricMap) else None
-    if isinstance(named, str) and named:
+    if isinstance(named, str) and named in _fitted_drifts():
         return named
     grid = map.grid if isinstance(map, TopometricMap) else map
     if extruded(grid):
