@@ -41,6 +41,17 @@ def test_the_other_way_round_is_the_inverse(halves):
     assert there.probability == back.probability
 
 
+@pytest.mark.parametrize("up", [0.0, 0.035, 0.07])
+def test_bent_maps_lie_as_high_as_rigid_ones(points, up):
+    """Bending is level: the height is that of the fine registration, finer than a cell."""
+    raised = Sim3(MOVE.yaw, (*MOVE.translation[:2], up))
+    a, b = grid_of(part(points, high=(16, 99))), grid_of(part(points, low=(5, -99)), raised)
+    bent, rigid = register(a, b), register(a, b, rigid=True)
+    assert bent.bend is not None and bent.bend.transform == bent.transform
+    assert bent.transform.translation[2] == pytest.approx(-up, abs=0.01)
+    assert bent.transform.translation[2] == rigid.transform.translation[2]
+
+
 def test_order_of_cells_changes_nothing(halves):
     a, b = halves
     rows = np.random.default_rng(0).permutation(len(a))

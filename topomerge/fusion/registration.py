@@ -102,8 +102,13 @@ def register(
     bent, winner = judged_as_bent(a, b, ranked[0].transform, scale == "free")
     clock("bend")
     pose, rmse = bent.transform, winner.get("rmse", float("nan"))
-    if (rigid or bent.reason) and not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
-        pose, rmse = fine(a, b, ranked[0].transform, scale == "free")
+    if not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
+        aligned, misfit = fine(a, b, ranked[0].transform, scale == "free")
+        if rigid or bent.reason:
+            pose, rmse = aligned, misfit
+        else:  # bending is level: floors and ceilings say how high
+            pose = replace(pose, translation=(*pose.translation[:2], aligned.translation[2]))
+            bent = replace(bent, transform=pose)
     clock("refine")
     return replace(_verdict(ranked, winner, pose, rmse, clock.seconds), bend=None if rigid else bent)
 

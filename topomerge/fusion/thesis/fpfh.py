@@ -63,21 +63,23 @@ def sampled_pose(a: Features, b: Features, seed: int = 0) -> Sim3 | None:
     Open3D knows no gravity: of the pose that it gives the turn about the vertical is taken.
     """
     import open3d
+    from threadpoolctl import threadpool_limits
 
     registration = open3d.pipelines.registration
     open3d.utility.random.seed(seed)
-    result = registration.registration_ransac_based_on_feature_matching(
-        b.cloud,
-        a.cloud,
-        b.histograms,
-        a.histograms,
-        mutual_filter=False,
-        max_correspondence_distance=INLIER_DISTANCE,
-        estimation_method=registration.TransformationEstimationPointToPoint(False),
-        ransac_n=3,
-        checkers=[registration.CorrespondenceCheckerBasedOnEdgeLength(EDGE_RATIO)],
-        criteria=registration.RANSACConvergenceCriteria(TRIPLES, CONFIDENCE),
-    )
+    with threadpool_limits(1):  # threads draw from one generator, in an order that differs from run to run
+        result = registration.registration_ransac_based_on_feature_matching(
+            b.cloud,
+            a.cloud,
+            b.histograms,
+            a.histograms,
+            mutual_filter=False,
+            max_correspondence_distance=INLIER_DISTANCE,
+            estimation_method=registration.TransformationEstimationPointToPoint(False),
+            ransac_n=3,
+            checkers=[registration.CorrespondenceCheckerBasedOnEdgeLength(EDGE_RATIO)],
+            criteria=registration.RANSACConvergenceCriteria(TRIPLES, CONFIDENCE),
+        )
     matrix = np.asarray(result.transformation)
     if result.fitness == 0 or matrix[2, 2] < LEAST_UPRIGHT:
         return None
