@@ -165,7 +165,7 @@ def grid_rows(item: GridItem) -> list[Row]:
         made = make_grids(item, [], folder)
         if made.reason:
             raise InputError(made.reason)
-        pair = load_grids(Path(folder) / f"{item.name}.npz", mean=True)
+        pair = load_grids(Path(folder) / f"{item.name}.npz")
     return [merge_row(pair, physical_building("procedural", str(pair.about["building"])))]
 
 

@@ -39,7 +39,6 @@ from topomerge.fusion.bend.drift import Drift, sensor_drift
 from topomerge.fusion.prepared import Prepared, prepare
 from topomerge.fusion.registration import register
 from topomerge.training.belief_hypotheses import error, right
-from topomerge.types import VoxelGrid
 
 Row = dict[str, Any]
 GROWTH_ROOMS = (10, 30, 100, 300, 1000)
@@ -49,8 +48,7 @@ OFFICE = "halmstad_office_f5"
 
 def prepared(pair: GridPair) -> tuple[Prepared, Prepared]:
     """Both maps as cells only."""
-    grids = (VoxelGrid(g.cells, g.origin, g.edge, g.shape) for g in (pair.a, pair.b))
-    a, b = (prepare(g, f) for g, f in zip(grids, pair.free, strict=True))
+    a, b = (prepare(g, f) for g, f in zip((pair.a, pair.b), pair.free, strict=True))
     return a, b
 
 

@@ -22,7 +22,7 @@ from benchmarks.merging.cached_pairs import SETS, pair_files
 from benchmarks.merging.register import real_pairs
 from benchmarks.merging.tables import modality
 from topomerge.errors import InputError
-from topomerge.fusion.cell_means import cell_middles
+from topomerge.extraction.cell_means import cell_middles
 from topomerge.types import Array, VoxelGrid
 
 HELDOUT = Path("cache/evaluation/heldout.jsonl")
@@ -120,7 +120,7 @@ def peer_pairs(what: str, done: set[str]) -> Iterator[PeerPair]:
     left = [path for path in cached_order(what) if path.stem not in done]
     items = raw_items({path.stem for path in left}) if what == "raw" else {}
     for path in left:
-        pair = load_grids(path, mean=True)
+        pair = load_grids(path)
         yield raw(pair, *items[path.stem]) if what == "raw" else thinned(pair)
 
 
@@ -158,7 +158,7 @@ def heldout_pairs() -> Iterator[GridPair]:
         if evaluation_pair.transform is None or evaluation_pair.about["common"] < 1 or evaluation_pair.about["scale_free"]:
             continue
         maps = evaluation_pair.maps()
-        a, b = (m.grid.with_properties(mean=m.grid.centroids()) for m in maps)
+        a, b = (m.grid for m in maps)
         about = {key: evaluation_pair.about[key] for key in ("sensors", "source")}
         about |= {"building": str(evaluation_pair.about["building"]), "kind": "overlap", "evaluation_pair": evaluation_pair}
         free, common = (maps[0].free, maps[1].free), evaluation_pair.about["common"]
@@ -170,6 +170,5 @@ def scaled(pair: GridPair) -> GridPair:
     size = pair.truth.scale if pair.truth is not None else 1.0
     if pair.truth is None or size == 1.0:
         return pair
-    grid = VoxelGrid(pair.b.cells, pair.b.origin * size, pair.b.edge * size, pair.b.shape)
-    grid = grid.with_properties(mean=np.asarray(pair.b.properties["mean"]) * size)
+    grid = VoxelGrid(pair.b.cells, pair.b.origin * size, pair.b.edge * size, pair.b.shape, pair.b.properties)
     return replace(pair, b=grid, free=(pair.free[0], None), truth=replace(pair.truth, scale=1.0))

@@ -30,6 +30,7 @@ from benchmarks.merging import peer_methods
 from benchmarks.merging.peer_calls import CALL_SECONDS, GuardedWork
 from benchmarks.merging.peer_pairs import PEER_SPLITS, PeerPair, described, peer_pairs, scaled
 from benchmarks.merging.register import SCALELESS, upright, where_from
+from topomerge.extraction.cell_means import cell_middles
 from topomerge.training.belief_hypotheses import error
 from topomerge.types import Array, PointCloud, VoxelGrid
 
@@ -57,7 +58,7 @@ def ours(given: PeerPair) -> Outcome:
 
     pair, free = given.pair, given.pair.about.get("source") in SCALELESS
     begun = time.process_time()
-    clouds = (given.a, np.asarray(pair.b.properties["mean"], float) if free else given.b)
+    clouds = (given.a, cell_middles(pair.b) if free else given.b)
     a, b = (voxelise(PointCloud(points), pair.a.edge) for points in clouds)
     registration = register(a, b, free=pair.free, scale="free" if free else "fixed")
     seconds = time.process_time() - begun
@@ -81,7 +82,7 @@ def whole(pair: GridPair) -> dict[str, float]:
 
 def cloud(grid: VoxelGrid, free: VoxelGrid | None = None) -> PointCloud:
     """A grid's points as a cloud."""
-    return PointCloud(np.asarray(grid.properties["mean"], np.float32), free=free)
+    return PointCloud(cell_middles(grid).astype(np.float32), free=free)
 
 
 def learned(pair: GridPair) -> Outcome:

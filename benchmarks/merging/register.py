@@ -70,7 +70,7 @@ def simulated_pairs(split: str, limit: int, skip: set[str]) -> Iterator[GridPair
     """The first cached pairs of a split, but for those named."""
     for path in pair_files(split, ("overlap",) if split.endswith("_drawings") else ())[:limit]:
         if path.stem not in skip:
-            yield load_grids(path, mean=True)
+            yield load_grids(path)
 
 
 def run(split: str, limit: int, target: Path) -> None:

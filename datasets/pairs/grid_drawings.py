@@ -171,9 +171,8 @@ def drawing_arrays(path: Path, here: Place, there: Place, storey: int, kind: str
     flat = draw(there.building, storey).moved(replace(frame, translation=(*frame.translation[:2], 0.0)))
     floor = float(there.building.storeys["floor"][storey])
     grid = grid_of(raise_flat(replace(flat, rooms=()), frame.translation[2] + frame.scale * floor))
-    offset = (grid.properties["mean"] - grid.cell_bounds(grid.cells)[0]) / grid.edge
     out |= {"b.cells": grid.cells.astype(np.int16), "b.origin": grid.origin, "b.shape": np.array(grid.shape)}
-    out["b.mean"] = np.clip(offset * 256, 0, 255).astype(np.uint8)
+    out["b.mean"] = grid.properties["offset"]
     truth = here.frame @ frame.inverse() if kind in ("overlap", "other-storey") else None
     out["truth"] = np.full((4, 4), np.nan) if truth is None else truth.matrix
     sensor = about["sensors"]["ab".index(here.side)]

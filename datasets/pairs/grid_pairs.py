@@ -22,8 +22,8 @@ from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.pairs.recipe import Library, Recipe, check, library
 
 from topomerge.errors import InputError
+from topomerge.extraction.cell_means import with_means
 from topomerge.extraction.voxels import voxelise
-from topomerge.fusion.cell_means import with_means
 from topomerge.io import archive
 from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
 
@@ -185,7 +185,7 @@ def make_grids(item: GridItem, plans: list[tuple[object, ...]], folder: str) -> 
 
 
 def grid_of(cloud: PointCloud) -> VoxelGrid:
-    """Occupied cells with the middle of their points."""
+    """Occupied cells with the middle of their points, rounded as in the files that are cached."""
     return with_means(voxelise(cloud, GRID_EDGE), cloud.points.astype(np.float64) + cloud.shift)
 
 
@@ -266,27 +266,24 @@ def pair_arrays(pair: Pair, about: dict[str, object]) -> dict[str, Array]:
 
 def grid_arrays(side: str, grid: VoxelGrid, empty: VoxelGrid | None) -> dict[str, Array]:
     """What is cached of a map: occupied cells with the middles of their points, and empty cells where they are known."""
-    offset = (grid.properties["mean"] - grid.cell_bounds(grid.cells)[0]) / grid.edge
     out = {f"{side}.cells": grid.cells.astype(np.int16), f"{side}.origin": grid.origin, f"{side}.shape": np.array(grid.shape)}
-    out[f"{side}.mean"] = np.clip(offset * 256, 0, 255).astype(np.uint8)
+    out[f"{side}.mean"] = grid.properties["offset"]
     return out if empty is None else {**out, f"{side}.free": empty.cells.astype(np.int16)}
 
 
-def load_grids(path: str | Path, mean: bool = False) -> GridPair:
-    """A cached pair; `mean`: with the middles of the points of each cell, which maps that were extracted do not have."""
-    return unpacked(Path(path).stem, archive.read(path, "cached pair"), mean)
+def load_grids(path: str | Path) -> GridPair:
+    """A cached pair."""
+    return unpacked(Path(path).stem, archive.read(path, "cached pair"))
 
 
-def unpacked(name: str, data: Mapping[str, Array], mean: bool = False) -> GridPair:
+def unpacked(name: str, data: Mapping[str, Array]) -> GridPair:
     """The pair of the arrays of a file."""
     about = json.loads(data["about"].tobytes())
     grids, free = [], []
     for side in "ab":
         shape = tuple(int(s) for s in data[f"{side}.shape"])
         cells, origin = data[f"{side}.cells"].astype(np.int32), data[f"{side}.origin"]
-        middle = origin + (cells + (data[f"{side}.mean"] + 0.5) / 256) * GRID_EDGE
-        properties = {"mean": middle.astype(np.float32)} if mean else {}
-        grids.append(VoxelGrid(cells, origin, GRID_EDGE, shape, properties))  # type: ignore[arg-type]
+        grids.append(VoxelGrid(cells, origin, GRID_EDGE, shape, {"offset": data[f"{side}.mean"]}))  # type: ignore[arg-type]
         empty = data.get(f"{side}.free")
         free.append(None if empty is None else VoxelGrid(empty.astype(np.int32), origin, GRID_EDGE, shape))  # type: ignore[arg-type]
     truth = sim3_of(data["truth"])

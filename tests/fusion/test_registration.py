@@ -55,7 +55,7 @@ def test_bent_maps_lie_as_high_as_rigid_ones(points, up):
 def test_order_of_cells_changes_nothing(halves):
     a, b = halves
     rows = np.random.default_rng(0).permutation(len(a))
-    shuffled = VoxelGrid.from_cells(a.cells[rows], a.origin, a.edge, a.shape, {"mean": a.properties["mean"][rows]})
+    shuffled = VoxelGrid.from_cells(a.cells[rows], a.origin, a.edge, a.shape, {"offset": a.properties["offset"][rows]})
     assert register(shuffled, b).transform == register(a, b).transform
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from topomerge.extraction.cell_means import MIDDLE
 from topomerge.extraction.scan import Scan
 from topomerge.kernels.carve import carve
 from topomerge.types import Array, VoxelGrid
@@ -41,7 +42,7 @@ def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, where they are known.
     """
     low = int(np.sort(grid.cells[:, 2])[int(0.01 * len(grid))])
-    columns = np.unique(grid.cells[:, :2], axis=0)
+    columns, column = np.unique(grid.cells[:, :2], axis=0, return_inverse=True)
     wall = np.zeros(grid.shape[:2], bool)
     wall[tuple(columns.T)] = True
     inside = _crossed(grid, *rays) if rays is not None else _enclosed(wall, grid.edge)
@@ -51,7 +52,13 @@ def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
     walls = np.column_stack([np.repeat(columns, len(levels), axis=0), np.tile(levels, len(columns))])
     shape = (grid.shape[0], grid.shape[1], max(grid.shape[2], low + high + 1))
     floor = np.column_stack([np.argwhere(inside), np.full(int(inside.sum()), low)])
-    return VoxelGrid.from_cells(np.concatenate([walls, floor]), grid.origin, grid.edge, shape)
+    offset = np.full((len(walls) + len(floor), 3), MIDDLE, np.uint8)
+    if "offset" in grid.properties:  # a wall stands where the points of its column are
+        many = np.bincount(column.ravel())
+        for k in (0, 1):
+            mean = np.bincount(column.ravel(), grid.properties["offset"][:, k]) / many
+            offset[: len(walls), k] = np.repeat(mean, len(levels))
+    return VoxelGrid.from_cells(np.concatenate([walls, floor]), grid.origin, grid.edge, shape, {"offset": offset})
 
 
 def _crossed(grid: VoxelGrid, starts: Array, ends: Array) -> Array:

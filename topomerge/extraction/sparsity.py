@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from topomerge.extraction.cell_means import cell_middles, with_means
 from topomerge.extraction.convolution import convolve, moore
 from topomerge.types import VoxelGrid
 
@@ -19,6 +20,8 @@ def without_gaps(grid: VoxelGrid, neighbours: float, warnings: list[str]) -> Vox
         warnings: what the user should know is appended here.
     """
     while len(grid) and 2 * grid.edge <= COARSEST_CELL and float(np.median(convolve(grid, moore()))) < neighbours:
-        grid = grid.coarser(2)
+        fine, grid = grid, grid.coarser(2)
+        if "offset" in fine.properties:
+            grid = with_means(grid, cell_middles(fine), fine.properties.get("count"))
         warnings.append(f"the points are sparse: cells of {grid.edge:g} m were taken")
     return grid

@@ -20,11 +20,13 @@ STRAY_DISTANCE = 10.0
 STRAY_SHARE = 0.01
 STRAY_TOTAL_SHARE = 0.05  # of all cells may be strays
 PENDING_CELLS = 4_000_000  # cells of pending chunks
+_Lattice = tuple[Array, Array, Array]  # cells (n, 3), counts (n,), sums (n, 3): `kernels.voxelise.occupied`
 LARGE_VOLUME = 2e8  # cells: 200 x 200 x 5 m at 0.1 m; smaller grids cost little whatever is in them
 
 
 def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1, warnings: list[str] | None = None) -> VoxelGrid:
-    """Occupied cells of a point cloud, with the property ``count``, the number of points in each.
+    """Occupied cells of a point cloud, with the properties ``count``, the number of points in each, and ``offset``, where in it
+    they lie on average (`cell_means`).
 
     V_min is a multiple of the edge length, so the cells of a cloud do not depend on what else is in the file or on its order.
 
@@ -44,7 +46,7 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
         chunks = [PointCloud(cloud)]
     else:
         chunks = cloud
-    cells, counts = _gather(chunks, edge)
+    cells, counts, sums = _gather(chunks, edge)
     if not len(cells):
         raise InputError("no finite point: nothing to voxelise")
     base, shape = _box(cells)
@@ -56,38 +58,41 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
             dropped = int(counts[~connected].sum())
             said = "1 stray point lies" if dropped == 1 else f"{dropped} stray points lie"
             warn(warnings, f"{said} more than {STRAY_DISTANCE:g} m from the rest: left out")
-            cells, counts = cells[connected], counts[connected]
+            cells, counts, sums = cells[connected], counts[connected], sums[connected]
             base, shape = _box(cells)
     if (shape > morton.AXIS_LIMIT).any() or _volume(shape) / 512 > lookup.MAX_BRICKS:
         extent = " x ".join(f"{s * edge:.0f}" for s in shape)
         raise InputError(f"the points span {extent} m: too large for {edge:g} m voxels; check --unit, or crop the file")
     size = (int(shape[0]), int(shape[1]), int(shape[2]))
-    return VoxelGrid.from_cells(cells - base, base * edge, edge, size, {"count": counts})
+    offset = (sums + counts[:, None] // 2) // counts[:, None]
+    return VoxelGrid.from_cells(cells - base, base * edge, edge, size, {"count": counts, "offset": offset.astype(np.uint8)})
 
 
-def _gather(chunks: Iterable[PointCloud], edge: float) -> tuple[Array, Array]:
-    """Lattice cells and counts of all chunks. Pending chunks are merged when they outgrow what is merged already."""
-    merged = (np.zeros((0, 3), np.int64), np.zeros(0, np.int64))
-    pending: list[tuple[Array, Array]] = []
+def _gather(chunks: Iterable[PointCloud], edge: float) -> _Lattice:
+    """Lattice cells of all chunks. Pending chunks are merged when they outgrow what is merged already."""
+    merged: _Lattice = (np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.int64))
+    pending: list[_Lattice] = []
     for chunk in chunks:
-        base, cells, counts = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), edge)
-        pending.append((cells + base, counts))
-        if sum(len(c) for c, _ in pending) > max(len(merged[0]), PENDING_CELLS):
+        base, cells, counts, sums = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), edge)
+        pending.append((cells + base, counts, sums))
+        if sum(len(part[0]) for part in pending) > max(len(merged[0]), PENDING_CELLS):
             merged, pending = _merge([merged, *pending]), []
     return _merge([merged, *pending])
 
 
-def _merge(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    parts = [p for p in parts if len(p[0])]
-    if len(parts) <= 1:
-        return parts[0] if parts else (np.zeros((0, 3), np.int64), np.zeros(0, np.int64))
-    cells, counts = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+def _merge(parts: list[_Lattice]) -> _Lattice:
+    filled = [p for p in parts if len(p[0])] or parts[:1]
+    if len(filled) == 1:
+        return filled[0]
+    cells, counts, sums = (np.concatenate(arrays) for arrays in zip(*filled, strict=True))
     base = cells.min(axis=0)
     if ((cells.max(axis=0) - base) < morton.AXIS_LIMIT).all():
         _, first, inverse = np.unique(morton.encode(cells - base), return_index=True, return_inverse=True)
     else:
         _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    return cells[first], np.bincount(inverse.ravel(), counts, len(first)).astype(np.int64)
+    total = (np.bincount(inverse.ravel(), weights, len(first)).astype(np.int64) for weights in (counts, *sums.T))
+    number, *axes = total
+    return cells[first], number, np.column_stack(axes)
 
 
 def _box(cells: Array) -> tuple[Array, Array]:

@@ -9,11 +9,11 @@ from functools import cache, cached_property
 
 import numpy as np
 
+from topomerge.extraction.cell_means import cell_middles
 from topomerge.fusion.bend.drift import map_sensor
 from topomerge.fusion.bend.lines import WallLines, wall_lines
 from topomerge.fusion.bend.local import Target, samples
 from topomerge.fusion.bend.pieces import Pieces, pieces_of
-from topomerge.fusion.cell_means import cell_middles
 from topomerge.fusion.refine import Surface, surface
 from topomerge.fusion.storey_plan import plans
 from topomerge.matching.plan_fields import PlanFields

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from topomerge.extraction.plans.storey_plan import USUAL_HEIGHT
-from topomerge.fusion.cell_means import cell_middles
 from topomerge.types import Array, VoxelGrid
 
 STOREY_GAP = 1.9  # m of empty height between a floor and its ceiling
@@ -42,7 +41,7 @@ def slices(grid: VoxelGrid) -> list[float]:
 
     Nearly all cells lie in a few thin layers, and these show lines, where floors and ceilings would show areas.
     """
-    z = cell_middles(grid)[:, 2]
+    z = grid.centroids()[:, 2]
     if float(np.ptp(z)) + grid.edge <= SLICE_HEIGHT:
         return [] if _filled(grid.cells, grid.edge) else [float(np.median(z))]
     thick = max(round(SLICE_HEIGHT / 2 / grid.edge), 1)

@@ -22,7 +22,6 @@ from topomerge.extraction.plans.storey_plan import (
     observed_bands,
     wall_columns,
 )
-from topomerge.fusion.cell_means import cell_middles
 from topomerge.fusion.storey_levels import SLICE_HEIGHT, extruded, levels, lines_of, slices
 from topomerge.kernels.plan import column_bits, on_lines
 from topomerge.types import Array, TopometricMap, VoxelGrid
@@ -54,7 +53,7 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
     if extruded(grid):
         grid, free = lines_of(grid)
     cell = max(cell, grid.edge)
-    points = cell_middles(grid)
+    points = grid.centroids()  # as the verdict was fitted: to half a cell
     corner = grid.origin[:2]  # columns are those of the cells: on another lattice some get two rows of cells, and some none
     low = np.floor((points[:, :2].min(axis=0) - corner) / cell + 1e-6).astype(np.int64)
     columns = np.floor((points[:, :2] - corner) / cell + 1e-6).astype(np.int64) - low

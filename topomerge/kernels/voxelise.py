@@ -1,4 +1,4 @@
-"""Points -> occupied lattice cells with counts, in two passes over a coarse table of bricks (8 x 8 x 8 cells)."""
+"""Points -> occupied lattice cells with counts and sums, in three passes over a coarse table of bricks (8 x 8 x 8 cells)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from topomerge.kernels import morton
 
 TABLE_REACH = 1 << 10  # cells around the median point that `_split` puts into a table, which is then small enough
+OFFSET_STEPS = 256  # in which the way through a cell is divided
 MAX_TABLE = 1 << 26  # bricks of the dense table; larger extents are sorted instead
 
 
@@ -51,13 +52,22 @@ def _cell(points, i, shift, edge):  # type: ignore[no-untyped-def]  # pragma: no
     )
 
 
+@njit(cache=True, error_model="numpy")
+def _part(points, i, shift, edge, cell, axis):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Which of the `OFFSET_STEPS` parts of its cell the finite point i lies in, along an axis."""
+    part = np.int64(((points[i, axis] + shift[axis]) / edge - cell) * OFFSET_STEPS)
+    return min(max(part, 0), OFFSET_STEPS - 1)
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
-def to_lattice(points, shift, edge, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Lattice cell of each point; points that are not finite get the lowest integer."""
+def to_lattice(points, shift, edge, out, parts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Lattice cell of each point, and its part of the cell; points that are not finite get the lowest integer."""
     for i in prange(len(points)):
         finite, x, y, z = _cell(points, i, shift, edge)
         if finite:
             out[i, 0], out[i, 1], out[i, 2] = x, y, z
+            for k in range(3):
+                parts[i, k] = _part(points, i, shift, edge, out[i, k], k)
         else:
             out[i, 0] = out[i, 1] = out[i, 2] = np.iinfo(np.int64).min
 
@@ -71,24 +81,42 @@ def mark(points, shift, edge, base, table):  # type: ignore[no-untyped-def]  # p
             table[(x - base[0]) >> 3, (y - base[1]) >> 3, (z - base[2]) >> 3] = 1
 
 
+@njit(cache=True)
+def _code(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Place of a cell in its brick, in Morton order."""
+    x3, y3, z3 = x & 7, y & 7, z & 7
+    code = (x3 & 1) | (y3 & 1) << 1 | (z3 & 1) << 2
+    code |= (x3 & 2) << 2 | (y3 & 2) << 3 | (z3 & 2) << 4
+    return code | (x3 & 4) << 4 | (y3 & 4) << 5 | (z3 & 4) << 6
+
+
 @njit(cache=True, error_model="numpy")
 def count(points, shift, edge, base, table, counts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Second pass: points in each cell of the bricks in use; within a brick cells stand in Morton order."""
+    """Second pass: points in each cell of the bricks in use."""
     for i in range(len(points)):
         finite, x, y, z = _cell(points, i, shift, edge)
-        if not finite:
-            continue
-        cx, cy, cz = x - base[0], y - base[1], z - base[2]
-        x3, y3, z3 = cx & 7, cy & 7, cz & 7
-        code = (x3 & 1) | (y3 & 1) << 1 | (z3 & 1) << 2
-        code |= (x3 & 2) << 2 | (y3 & 2) << 3 | (z3 & 2) << 4
-        code |= (x3 & 4) << 4 | (y3 & 4) << 5 | (z3 & 4) << 6
-        counts[table[cx >> 3, cy >> 3, cz >> 3], code] += 1
+        if finite:
+            cx, cy, cz = x - base[0], y - base[1], z - base[2]
+            counts[table[cx >> 3, cy >> 3, cz >> 3], _code(cx, cy, cz)] += 1
 
 
-def occupied(
-    points: NDArray[Any], shift: NDArray[Any], edge: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+@njit(cache=True, error_model="numpy")
+def add_parts(points, shift, edge, base, table, rows, sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Third pass: sums (n, 3) of the parts of their cells that points lie in; rows as `counts`, number of each cell."""
+    for i in range(len(points)):
+        finite, x, y, z = _cell(points, i, shift, edge)
+        if finite:
+            cx, cy, cz = x - base[0], y - base[1], z - base[2]
+            row = rows[table[cx >> 3, cy >> 3, cz >> 3], _code(cx, cy, cz)]
+            sums[row, 0] += _part(points, i, shift, edge, x, 0)
+            sums[row, 1] += _part(points, i, shift, edge, y, 1)
+            sums[row, 2] += _part(points, i, shift, edge, z, 2)
+
+
+Occupied = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+
+
+def occupied(points: NDArray[Any], shift: NDArray[Any], edge: float) -> Occupied:
     """Occupied lattice cells of one chunk of points.
 
     Args:
@@ -97,11 +125,12 @@ def occupied(
         edge: edge length of a cell, m.
 
     Returns:
-        base (3,) int64; cells (n, 3) int64 relative to it, not negative; their counts (n,) int64.
+        base (3,) int64; cells (n, 3) int64 relative to it, not negative; their counts (n,) int64; (n, 3) int64 sums over their
+        points of which of `OFFSET_STEPS` parts of the cell they lie in: whole numbers, so that no order of points matters.
     """
     low, high, _ = bounds(points)
     if not np.isfinite(low).all():
-        return np.zeros(3, np.int64), np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
+        return np.zeros(3, np.int64), np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.int64)
     first = np.floor((low + shift) / edge).astype(np.int64)
     last = np.floor((high + shift) / edge).astype(np.int64)
     base = (first >> 3) << 3
@@ -117,23 +146,28 @@ def occupied(
     count(points, shift, edge, base, table, counts)
     which, code = np.nonzero(counts)
     cells = (bricks[which] << 3) + morton.decode(code)
-    return base, cells, counts[which, code].astype(np.int64)
+    numbers = counts[which, code].astype(np.int64)
+    counts[which, code] = np.arange(len(which))
+    sums = np.zeros((len(which), 3), np.int64)
+    add_parts(points, shift, edge, base, table, counts, sums)
+    return base, cells, numbers, sums
 
 
-def _split(
-    points: NDArray[Any], shift: NDArray[Any], edge: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _split(points: NDArray[Any], shift: NDArray[Any], edge: float) -> Occupied:
     """`occupied` for an extent too large for a table: a table around the median point, the points far from it sorted."""
-    cells = np.empty((len(points), 3), np.int64)
-    to_lattice(points, shift, edge, cells)
-    cells = cells[cells[:, 0] != np.iinfo(np.int64).min]
+    cells, parts = np.empty((len(points), 3), np.int64), np.zeros((len(points), 3), np.uint8)
+    to_lattice(points, shift, edge, cells, parts)
+    finite = cells[:, 0] != np.iinfo(np.int64).min
+    cells, parts = cells[finite], parts[finite]
     middle = np.median(cells[:: max(len(cells) // 100_000, 1)], axis=0).astype(np.int64)
     near = (np.abs(cells - middle) < TABLE_REACH).all(axis=1)
-    occupied_cells, counts = np.unique(cells[~near], axis=0, return_counts=True)
+    occupied_cells, row, counts = np.unique(cells[~near], axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(occupied_cells), 3), np.int64)
+    np.add.at(sums, row.ravel(), parts[~near])
     if near.any():
-        points_near = (cells[near] - middle + 0.5).astype(np.float32)
-        base, inner, inner_counts = occupied(points_near, np.zeros(3), 1.0)
+        points_near = (cells[near] - middle + (parts[near] + 0.5) / OFFSET_STEPS).astype(np.float32)
+        base, inner, inner_counts, inner_sums = occupied(points_near, np.zeros(3), 1.0)
         occupied_cells = np.concatenate([inner + base + middle, occupied_cells])
-        counts = np.concatenate([inner_counts, counts])
+        counts, sums = np.concatenate([inner_counts, counts]), np.concatenate([inner_sums, sums])
     low = occupied_cells.min(axis=0)
-    return low, occupied_cells - low, counts
+    return low, occupied_cells - low, counts, sums
