@@ -22,6 +22,7 @@ from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.bend.deformation import Deformation
+from topomerge.fusion.joined_doors import joined_rooms, with_doors
 from topomerge.fusion.resampling import Laying, decoded, encoded, resampled
 from topomerge.fusion.single_walls import copies
 from topomerge.fusion.storey_levels import extruded
@@ -63,12 +64,12 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
         )
     cells = _JoinedCells(maps[poses[0][0]].grid.origin, _edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
+    layings = [Laying.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
     for n in order:
-        k, pose = poses[n]
-        laying = Laying.of(pose, (bends or {}).get(k), maps[k].grid.edge)
-        cells.add_map(maps[k], laying, int(first_bits[n]), parts[n].assumed and n != order[0])
+        cells.add_map(maps[poses[n][0]], layings[n], int(first_bits[n]), parts[n].assumed and n != order[0])
     name = " + ".join(maps[k].source or "map" for k, _ in poses)
-    return _extracted(cells, min(part.neighbours for part in parts), name)
+    joined = _extracted(cells, min(part.neighbours for part in parts), name)
+    return with_doors(joined, [(maps[k], laying) for (k, _), laying in zip(poses, layings, strict=True)])
 
 
 @dataclass(frozen=True)
@@ -213,15 +214,7 @@ def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3, bend: 
         bend: of the part, in its own frame, before it is posed; None: rigid.
     """
     rooms = np.full(len(part.rooms), -1, np.int64)
-    inside = part.navigable_room >= 0
-    floor = part.navigable.centroids(part.navigable.cells[inside])
-    cells = joined.navigable.locate(Laying.of(pose, bend).apply(floor))
-    joined_room = np.full(len(cells), -1, np.int64)
-    for up in (0, 1, -1, 2, -2):  # floors of two maps are seldom at one height to a cell
-        rows = joined.navigable.rows(cells + (0, 0, up))
-        missing = (joined_room < 0) & (rows >= 0)
-        joined_room[missing] = joined.navigable_room[rows[missing]]
-    part_room = part.navigable_room[inside]
+    joined_room, part_room = joined_rooms(part, joined, Laying.of(pose, bend)), part.navigable_room[part.navigable_room >= 0]
     for i in range(len(part.rooms)):
         votes = joined_room[part_room == i]
         votes = votes[votes >= 0]

@@ -1,0 +1,105 @@
+"""Doors of the maps that were joined -> doors of the joined map (method 4).
+
+In the joined map a door may be lost: its frame is seen twice, a little apart, or its leaf stood open in the one and was shut in
+the other map. What one map saw open stays a door. And where walls of two maps leave a gap, a door may seem to be: one that no
+map has, though one of them saw the floor on both its sides, is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from topomerge.fusion.resampling import Laying
+from topomerge.types import EDGE_DTYPE, Array, TopometricMap
+
+DOOR_SIDE = 1.0  # m around a door in which floor says which rooms it joins
+LEAST_FLOOR = 5  # cells of it, from which a map saw that side of a door
+ONE_DOOR = 1.2  # m: doors of two maps that are this close are one
+LEVEL_KINDS = ("door", "opening")
+
+
+def with_doors(joined: TopometricMap, parts: Sequence[tuple[TopometricMap, Laying]]) -> TopometricMap:
+    """The joined map with those doors and openings of its parts that it lacks, and without those that its parts deny.
+
+    Args:
+        parts: maps, and how each is laid into the joined one.
+    """
+    laid = [_LaidFloor.of(part, joined, laying) for part, laying in parts]
+    level = np.isin(joined.edges["kind"], LEVEL_KINDS)
+    edges = joined.edges[[not level[k] or _confirmed(edge, laid) for k, edge in enumerate(joined.edges)]]
+    for part in laid:
+        new = [door for door in part.doors if not _is_there(edges, door)]
+        edges = np.concatenate([edges, np.array(new, EDGE_DTYPE)])
+    return replace(joined, edges=edges[np.lexsort((*edges["centre"].T[::-1], *edges["rooms"].T[::-1]))])
+
+
+def joined_rooms(part: TopometricMap, joined: TopometricMap, laying: Laying) -> Array:
+    """(k,) room of the joined map, -1 none, in which each cell of the floor of a part's rooms lies (`navigable_room` >= 0)."""
+    cells = joined.navigable.locate(laying.apply(part.navigable.centroids(part.navigable.cells[part.navigable_room >= 0])))
+    out = np.full(len(cells), -1, np.int64)
+    for up in (0, 1, -1, 2, -2):  # floors of two maps are seldom at one height to a cell
+        rows = joined.navigable.rows(cells + (0, 0, up))
+        missing = (out < 0) & (rows >= 0)
+        out[missing] = joined.navigable_room[rows[missing]]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _LaidFloor:
+    """What a part says of doors, in the joined map.
+
+    Args:
+        floor: (k, 3) m, the floor of its rooms.
+        room: (k,) room of the joined map there, -1 none.
+        centres: (E, 3) m of its doors and openings.
+        doors: EDGE_DTYPE, those of them that lie between two rooms of the joined map.
+    """
+
+    floor: Array
+    room: Array
+    centres: Array
+    doors: Array
+
+    @classmethod
+    def of(cls, part: TopometricMap, joined: TopometricMap, laying: Laying) -> _LaidFloor:
+        inside = part.navigable_room >= 0
+        floor = laying.apply(part.navigable.centroids(part.navigable.cells[inside]))
+        room = joined_rooms(part, joined, laying)
+        doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)].copy()
+        for name in ("centre", "lower", "upper"):
+            doors[name] = laying.apply(doors[name])
+        doors["direction"] = (doors["direction"] + laying.pose.yaw) % np.pi
+        for name in ("width", "height"):
+            doors[name] *= laying.pose.scale
+        pairs = np.full((len(doors), 2), -1, np.int64)
+        for k, door in enumerate(doors):
+            near = (np.linalg.norm(floor - door["centre"], axis=1) < DOOR_SIDE) & (room >= 0)
+            for side, own in enumerate(door["rooms"]):
+                votes = room[near & (part.navigable_room[inside] == own)]
+                pairs[k, side] = np.bincount(votes).argmax() if len(votes) else -1
+        between = (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
+        doors["rooms"] = np.sort(pairs, axis=1)
+        return cls(floor, room, doors["centre"], doors[between])
+
+    def saw_both_sides(self, edge: Array) -> bool:
+        """Has it floor on both sides of an edge of the joined map?"""
+        near = self.room[np.linalg.norm(self.floor - edge["centre"], axis=1) < DOOR_SIDE]
+        return all(int((near == room).sum()) >= LEAST_FLOOR for room in edge["rooms"])
+
+
+def _confirmed(edge: Array, parts: Sequence[_LaidFloor]) -> bool:
+    """Has a part a door there, or did none see both sides?"""
+    at = np.concatenate([part.centres for part in parts])
+    if (np.linalg.norm(at - edge["centre"], axis=1) < ONE_DOOR).any():
+        return True
+    return not any(part.saw_both_sides(edge) for part in parts)
+
+
+def _is_there(edges: Array, door: Array) -> bool:
+    """Is a door among edges, between the same rooms and near enough?"""
+    same = (np.sort(edges["rooms"], axis=1) == door["rooms"]).all(axis=1)
+    apart = np.linalg.norm(edges["centre"][same] - door["centre"], axis=1)
+    return bool((apart <= max(ONE_DOOR, float(door["width"]) / 2)).any())
