@@ -17,6 +17,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from topomerge.types import Array
 
 UNKNOWNS = 4  # of a piece: shift x, y, turn, logarithm of the scale
+SETTLED_WEIGHTS = 0.005  # change of the weights, below which no further round is needed
 CONVEX_ROUNDS = 10  # of graduated non-convexity
 OUTLIER = 9.0  # square of the misfit, in standard deviations, from which a measurement is doubted
 SAMPLED_JOINTS = 120  # joints of which it is said how sure they are
@@ -106,15 +107,22 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
     relaxed = 0.0
     for k in range(CONVEX_ROUNDS):
         scaled = whitened.multiply(np.repeat(weights, 3)[:, None]).tocsr()
-        factor = splu((held + scaled.T @ whitened).tocsc())
+        factor = _factor(held + scaled.T @ whitened)
         moves = factor.solve(scaled.T @ aims.ravel())
         misfit = (whitened @ moves).reshape(-1, 3) - aims
         chi = (misfit**2).sum(axis=1)
         relaxed = max(2 * chi.max(initial=0) / OUTLIER, 1.0) if k == 0 else max(relaxed / 1.6, 1.0)
-        weights = (relaxed * OUTLIER / (chi + relaxed * OUTLIER)) ** 2
+        before, weights = weights, (relaxed * OUTLIER / (chi + relaxed * OUTLIER)) ** 2
+        if relaxed == 1.0 and np.abs(weights - before).max(initial=0.0) < SETTLED_WEIGHTS:
+            break
     moves = np.where(prior.ravel() > 0, moves, 0.0)
     squares = (jointed @ moves).reshape(-1, UNKNOWNS) ** 2
     return Settled(moves.reshape(n, UNKNOWNS), weights, squares, factor, jointed)
+
+
+def _factor(normal: sparse.spmatrix) -> SuperLU:
+    """The normal equations, which are symmetric and positive, factored: their order is chosen once for rows and columns."""
+    return splu(normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def _joint_variance(factor: SuperLU, jointed: sparse.csr_matrix) -> Array:
