@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.fusion.plans_of import MOVE, grid_of, office, part
-from topomerge.fusion.bend.bend import NEITHER_BENDS, Bend, bend, bend_together
+from topomerge.fusion.bend.bend import NEITHER_BENDS, NO_WALLS_NEAR, Bend, bend, bend_together
 from topomerge.fusion.bend.drift import Drift
 from topomerge.fusion.judge import Judge
 from topomerge.fusion.prepared import prepare
@@ -121,12 +123,20 @@ def test_one_room_stays_rigid(points):
     assert bent.reason == "the maps are one piece each"
 
 
+@pytest.mark.parametrize(("sensor", "up", "reason"), [("", 40.0, NO_WALLS_NEAR), ("drawing", 0.0, NEITHER_BENDS)])
+def test_many_maps_that_cannot_be_bent_say_why(straight, bent_map, sensor, up, reason):
+    maps = {k: replace(m, sensor=sensor) if sensor else m for k, m in ((0, straight), (1, bent_map))}
+    start = {0: Sim3(), 1: Sim3(0.0, (0.0, 0.0, up))}
+    assert bend_together(maps, start, [(0, 1)]) == (start, {}, reason)
+
+
 def test_many_maps_bend_together(points, straight, bent_map):
     """What the second map says straightens the third, which the first never saw."""
     west, east = part(points, high=(14, 99)), part(points, low=(10, -99))
     third = prepare(grid_of(bowed(part(east, low=(14, -99)))))
     maps = {0: prepare(grid_of(west)), 1: prepare(grid_of(points)), 2: third}
-    poses, bends = bend_together(maps, dict.fromkeys(maps, Sim3()), [(0, 1), (1, 2)])
+    poses, bends, reason = bend_together(maps, dict.fromkeys(maps, Sim3()), [(0, 1), (1, 2)])
+    assert not reason
     there = poses[2].apply(bends[2].apply(bowed(east)))
     here = poses[1].apply(bends[1].apply(east))
     gap = np.linalg.norm(there[:, :2] - here[:, :2], axis=1)[east[:, 0] > 15]

@@ -20,7 +20,7 @@ from topomerge.fusion.atlas.maps import Maps, map_key
 from topomerge.fusion.atlas.pairs import Checks, hypotheses, promise
 from topomerge.fusion.atlas.pose_graph import residual
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.bend.bend import bend_together
+from topomerge.fusion.bend.bend import NEITHER_BENDS, bend_together
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.inputs import check_cells, check_scale, check_units, checked_threshold, without_rooms
 from topomerge.io.maps import load_map
@@ -96,7 +96,7 @@ def solve(
     explorer = _Explorer(ordered, [map_keys[k] for k in order], settings.scale, threshold, registrations)
     assembly = explorer.explored()
     result = _result(assembly, explorer, names, order, settings.rigid)
-    return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=tuple(warnings))
+    return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=(*warnings, *result.warnings))
 
 
 def _checked(
@@ -183,12 +183,15 @@ def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order
     transforms: dict[int, Sim3] = {}
     residuals: dict[int, float] = {}
     bends: dict[int, Deformation] = {}
+    warnings: list[str] = []
     for component in assembly.components:
         poses, edges = explorer.assembler.settled(component, assembly.links, fine=True)
         if not rigid and len(component) > 1:
             pairs = sorted({link.maps for link in assembly.links if link.maps[0] in component})
             prepared = {k: explorer.maps.prepared(k) for k in component}
-            poses, deformations = bend_together(prepared, poses, pairs, explorer.scale == "free")
+            poses, deformations, reason = bend_together(prepared, poses, pairs, explorer.scale == "free")
+            if reason not in ("", NEITHER_BENDS):
+                warnings.append(f"{', '.join(names[order[k]] for k in sorted(component))} were not bent: {reason}")
             bends |= {order[k]: d for k, d in deformations.items()}
         first = min(component, key=lambda k: order[k])
         back = poses[first].inverse()
@@ -208,6 +211,7 @@ def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order
         residuals,
         bends,
         (len(explorer.tried), len(names) * (len(names) - 1) // 2),
+        warnings=tuple(warnings),
     )
 
 

@@ -38,6 +38,8 @@ LEAST_GROWTH = 0.6  # of a small area: below, space nearly folds
 STIFFER = (1.0, 0.5, 0.25)  # times the drift, tried in turn until space does not fold
 SHIFT_STEPS, MOST_MOVED = 0.5, 1.5  # m between the places at which the bending of a plan is computed, and around it
 NEITHER_BENDS = "neither map bends"
+NO_WALLS_NEAR = "no walls of the one map are near those of the other"
+FOLDED = "bending would fold space"
 DOUBTED = 0.25  # weight of a measurement that is voted out
 
 
@@ -111,16 +113,16 @@ def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | N
         mended.mend_pose(FIRST_WINDOW)
     for alignment, settled in _ever_stiffer((a, b), mended.poses, [(0, 1)], scaled, usual):
         if settled is None:
-            return Bend(pose, (_rigid(a), _rigid(b)), reason="no walls of the one map are near those of the other")
+            return Bend(pose, (_rigid(a), _rigid(b)), reason=NO_WALLS_NEAR)
         bent = alignment.deformations(settled)
         if min(d.least_growth for d in bent) >= LEAST_GROWTH:
             return Bend(alignment.poses[1], (bent[0], bent[1]), _features(alignment, settled))
-    return Bend(pose, (_rigid(a), _rigid(b)), reason="bending would fold space")
+    return Bend(pose, (_rigid(a), _rigid(b)), reason=FOLDED)
 
 
 def bend_together(
     maps: Mapping[int, Prepared], poses: Mapping[int, Sim3], pairs: Sequence[tuple[int, int]], scaled: bool = False
-) -> tuple[dict[int, Sim3], dict[int, Deformation]]:
+) -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
     """Bend maps that lie in one frame, all together: what two of them say moves the others, too, and cycles close.
 
     Args:
@@ -129,24 +131,25 @@ def bend_together(
         scaled: are the scales of all but the first map free?
 
     Returns:
-        The poses of the bent maps, the first one as it was, and the deformations of those that are bent.
+        The poses of the bent maps, the first one as it was; the deformations of those that are bent; why they stayed rigid,
+        empty where they did not.
     """
     names = sorted(maps)
     place = {name: k for k, name in enumerate(names)}
     first = poses[names[0]]
     usual = drifts_of([maps[name].sensor for name in names])
     if all(d.rigid for d in usual):
-        return dict(poses), {}
+        return dict(poses), {}, NEITHER_BENDS
     start = [first.inverse() @ poses[name] for name in names]
     seen = [(place[i], place[j]) for i, j in pairs]
     for alignment, settled in _ever_stiffer([maps[name] for name in names], start, seen, scaled, usual):
         if settled is None:
-            return dict(poses), {}
+            return dict(poses), {}, NO_WALLS_NEAR
         bent = alignment.deformations(settled)
         if min(d.least_growth for d in bent) >= LEAST_GROWTH:
             moved = {name: first @ alignment.poses[place[name]] for name in names}
-            return moved, {name: bent[k] for name, k in place.items() if len(bent[k]) and not usual[k].rigid}
-    return dict(poses), {}
+            return moved, {name: bent[k] for name, k in place.items() if len(bent[k]) and not usual[k].rigid}, ""
+    return dict(poses), {}, FOLDED
 
 
 def _ever_stiffer(
