@@ -4,7 +4,8 @@
 so many seconds of processor: ``train`` for the thresholds of the verdicts (`peer_thresholds.py`), ``test`` for the tables
 (`peers_table.py`), ``raw`` with all simulated points instead of the means of 0.1 m cells; the real pairs of TOPOMERGE_DATA; the
 maps that `evaluate.py data=heldout` kept, with the learned embedder's merge among the methods; or any manifest of pairs of the
-same format, e.g. of look-alikes. Resumable: a line of JSON a pair with all methods in ``cache/merge/peers_*.jsonl``.
+same format, e.g. of look-alikes. Resumable: a line of JSON a pair with all methods in ``cache/merge/peers_*.jsonl``. After a
+change of ours, ``python -m benchmarks.merging.peers again [test|real|MANIFEST]`` measures ours alone on the pairs that are there.
 
 All on one core, in seconds of processor from points in memory to the pose; ours also from them to the joined map with its rooms
 (``extract`` of both, ``merge``). Peers run in processes of their own; what takes longer than a minute of processor, or dies, is
@@ -169,5 +170,20 @@ def run(seconds: float, what: str = "test") -> None:
             return
 
 
+def again(what: str = "test") -> None:
+    """Ours alone, measured anew on the pairs that a file has lines of; what the peers answered stays."""
+    target = target_of(what)
+    lines = {row["name"]: row for row in map(json.loads, target.read_text().splitlines())}
+    for given in peer_pairs(what, set()):
+        if given.pair.name in lines:
+            lines[given.pair.name]["methods"]["ours"] = ours(given)
+    fresh = target.with_name(f"{target.name}.{os.getpid()}")
+    fresh.write_text("".join(json.dumps(row) + "\n" for row in lines.values()))
+    fresh.replace(target)
+
+
 if __name__ == "__main__":
-    run(float(sys.argv[1]), *sys.argv[2:])
+    if sys.argv[1] == "again":
+        again(*sys.argv[2:])
+    else:
+        run(float(sys.argv[1]), *sys.argv[2:])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -262,7 +263,6 @@ def test_thirty_ordinary_pairs_come_first_and_unknown_scales_not_at_all(module, 
 def test_poses_are_judged_upright_and_misses_are_told(module, monkeypatch) -> None:
     peers, pairs, answer = module("peers"), module("peer_pairs"), module("peer_methods").PeerAnswer
     grid = VoxelGrid(np.array([[0, 0, 0], [30, 10, 20]], np.int32), np.zeros(3), 0.1, (40, 40, 40))
-    grid = grid.with_properties(mean=grid.centroids().astype(np.float32))
     about = {"kind": "overlap", "sensors": ["tls", "tls"], "source": "procedural", "building": "office-1-1"}
     given = pairs.thinned(pairs.GridPair("p", grid, grid, (None, None), Sim3(0.0, (1.0, 0.0, 0.0)), 1.0, about))
     off, exact = np.eye(4), np.eye(4)
@@ -281,3 +281,18 @@ def test_poses_are_judged_upright_and_misses_are_told(module, monkeypatch) -> No
     )
     assert outcomes["kiss02q"]["err"] is None and outcomes["kiss02q"]["status"] == ""  # it turns the map over
     assert outcomes["fgr"]["status"] == "over the cap" and outcomes["fgr"]["seconds"] == module("peer_calls").CALL_SECONDS
+
+
+def test_ours_is_measured_anew_and_what_peers_answered_stays(module, monkeypatch, tmp_path) -> None:
+    peers = module("peers")
+    monkeypatch.setattr(peers, "CACHE", tmp_path)
+    lines = [{"name": name, "methods": {"ours": {"err": None}, "kiss02": {"err": [9.0, 0.0, 1.0]}}} for name in ("p", "q")]
+    target = tmp_path / "peers_test.jsonl"
+    target.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    given = [SimpleNamespace(pair=SimpleNamespace(name=name)) for name in ("p", "other")]
+    monkeypatch.setattr(peers, "peer_pairs", lambda what, done: iter(given))
+    monkeypatch.setattr(peers, "ours", lambda given: {"err": [0.1, 0.0, 0.0]})
+    peers.again("test")
+    after = [json.loads(line) for line in target.read_text().splitlines()]
+    assert after[0]["methods"] == {"ours": {"err": [0.1, 0.0, 0.0]}, "kiss02": {"err": [9.0, 0.0, 1.0]}}
+    assert after[1] == lines[1] and list(tmp_path.iterdir()) == [target]
