@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from topomerge.fusion.resampling import Laying
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
@@ -52,13 +53,13 @@ class _LaidFloor:
     """What a part says of doors, in the joined map.
 
     Args:
-        floor: (k, 3) m, the floor of its rooms.
+        floor: tree of the floor of its rooms, (k, 3) m.
         room: (k,) room of the joined map there, -1 none.
         centres: (E, 3) m of its doors and openings.
         doors: EDGE_DTYPE, those of them that lie between two rooms of the joined map.
     """
 
-    floor: Array
+    floor: cKDTree
     room: Array
     centres: Array
     doors: Array
@@ -74,19 +75,20 @@ class _LaidFloor:
         doors["direction"] = (doors["direction"] + laying.pose.yaw) % np.pi
         for name in ("width", "height"):
             doors[name] *= laying.pose.scale
+        tree, part_room = cKDTree(floor.reshape(-1, 3)), part.navigable_room[inside]
         pairs = np.full((len(doors), 2), -1, np.int64)
-        for k, door in enumerate(doors):
-            near = (np.linalg.norm(floor - door["centre"], axis=1) < DOOR_SIDE) & (room >= 0)
-            for side, own in enumerate(door["rooms"]):
-                votes = room[near & (part.navigable_room[inside] == own)]
+        for k, near in enumerate(tree.query_ball_point(doors["centre"], DOOR_SIDE)):
+            there, own = room[near], part_room[near]
+            for side, number in enumerate(doors["rooms"][k]):
+                votes = there[(own == number) & (there >= 0)]
                 pairs[k, side] = np.bincount(votes).argmax() if len(votes) else -1
         between = (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
         doors["rooms"] = np.sort(pairs, axis=1)
-        return cls(floor, room, doors["centre"], doors[between])
+        return cls(tree, room, doors["centre"], doors[between])
 
     def saw_both_sides(self, edge: Array) -> bool:
         """Has it floor on both sides of an edge of the joined map?"""
-        near = self.room[np.linalg.norm(self.floor - edge["centre"], axis=1) < DOOR_SIDE]
+        near = self.room[self.floor.query_ball_point(edge["centre"], DOOR_SIDE)]
         return all(int((near == room).sum()) >= LEAST_FLOOR for room in edge["rooms"])
 
 

@@ -126,3 +126,24 @@ def line_steps(points, normal, faced, start, places, turns, row, target, target_
             sums[k, 0] += w
             sums[k, 1] += w * d * d
     return h, g, partners, sums
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def interpolated(points, origin, step, nodes):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(n, 2) bilinear values at points (n, 2) of those at the nodes (nx, ny, 2) of a lattice; outside the value at its rim.
+
+    Args:
+        origin: (2,) m, node (0, 0); step: m between nodes.
+    """
+    out = np.empty((len(points), 2))
+    wide, deep = nodes.shape[0] - 1, nodes.shape[1] - 1
+    for k in range(len(points)):
+        x = min(max((points[k, 0] - origin[0]) / step, 0.0), float(wide))
+        y = min(max((points[k, 1] - origin[1]) / step, 0.0), float(deep))
+        i, j = min(int(x), wide - 1), min(int(y), deep - 1)
+        u, v = x - i, y - j
+        for c in range(2):
+            low = (1 - u) * nodes[i, j, c] + u * nodes[i + 1, j, c]
+            high = (1 - u) * nodes[i, j + 1, c] + u * nodes[i + 1, j + 1, c]
+            out[k, c] = (1 - v) * low + v * high
+    return out

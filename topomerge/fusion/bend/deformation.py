@@ -82,6 +82,9 @@ class Deformation:
 
     def _shifts(self, points: Array) -> Array:
         """(n, 2) m. Over the last decimetres below a floor the moves of two storeys are blended: pipes and walls go through."""
+        if len(self.fields) == 1:
+            only = self.fields[0]
+            return np.zeros((len(points), 2)) if only is None else only.at(points[:, :2])
         own = self.storey_at(points[:, 2])
         below = np.maximum(own - 1, 0)
         above = points[:, 2] - self.floors[own] + BETWEEN_STOREYS  # m above the border between the two storeys

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from topomerge.kernels.bend import interpolated
 from topomerge.types import Array
 
 INVERSE_ROUNDS = 30
@@ -28,15 +29,7 @@ class ShiftField:
 
     def at(self, points: Array) -> Array:
         """(n, 2) m by which the points (n, 2) are moved."""
-        last = np.array(self.shifts.shape[:2]) - 1
-        place = np.clip((np.asarray(points, np.float64) - self.origin) / self.step, 0, last)
-        cell = np.minimum(place.astype(np.int64), last - 1)
-        u, v = (place - cell).T[:, :, None]
-        i, j = cell.T
-        s = self.shifts
-        low = (1 - u) * s[i, j] + u * s[i + 1, j]
-        high = (1 - u) * s[i, j + 1] + u * s[i + 1, j + 1]
-        out: Array = (1 - v) * low + v * high
+        out: Array = interpolated(np.asarray(points, np.float64), self.origin, self.step, np.asarray(self.shifts, np.float64))
         return out
 
     def apply(self, points: Array) -> Array:
