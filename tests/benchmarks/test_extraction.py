@@ -16,17 +16,7 @@ def benchmark():
 def test_one_small_case(benchmark, tmp_path, capsys, monkeypatch) -> None:
     page = tmp_path / "results.md"
     page.write_text("# Results\nbefore\n<!-- extraction:begin -->\nold\n<!-- extraction:end -->\nafter\n")
-    words = [
-        "--dev",
-        "--only",
-        "house-2",
-        "--preset",
-        "thesis",
-        "--out",
-        str(tmp_path / "out"),
-        "--scans",
-        str(tmp_path / "scans"),
-    ]
+    words = ["--dev", "--only", "house-2", "--out", str(tmp_path / "out"), "--scans", str(tmp_path / "scans")]
     words += ["--write", str(page), "--pictures"]
     assert benchmark.main(words) == 0
     row = json.loads((tmp_path / "out" / "results.jsonl").read_text())
