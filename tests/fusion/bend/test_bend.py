@@ -15,7 +15,7 @@ from topomerge.fusion.judge import Judge
 from topomerge.fusion.prepared import prepare
 from topomerge.types import Sim3
 
-PHONE, SCANNER, DRAWING = Drift(0.05, 0.01), Drift(1e-5, 1e-6), Drift(0.0, 0.0)
+PHONE, SCANNER = Drift(0.05, 0.01), Drift(0.0, 0.0)
 
 
 def bowed(points: np.ndarray, radius: float = 240.0) -> np.ndarray:
@@ -67,11 +67,8 @@ def test_what_speaks_against_a_bent_map_is_drift(straight, bent_map, straightene
     assert judged["conflict_share"] <= rigid["conflict_share"]
 
 
-def test_a_scanner_hardly_gives_way_to_a_phone_and_a_drawing_not_at_all(points, straight, bent_map, straightened):
-    moved = np.linalg.norm(straightened.deformations[0].apply(points) - points, axis=1)
-    assert moved.max() < 0.01
-    beside = bend(straight, bent_map, MOVE.inverse(), drift=(DRAWING, PHONE))
-    assert np.array_equal(beside.deformations[0].apply(points), points) and len(beside.deformations[1])
+def test_a_scanner_does_not_give_way_to_a_phone(points, straightened):
+    assert np.array_equal(straightened.deformations[0].apply(points), points)
 
 
 def test_two_alike_give_way_alike(points, straight, bent_map):
@@ -110,7 +107,7 @@ def test_relative_and_back_undo_each_other(points, straight, bent_map):
 @pytest.mark.parametrize(
     ("drift", "pose", "reason"),
     [
-        ((DRAWING, DRAWING), MOVE.inverse(), NEITHER_BENDS),
+        ((SCANNER, SCANNER), MOVE.inverse(), NEITHER_BENDS),
         ((PHONE, PHONE), Sim3(0.0, (0.0, 0.0, 40.0)), "no storeys lie on one level"),
     ],
 )
