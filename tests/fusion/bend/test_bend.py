@@ -10,7 +10,6 @@ import pytest
 from tests.fusion.plans_of import MOVE, grid_of, office, part
 from topomerge.fusion.bend.bend import NEITHER_BENDS, NO_WALLS_NEAR, Bend, bend, bend_together
 from topomerge.fusion.bend.drift import Drift
-from topomerge.fusion.bend.lines import bounded
 from topomerge.fusion.judge import Judge
 from topomerge.fusion.prepared import prepare
 from topomerge.types import Sim3
@@ -143,11 +142,3 @@ def test_many_maps_bend_together(points, straight, bent_map):
     gap = np.linalg.norm(there[:, :2] - here[:, :2], axis=1)[east[:, 0] > 15]
     assert np.median(gap) < 0.03
     assert poses[0] == Sim3()
-
-
-def test_nothing_is_known_better_than_a_floor():
-    """Covariances add in the directions that information has; what is not held at all stays so."""
-    sharp = np.diag([1e6, 400.0, 0.0])
-    floored = bounded(np.array([sharp]), (0.05, 0.01))[0]
-    assert np.allclose(np.diag(floored)[:2], [1 / (1e-6 + 0.0025), 1 / (1 / 400 + 0.0025)])
-    assert floored[2, 2] == 0.0

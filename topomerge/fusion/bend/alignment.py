@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.bend.drift import Drift
 from topomerge.fusion.bend.graph import Joints, Measurements, Settled, settle
-from topomerge.fusion.bend.lines import bounded, measure_lines
+from topomerge.fusion.bend.lines import measure_lines
 from topomerge.fusion.bend.local import Window, measure
 from topomerge.fusion.bend.pieces import PIECE_SIZE, Pieces
 from topomerge.fusion.prepared import Prepared
@@ -21,7 +21,6 @@ from topomerge.types import Array, Sim3
 RIGID_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.05)  # m, m, rad, logarithm of the scale: of a mended pose
 PIECE_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.02)
 SCALE_DRIFT = 0.003  # logarithm of the scale per square root of a metre
-DRAWN_FLOOR = (0.05, float(np.radians(0.3)))  # m, rad: no move against a drawing is known better
 LEAST_SHARE = 0.25  # of the usual drift, that a map is taken to have at least
 LEAST_DRIFT = 1e-4  # m and rad, of a joint
 NEIGHBOURS = 4  # pieces of the other map that say how it is bent at a place
@@ -36,14 +35,10 @@ class Alignment:
         poses: of the maps in the common frame.
         pairs: numbers of two maps; pieces of each are registered on the other one.
         scaled: are the scales of all but the first map free?
-        drawn: (n,) does each map not bend? Its walls are where and as thick as somebody drew them.
     """
 
-    def __init__(
-        self, maps: Sequence[Prepared], poses: Sequence[Sim3], pairs: Sequence[Pair], scaled: bool, drawn: Sequence[bool] = ()
-    ) -> None:
+    def __init__(self, maps: Sequence[Prepared], poses: Sequence[Sim3], pairs: Sequence[Pair], scaled: bool) -> None:
         self.maps, self.poses, self.scaled = tuple(maps), list(poses), scaled
-        self.drawn = tuple(drawn) or (False,) * len(maps)
         self.pairs = [pair for i, j in pairs for pair in ((i, j), (j, i))]
         self.moves = [np.zeros((len(m.pieces), 4)) for m in maps]
         self.drift_shares = [np.ones(2) for _ in self.maps]  # of shift and turn
@@ -137,8 +132,6 @@ class Alignment:
         others, shares = self.shares(i, j, chosen)
         move = np.concatenate([np.zeros((0, 3)), *(p[1] for p in parts)]) @ np.linalg.inv(own).T
         certain = own.T @ np.concatenate([np.zeros((0, 3, 3)), *(p[2] for p in parts)]) @ own / 2
-        if self.drawn[i] or self.drawn[j]:
-            certain = bounded(certain, DRAWN_FLOOR)
         places = self.anchors(i)[chosen]
         return Measurements(chosen + self.first[i], places, others + self.first[j], shares, move, certain)
 

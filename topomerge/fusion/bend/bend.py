@@ -157,7 +157,7 @@ def _ever_stiffer(
 ) -> Iterator[tuple[Alignment, Settled | None]]:
     """The maps settled with their usual drift, then with less and less of it, for as long as they are asked for."""
     for share in STIFFER:
-        alignment = Alignment(maps, poses, pairs, scaled, [d.rigid for d in usual])
+        alignment = Alignment(maps, poses, pairs, scaled)
         yield alignment, settle_all(alignment, [Drift(share * d.shift, share * d.turn) for d in usual])
 
 

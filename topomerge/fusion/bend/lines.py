@@ -106,14 +106,13 @@ def measure_lines(
     there = np.linalg.inv(own)
     h, g = h[enough], g[enough]
     steps = -np.einsum("kij,kj->ki", np.linalg.pinv(h, rcond=1e-4, hermitian=True), g)
-    certain = bounded(h / (INDEPENDENT * LINE_NOISE**2), LINE_FLOOR)
+    certain = _bounded(h / (INDEPENDENT * LINE_NOISE**2))
     return chosen[enough], moves[chosen[enough]] + steps @ own.T, there.T @ certain @ there, sums[enough].sum(axis=0)
 
 
-def bounded(information: Array, floor: tuple[float, float]) -> Array:
-    """Information (k, 3, 3) after a floor of what can be known (m, rad) is added to its covariance, in each of its own
-    directions."""
-    unit = np.diag([floor[0], floor[0], floor[1]])
+def _bounded(information: Array) -> Array:
+    """Information (k, 3, 3) after the floor of what can be known is added to its covariance, in each of its own directions."""
+    unit = np.diag([LINE_FLOOR[0], LINE_FLOOR[0], LINE_FLOOR[1]])
     back = np.linalg.inv(unit)
     values, vectors = np.linalg.eigh(unit @ information @ unit)
     values = np.maximum(values, 0)
