@@ -53,10 +53,9 @@ def _cell(points, i, shift, edge):  # type: ignore[no-untyped-def]  # pragma: no
 
 
 @njit(cache=True, error_model="numpy")
-def _part(points, i, shift, edge, cell, axis):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Which of the `OFFSET_STEPS` parts of its cell the finite point i lies in, along an axis."""
-    part = np.int64(((points[i, axis] + shift[axis]) / edge - cell) * OFFSET_STEPS)
-    return min(max(part, 0), OFFSET_STEPS - 1)
+def _part(points, i, shift, edge, axis):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Which of the `OFFSET_STEPS` parts of its cell the finite point i lies in, along an axis: exact: a power of 2."""
+    return np.int64(np.floor((points[i, axis] + shift[axis]) / edge * OFFSET_STEPS)) & (OFFSET_STEPS - 1)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -67,7 +66,7 @@ def to_lattice(points, shift, edge, out, parts):  # type: ignore[no-untyped-def]
         if finite:
             out[i, 0], out[i, 1], out[i, 2] = x, y, z
             for k in range(3):
-                parts[i, k] = _part(points, i, shift, edge, out[i, k], k)
+                parts[i, k] = _part(points, i, shift, edge, k)
         else:
             out[i, 0] = out[i, 1] = out[i, 2] = np.iinfo(np.int64).min
 
@@ -91,26 +90,31 @@ def _code(x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover - compil
 
 
 @njit(cache=True, error_model="numpy")
-def count(points, shift, edge, base, table, counts):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Second pass: points in each cell of the bricks in use."""
+def count(points, shift, edge, base, table, counts, places):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Second pass: points in each cell of the bricks in use; of each point where in `counts` (flat) it is counted (-1 nowhere),
+    with the parts of its cell in the 24 lowest bits."""
     for i in range(len(points)):
         finite, x, y, z = _cell(points, i, shift, edge)
         if finite:
             cx, cy, cz = x - base[0], y - base[1], z - base[2]
-            counts[table[cx >> 3, cy >> 3, cz >> 3], _code(cx, cy, cz)] += 1
+            at = (np.int64(table[cx >> 3, cy >> 3, cz >> 3]) << 9) + _code(cx, cy, cz)
+            counts[at] += 1
+            for k in range(3):
+                at = (at << 8) | _part(points, i, shift, edge, k)
+            places[i] = at
+        else:
+            places[i] = -1
 
 
 @njit(cache=True, error_model="numpy")
-def add_parts(points, shift, edge, base, table, rows, sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Third pass: sums (n, 3) of the parts of their cells that points lie in; rows as `counts`, number of each cell."""
-    for i in range(len(points)):
-        finite, x, y, z = _cell(points, i, shift, edge)
-        if finite:
-            cx, cy, cz = x - base[0], y - base[1], z - base[2]
-            row = rows[table[cx >> 3, cy >> 3, cz >> 3], _code(cx, cy, cz)]
-            sums[row, 0] += _part(points, i, shift, edge, x, 0)
-            sums[row, 1] += _part(points, i, shift, edge, y, 1)
-            sums[row, 2] += _part(points, i, shift, edge, z, 2)
+def add_parts(places, rows, sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Third pass: sums (n, 3) of the parts of their cells that points lie in; rows: number of the cell at each place."""
+    for place in places:
+        if place >= 0:
+            row = rows[place >> 24]
+            sums[row, 0] += (place >> 16) & 255
+            sums[row, 1] += (place >> 8) & 255
+            sums[row, 2] += place & 255
 
 
 Occupied = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
@@ -142,14 +146,15 @@ def occupied(points: NDArray[Any], shift: NDArray[Any], edge: float) -> Occupied
     bricks = np.argwhere(table)
     bricks = bricks[np.argsort(morton.encode(bricks), kind="stable")]
     table[tuple(bricks.T)] = np.arange(len(bricks))
-    counts = np.zeros((len(bricks), 512), np.uint32)
-    count(points, shift, edge, base, table, counts)
-    which, code = np.nonzero(counts)
-    cells = (bricks[which] << 3) + morton.decode(code)
-    numbers = counts[which, code].astype(np.int64)
-    counts[which, code] = np.arange(len(which))
-    sums = np.zeros((len(which), 3), np.int64)
-    add_parts(points, shift, edge, base, table, counts, sums)
+    counts = np.zeros(len(bricks) * 512, np.uint32)
+    places = np.empty(len(points), np.int64)
+    count(points, shift, edge, base, table, counts, places)
+    filled = np.flatnonzero(counts)
+    cells = (bricks[filled >> 9] << 3) + morton.decode(filled & 511)
+    numbers = counts[filled].astype(np.int64)
+    counts[filled] = np.arange(len(filled))
+    sums = np.zeros((len(filled), 3), np.int64)
+    add_parts(places, counts, sums)
     return base, cells, numbers, sums
 
 
