@@ -22,7 +22,7 @@ from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.bend.deformation import Deformation
-from topomerge.fusion.joined_doors import joined_rooms, with_doors
+from topomerge.fusion.joined_doors import joined_rooms, laid_floor, with_doors
 from topomerge.fusion.resampling import Laying, decoded, encoded, resampled
 from topomerge.fusion.single_walls import copies
 from topomerge.fusion.storey_levels import extruded
@@ -69,7 +69,7 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
         cells.add_map(maps[poses[n][0]], layings[n], int(first_bits[n]), parts[n].assumed and n != order[0])
     name = " + ".join(maps[k].source or "map" for k, _ in poses)
     joined = _extracted(cells, min(part.neighbours for part in parts), name)
-    return with_doors(joined, [(maps[k], laying) for (k, _), laying in zip(poses, layings, strict=True)])
+    return with_doors(joined, ((maps[k], laying) for (k, _), laying in zip(poses, layings, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,8 @@ def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3, bend: 
         bend: of the part, in its own frame, before it is posed; None: rigid.
     """
     rooms = np.full(len(part.rooms), -1, np.int64)
-    joined_room, part_room = joined_rooms(part, joined, Laying.of(pose, bend)), part.navigable_room[part.navigable_room >= 0]
+    floor, part_room = laid_floor(part, Laying.of(pose, bend))
+    joined_room = joined_rooms(joined, floor)
     for i in range(len(part.rooms)):
         votes = joined_room[part_room == i]
         votes = votes[votes >= 0]

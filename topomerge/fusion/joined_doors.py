@@ -7,7 +7,7 @@ map has, though one of them saw the floor on both its sides, is none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,11 +22,11 @@ ONE_DOOR = 1.2  # m: doors of two maps that are this close are one
 LEVEL_KINDS = ("door", "opening")
 
 
-def with_doors(joined: TopometricMap, parts: Sequence[tuple[TopometricMap, Laying]]) -> TopometricMap:
+def with_doors(joined: TopometricMap, parts: Iterable[tuple[TopometricMap, Laying]]) -> TopometricMap:
     """The joined map with those doors and openings of its parts that it lacks, and without those that its parts deny.
 
     Args:
-        parts: maps, and how each is laid into the joined one.
+        parts: maps, one at a time, and how each is laid into the joined one.
     """
     laid = [_LaidFloor.of(part, joined, laying) for part, laying in parts]
     level = np.isin(joined.edges["kind"], LEVEL_KINDS)
@@ -37,9 +37,15 @@ def with_doors(joined: TopometricMap, parts: Sequence[tuple[TopometricMap, Layin
     return replace(joined, edges=edges[np.lexsort((*edges["centre"].T[::-1], *edges["rooms"].T[::-1]))])
 
 
-def joined_rooms(part: TopometricMap, joined: TopometricMap, laying: Laying) -> Array:
-    """(k,) room of the joined map, -1 none, in which each cell of the floor of a part's rooms lies (`navigable_room` >= 0)."""
-    cells = joined.navigable.locate(laying.apply(part.navigable.centroids(part.navigable.cells[part.navigable_room >= 0])))
+def laid_floor(part: TopometricMap, laying: Laying) -> tuple[Array, Array]:
+    """(k, 3) m in the joined map, and (k,) their rooms in the part: the floor of its rooms."""
+    inside = part.navigable_room >= 0
+    return laying.apply(part.navigable.centroids(part.navigable.cells[inside])), part.navigable_room[inside]
+
+
+def joined_rooms(joined: TopometricMap, floor: Array) -> Array:
+    """(k,) room of the joined map, -1 none, in which each place (k, 3) of a laid floor lies."""
+    cells = joined.navigable.locate(floor)
     out = np.full(len(cells), -1, np.int64)
     for up in (0, 1, -1, 2, -2):  # floors of two maps are seldom at one height to a cell
         rows = joined.navigable.rows(cells + (0, 0, up))
@@ -66,16 +72,15 @@ class _LaidFloor:
 
     @classmethod
     def of(cls, part: TopometricMap, joined: TopometricMap, laying: Laying) -> _LaidFloor:
-        inside = part.navigable_room >= 0
-        floor = laying.apply(part.navigable.centroids(part.navigable.cells[inside]))
-        room = joined_rooms(part, joined, laying)
+        floor, part_room = laid_floor(part, laying)
+        room = joined_rooms(joined, floor)
         doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)].copy()
         for name in ("centre", "lower", "upper"):
             doors[name] = laying.apply(doors[name])
         doors["direction"] = (doors["direction"] + laying.pose.yaw) % np.pi
         for name in ("width", "height"):
             doors[name] *= laying.pose.scale
-        tree, part_room = cKDTree(floor.reshape(-1, 3)), part.navigable_room[inside]
+        tree = cKDTree(floor)
         pairs = np.full((len(doors), 2), -1, np.int64)
         for k, near in enumerate(tree.query_ball_point(doors["centre"], DOOR_SIDE)):
             there, own = room[near], part_room[near]
