@@ -52,6 +52,16 @@ def test_bent_maps_lie_as_high_as_rigid_ones(points, up):
     assert bent.transform.translation[2] == rigid.transform.translation[2]
 
 
+def test_bent_maps_of_unknown_scale_lie_as_high_as_rigid_ones(points):
+    """Far above their origin, too, where a little more or less scale is half a metre."""
+    frame = Sim3(MOVE.yaw, (*MOVE.translation[:2], 60.0), 0.8)
+    a, b = grid_of(part(points, high=(17, 99))), grid_of(part(points, low=(4, -99)), frame)
+    middle = frame.apply(np.array([[10.0, 7.0, 1.0]]))
+    bent, rigid = (register(a, b, scale="free", rigid=rigid).transform for rigid in (False, True))
+    assert bent.scale != rigid.scale
+    assert bent.apply(middle)[0, 2] == pytest.approx(rigid.apply(middle)[0, 2], abs=0.02) == pytest.approx(1.0, abs=0.1)
+
+
 def test_order_of_cells_changes_nothing(halves):
     a, b = halves
     rows = np.random.default_rng(0).permutation(len(a))

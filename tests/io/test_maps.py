@@ -150,6 +150,16 @@ def test_contents_that_contradict_each_other(saved: Path, tmp_path: Path) -> Non
         refused(rewritten(saved, tmp_path / name, **change), "damaged")
 
 
+def test_offsets_of_points_come_back_and_are_checked(saved: Path, tmp_path: Path) -> None:
+    map = load_map(saved)
+    offset = np.random.default_rng(0).integers(0, 256, (len(map.grid), 3)).astype(np.uint8)
+    path = tmp_path / "a.tmap"
+    save_map(replace(map, grid=map.grid.with_properties(offset=offset)), path)
+    assert (load_map(path).grid.properties["offset"] == offset).all()
+    for name, wrong in (("flat", offset[:, 0]), ("float", offset.astype(float)), ("wide", np.hstack([offset, offset]))):
+        refused(rewritten(path, tmp_path / name, **{"grid_property.offset": wrong}), "no proper offsets")
+
+
 @pytest.mark.parametrize(("name", "rows", "words"), [
     ("rooms", 20_000, "20,000 rooms, more than 5,000"), ("edges", 100_000, "100,000 edges, more than 200 .20 a room"),
     ("storeys", 1_001, "1,001 storeys"), ("areas", 10_000, "10,000 areas, more than"),

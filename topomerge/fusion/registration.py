@@ -107,7 +107,8 @@ def register(
         if rigid or bent.reason:
             pose, rmse = aligned, misfit
         else:  # bending is level: floors and ceilings say how high
-            pose = replace(pose, translation=(*pose.translation[:2], aligned.translation[2]))
+            height = aligned.translation[2] + (aligned.scale - pose.scale) * float(b.middle[2])  # there, where scales differ
+            pose = replace(pose, translation=(*pose.translation[:2], height))
             bent = replace(bent, transform=pose)
     clock("refine")
     return replace(_verdict(ranked, winner, pose, rmse, clock.seconds), bend=None if rigid else bent)

@@ -136,6 +136,9 @@ def _unpack(arrays: dict[str, Array], name: str) -> VoxelGrid:
         raise ValueError(f"the cells of {name} are not in order")
     start = f"{name}_property."
     properties = {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
+    offset = properties.get("offset")
+    if offset is not None and (offset.dtype != np.uint8 or offset.shape != (len(codes), 3)):
+        raise ValueError(f"the points of the cells of {name} have no proper offsets")
     x, y, z = shape.tolist()
     return VoxelGrid(morton.decode(codes), frame[:3].copy(), float(frame[3]), (x, y, z), properties)
 
