@@ -53,8 +53,18 @@ class PlanUNet(nn.Module):
 
 def exported_weights(network: PlanUNet) -> dict[str, Array]:
     """Weights for `plan_network.forward`: (9 c, k) with the normalisation in them."""
+    weights = folded(network.layers)
+    weights["out.w"] = network.out.weight.detach().numpy()[:, :, 0, 0].T
+    assert network.out.bias is not None
+    weights["out.b"] = network.out.bias.detach().numpy()
+    return weights
+
+
+def folded(layers: nn.ModuleDict) -> dict[str, Array]:
+    """Weights (9 c, k) and biases (k,) of convolutions for NumPy (`numpy_nn.convolution`), by name, with the batch normalisation
+    after each of them."""
     weights: dict[str, Array] = {}
-    for name, layer in network.layers.items():
+    for name, layer in layers.items():
         conv, norm, _ = list(layer.children())
         assert isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)
         assert norm.running_var is not None and norm.running_mean is not None
@@ -62,7 +72,4 @@ def exported_weights(network: PlanUNet) -> dict[str, Array]:
         kernel = (conv.weight * scale[:, None, None, None]).detach().numpy()
         weights[f"{name}.w"] = kernel.transpose(2, 3, 1, 0).reshape(-1, kernel.shape[0])
         weights[f"{name}.b"] = (norm.bias - norm.running_mean * scale).detach().numpy()
-    weights["out.w"] = network.out.weight.detach().numpy()[:, :, 0, 0].T
-    assert network.out.bias is not None
-    weights["out.b"] = network.out.bias.detach().numpy()
     return weights

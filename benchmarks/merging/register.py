@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from topomerge.datasets.pairs.grid_pairs import GridPair, common_area, free_of, grid_of, load_grids
-from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.real.sources import DEVELOPMENT_FOLDERS, iter_real_pairs
+from topomerge.datasets.pairs.grid_pairs import GridPair, load_grids
+from topomerge.datasets.real.cached_grids import real_grid_pairs
+from topomerge.datasets.real.sources import DEVELOPMENT_FOLDERS
 
 from benchmarks.merging.cached_pairs import buildings_of, hard_of, pair_files, places_of
 from topomerge.fusion.registration import register
@@ -56,14 +56,7 @@ def upright(matrix: Array, pair: GridPair) -> Sim3 | None:
 
 def real_pairs(split: str = "real") -> Iterator[GridPair]:
     """The real pairs, at 0.1 m; of split ``development`` those that one may choose by."""
-    for name, pair in iter_real_pairs(os.environ["TOPOMERGE_DATA"], REAL_SPLITS[split]):
-        if isinstance(pair, Pair):
-            a, b = grid_of(pair.a), grid_of(pair.b)
-            free = tuple(free_of(c, g) if c.poses is not None else c.free for c, g in ((pair.a, a), (pair.b, b)))
-            about = {"sensors": list(pair.sensors), "kind": pair.kind, "building": pair.building, "source": pair.source}
-            about["overlap"] = pair.overlap
-            common = common_area(pair, a, b, (free[0], free[1]))
-            yield GridPair(name, a, b, (free[0], free[1]), pair.truth, common, about)
+    return real_grid_pairs(os.environ["TOPOMERGE_DATA"], REAL_SPLITS[split])
 
 
 def simulated_pairs(split: str, limit: int, skip: set[str]) -> Iterator[GridPair]:

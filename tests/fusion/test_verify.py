@@ -7,18 +7,22 @@ import pytest
 
 from tests.fusion.plans_of import MOVE, grid_of, off, office, part
 from tests.scenes import Scene
+from topomerge.fusion.posterior import FEW, POSTERIOR, WRONG
 from topomerge.fusion.registration import register
 from topomerge.fusion.verify import (
-    BEND_VECTOR,
-    LEAD_VECTOR,
+    BELIEF_VECTOR,
+    BENT_POSE_VECTOR,
     MARGIN_CAP,
     POSE_VECTOR,
     WINNER_VECTOR,
+    bent_pose_vector,
+    bent_score,
     lead,
     model,
     plausibility,
-    probability,
+    quality_lag,
     vector,
+    verdict,
     winner_vector,
 )
 from topomerge.matching.poses import PoseHypothesis
@@ -32,11 +36,14 @@ def points():
 
 def test_the_calibration_fits_its_features():
     found = model()
-    assert found["names"] == [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR, *BEND_VECTOR]
+    assert tuple(found["names"]) == BELIEF_VECTOR
     for kind in ("solid", "flat"):
-        winner, pose = (found[kind][which]["weight"] for which in ("winner", "pose"))
-        assert len(winner) == len(found["names"]) and len(pose) == len(POSE_VECTOR)
+        sizes = {"pose": len(POSE_VECTOR), "bent": len(BENT_POSE_VECTOR), "winner": len(BELIEF_VECTOR)}
+        assert all(len(found[kind][which]["weight"]) == size for which, size in sizes.items())
+        assert np.shape(found[kind]["kinds"]["weight"]) == (len(WRONG), len(BELIEF_VECTOR))
     assert 0.5 <= found["threshold"] < 1
+    thresholds, false = np.array(found["risk"]).T
+    assert (np.diff(thresholds) > 0).all() and (np.diff(false) <= 0).all()
 
 
 def test_nothing_at_all_gives_numbers():
@@ -80,6 +87,17 @@ FEATURES = {
 }  # fmt: skip
 
 
+PLACES = {"place_mean": 1.5, "place_worst": 0.5, "place_area": 100.0}
+QUIET = {
+    "tall_conflict": 0.0, "crossing": 30.0, "worst_ratio": 0.95, "squares": 60.0, "bad_squares": 0.0, "in_place": 20.0,
+    "strain": 0.1, "bent": 0.02, "doubted": 0.0, "pieces": 20.0, "by_chance": 1.0, "moved_walls": 0.0, "hanging": 9.0,
+    "hanging_met": 9.0, "repeats": 0.0,
+}  # fmt: skip
+GOOD = {
+    **FEATURES, **PLACES, "conflict_share": 0.0, "worst_conflict": 0.0, "conflict": 0.0, "met": 0.95, "walls": 80.0, "free":
+400.0, }  # fmt: skip
+
+
 def seen(**changes: float) -> dict[str, float]:
     """The vector of features by name."""
     return dict(zip(POSE_VECTOR, vector({**FEATURES, **changes}).tolist(), strict=True))
@@ -104,30 +122,65 @@ def test_shares_of_little_are_drawn_to_what_is_usual():
     assert seen(level=3.0)["level"] == 0.5
 
 
+def test_places_count_by_their_mean_their_number_and_the_worst():
+    by_name = dict(zip(BENT_POSE_VECTOR, bent_pose_vector({**FEATURES, **PLACES}).tolist(), strict=True))
+    assert by_name["place_mean"] == 1.5 and by_name["place_worst"] == 0.5
+    assert by_name["place_total"] == pytest.approx(1.5 * np.log1p(100 / 20))
+
+
 def test_the_lead_over_rivals_by_hand():
-    scores, one = np.array([5.0, 4.0, 1.0]), np.ones(len(POSE_VECTOR))
-    vectors = np.array([vector(FEATURES), vector({**FEATURES, "walls": 7.0}), vector({**FEATURES, "walls": 5.0, "ratio": 0.9})])
+    scores, one = np.array([5.0, 4.0, 1.0]), np.ones(len(BENT_POSE_VECTOR))
+    features = [{**FEATURES, **PLACES, **more} for more in ({}, {"walls": 7.0}, {"walls": 5.0, "ratio": 0.9})]
+    vectors = np.array([bent_pose_vector(f) for f in features])
     margin, ahead, alone, share = lead(scores, vectors, one, 2 * one)
     assert margin == 1.0 and share == pytest.approx(1 / (1 + np.exp(-1) + np.exp(-4)))
     assert alone == pytest.approx(np.log(share / (1 - share + 1e-3)))
-    names = ("ratio", "conflict", "worst", "opposed", "lift", "sliced_conflict", "level", "ceilings")
-    quality = [sum(v[POSE_VECTOR.index(n)] / 2 for n in names) for v in vectors]
+    names = ("ratio", "conflict", "worst", "opposed", "lift", "sliced_conflict", "level", "ceilings", "place_mean", "place_worst")
+    quality = [sum(v[BENT_POSE_VECTOR.index(n)] / 2 for n in names) for v in vectors]
     assert ahead == pytest.approx(quality[0] - quality[1])  # the third explains too little to be a rival
     assert lead(scores[:1], vectors[:1], one, one)[:3] == (MARGIN_CAP, MARGIN_CAP, pytest.approx(MARGIN_CAP))
 
 
+def test_a_rival_explains_enough_and_ratios_speak_for_it():
+    ranked = [PoseHypothesis(Sim3(), 0.0, features={**FEATURES, **m}) for m in ({}, {"ratio": 0.7}, {"walls": 5.0, "ratio": 0.9})]
+    lag = quality_lag(ranked)
+    assert lag[0] == 0 and 0 <= lag[1] < np.inf and lag[2] == np.inf
+
+
 def test_the_probability_is_at_most_the_share_of_the_odds():
-    """A second hypothesis that is as good halves what the first may be believed; the rest share as their odds do."""
-    quiet = {"tall_conflict": 0.0, "crossing": 30.0, "worst_ratio": 0.95, "squares": 60.0, "bad_squares": 0.0, "in_place": 20.0}
-    quiet |= {"strain": 0.1, "bent": 0.02, "doubted": 0.0}
-    quiet |= {"pieces": 20.0, "by_chance": 1.0, "moved_walls": 0.0, "hanging": 9.0, "hanging_met": 9.0}
-    good = {**FEATURES, "conflict_share": 0.0, "worst_conflict": 0.0, "conflict": 0.0, "met": 0.95, "walls": 80.0, "free": 400.0}
-    first, second, third = (PoseHypothesis(Sim3(), score, features=good) for score in (9.0, 9.0, 8.0))
-    alone, every = probability([first], quiet)
-    assert alone > 0.8 and every == [alone]
-    halved, shares = probability([first, second, third], quiet)
-    assert halved <= 1 / (2 + np.exp(-1)) and shares[1] == pytest.approx(shares[0]) == halved
-    assert shares[2] == pytest.approx(halved * np.exp(-1))
+    """A second pose that is as good halves what the first may be believed; the rest share as their odds do."""
+    alone = verdict([GOOD], {**GOOD, **QUIET})
+    assert alone.each[0] > 0.8 and len(alone.each) == 1 and sum(alone.posterior.values()) == pytest.approx(1.0)
+    worse = {**GOOD, "walls": 60.0, "free": 300.0}
+    halved = verdict([GOOD, GOOD, worse], {**GOOD, **QUIET})
+    behind = np.exp(bent_score(worse) - bent_score(GOOD))
+    assert halved.each[0] <= 1 / (2 + behind) and halved.each[1] == pytest.approx(halved.each[0])
+    assert halved.each[2] == pytest.approx(halved.each[0] * behind)
+    assert tuple(halved.posterior) == POSTERIOR and halved.posterior["here"] == halved.each[0]
+
+
+def test_what_the_user_knows_never_lowers_a_merge():
+    for first in (GOOD, {**GOOD, "walls": 9.0, "free": 30.0}):
+        each = [
+            verdict([first], {**first, **QUIET, "moved_walls": 0.02}, known).each[0]
+            for known in ("nothing", "building", "storey")
+        ]
+        assert each == sorted(each) and each[0] < each[2]
+
+
+def test_more_evidence_for_the_same_place_never_lowers_it():
+    """A room that fits: more walls, more floor, more places, furniture in place."""
+    few = {**GOOD, "walls": 12.0, "free": 60.0, "place_area": 60.0}
+    more = {**few, "walls": 20.0, "free": 90.0, "place_area": 90.0, "place_worst": 0.6, "share": 0.75}
+    winners = {**QUIET, "squares": 12.0, "crossing": 5.0}, {**QUIET, "squares": 16.0, "crossing": 8.0}
+    one, two = (verdict([f], {**f, **w}).each[0] for f, w in zip((few, more), winners, strict=True))
+    assert two >= one
+
+
+def test_one_square_metre_abstains():
+    little = {**GOOD, "walls": 0.9, "free": 400.0}
+    assert verdict([little], {**little, **QUIET}).each[0] <= FEW
+    assert verdict([{**GOOD, "free": 3.0}], {**GOOD, **QUIET, "free": 3.0}).posterior["here"] <= FEW
 
 
 @pytest.mark.parametrize(

@@ -26,10 +26,12 @@ def tempting(*_: Any) -> list[dict[str, Any]]:
     rows = []
     for k, row in enumerate(tiny.belief_rows()[:24]):
         first, *others = row["hyps"]
-        first |= {"walls": 30.5, "conflict": 8.0, "err": None}
+        first |= {"walls": 30.5, "conflict": 8.0, "err": None, "label": 0}
         first["bent"] |= {"walls": 30.5, "conflict": 8.0}
         about = {"kind": "lookalike", "lookalike": "modules", "tellable": k % 3 > 0, "repeats": k % 2 == 0, "common": 0.0}
-        rows.append({**row, **about, "building": f"modules-{k}", "hyps": [first, *({**h, "err": None} for h in others)]})
+        rows.append(
+            {**row, **about, "building": f"modules-{k}", "hyps": [first, *({**h, "err": None, "label": 0} for h in others)]}
+        )
     return rows
 
 
@@ -85,23 +87,19 @@ def test_a_word_that_is_none_of_the_three_is_refused() -> None:
 
 def test_none_are_built_where_none_are_taken(monkeypatch) -> None:
     monkeypatch.setattr(belief_lookalikes, "build_lookalikes", lambda *_: pytest.fail("nothing is to be built"))
-    settings = settings_of(["task=merge_belief"])
+    settings = settings_of(["task=merge_belief", "lookalikes=none"])
     assert lookalike_rows(settings.alike, settings, quiet) == []
     assert settings.alike.split == "train" and settings.alike_heldout.split == "test"
 
 
-def test_refitting_the_bending_keeps_what_the_model_says(words: list[str]) -> None:
-    """Four numbers are fitted: the old log odds are scaled, so that hypotheses keep their order but for what bending adds."""
-    settings = settings_of([*words, "name=bending", "refit=bending"])
+def test_the_models_of_rigid_poses_may_stay_as_they_are(words: list[str]) -> None:
     rows = [row for row in tiny.belief_rows() if "drawing" not in row["sensors"]]
-    weights, _ = merge_belief.fit_models(rows, False, settings)
-    before = merge_belief.model()["solid"]["winner"]
-    there, here = np.array(before["weight"][:-2]), np.array(weights["winner"]["weight"][:-2])
-    slope = float(here @ there / (there @ there))
-    assert np.allclose(here, slope * there, atol=1e-9) and slope >= 0
-    assert weights["winner"]["mean"][:-2] == before["mean"][:-2]
+    shipped = merge_belief.model()["solid"]["pose"]
+    for refit, same in (("closely", True), ("all", False)):
+        weights, _ = merge_belief.fit_models(rows, False, settings_of([*words, f"name={refit}", f"refit={refit}"]))
+        assert (weights["pose"] == shipped) is same
 
 
 def test_another_word_for_what_is_refitted_is_refused(words: list[str]) -> None:
-    with pytest.raises(InputError, match="refit must be all or bending"):
+    with pytest.raises(InputError, match="refit must be all or closely"):
         train(settings_of([*words, "refit=some"]), quiet)

@@ -19,10 +19,11 @@ from topomerge.embedding.engineered import scaled
 from topomerge.errors import InputError
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
+from topomerge.fusion.evidence.network import weights as place_weights
 from topomerge.fusion.verify import model
 from topomerge.io.weight_files import VARIABLE, weights_file
 from topomerge.matching.odds import odds_weights
-from topomerge.training import door_classification, plan_segmentation
+from topomerge.training import door_classification, place_evidence, plan_segmentation
 from topomerge.training.door_classification import door_scores
 from topomerge.training.judging import judge_task
 from topomerge.training.loop import State
@@ -33,6 +34,7 @@ ROOT = Path(__file__).parent.parent.parent
 NETWORKS = {
     "plan_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
     "door_classification": ["epochs=2", "batch=64", "hidden=4", "networks=2"],
+    "place_evidence": ["epochs=2", "steps=2", "batch=8", "widths=[4,4,4]", "hold_out=2", "lookalikes=false"],
 }
 FITS = ("merge_belief", "match_odds", "feature_scale")
 
@@ -47,6 +49,8 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     paths = tiny.plan_files(tmp_path / "plans", 4)
     monkeypatch.setattr(plan_segmentation, "build_plans", lambda *_: (paths, None))
     monkeypatch.setattr(door_classification, "door_examples", lambda *_: tiny.door_tables(320))
+    places = tiny.place_files(tmp_path / "places")
+    monkeypatch.setattr(place_evidence, "hypothesis_files", lambda *_: places)
     for task, name, make in (
         ("merge_belief", "belief_rows", tiny.belief_rows),
         ("match_odds", "pair_evidence", tiny.evidence),
@@ -66,6 +70,7 @@ def read(task: str) -> Any:
     return {
         "plan_segmentation": lambda: column_probabilities(plan),
         "door_classification": lambda: door_probability(np.zeros((3, 17))),
+        "place_evidence": lambda: place_weights()["a.w"],
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "match_odds": lambda: odds_weights("match"),
         "feature_scale": lambda: scaled(np.ones((2, 18)), "matched"),
@@ -95,7 +100,8 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
 
 @pytest.mark.parametrize("task", list(NETWORKS))
 def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
-    kind = {"plan_segmentation": plan_segmentation.PlanJob, "door_classification": door_classification.DoorJob}[task]
+    jobs = {"plan_segmentation": plan_segmentation.PlanJob, "door_classification": door_classification.DoorJob}
+    kind = {**jobs, "place_evidence": place_evidence.PlaceJob}[task]
     train(settings_of(words(task, "name=whole")), quiet)
     step, seen = kind.step, []
 
@@ -140,7 +146,9 @@ def test_fits_learn_what_is_so(words) -> None:
         (["task=plan_segmentation", "crop=30"], "crop"),
         (["task=plan_segmentation", "loss.classes=[1,2]"], "loss.classes"),
         (["task=door_classification", "networks=0"], "networks"),
-        (["task=merge_belief", "threshold=2"], "threshold"),
+        (["task=merge_belief", "risk=0"], "risk"),
+        (["task=merge_belief", "halves=[a]"], "halves"),
+        (["task=place_evidence", "half=3"], "half"),
         (["task=match_odds", "pulls=1"], "pulls"),
         (["task=feature_scale", "name=../x"], "name"),
         (["task=embedding", "epoch=3"], "epoch"),
@@ -171,13 +179,15 @@ SMALL_PAIRS = [
     "data.pairs=2", "data.rooms=[4,5]", "data.sources={procedural: 1, r2v: 0, campus: 0}", "heldout.pairs=1",
     "heldout.rooms=[4,5]",
 ]  # fmt: skip
+SMALL_GRIDS = [
+    "data.sets=[5]", "data.drawings=[2]", "data.rooms=[4,6]", "data.sensors={depth: 1.0, tls: 1.0}", "hypotheses=4",
+    "heldout.sets=[1]", "heldout.drawings=[0]", "heldout.rooms=[4,6]", "heldout.strangers=0",
+]  # fmt: skip
 SIMULATED = {
     "plan_segmentation": [*NETWORKS["plan_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "door_classification": ["data=plan_scans", "data.scans=4", "data.seed=0", "epochs=2", "hold_out=2", "heldout.scans=1"],
-    "merge_belief": [
-        "data.sets=[5]", "data.drawings=[2]", "data.rooms=[4,6]", "data.sensors={depth: 1.0, tls: 1.0}", "folds=2",
-        "hypotheses=4", "heldout.sets=[1]", "heldout.drawings=[0]", "heldout.rooms=[4,6]", "heldout.strangers=0",
-    ],
+    "place_evidence": [*NETWORKS["place_evidence"], *SMALL_GRIDS],
+    "merge_belief": [*SMALL_GRIDS, "folds=2", "lookalikes=none"],
     "match_odds": [*SMALL_PAIRS, "folds=2"],
     "feature_scale": SMALL_PAIRS,
 }  # fmt: skip

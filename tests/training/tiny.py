@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,12 @@ from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 from topomerge.embedding.engineered import FEATURES
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.fusion.evidence.crops import LOOKED, SIDE
 from topomerge.io import archive
 from topomerge.matching.odds import hypothesis_features
 from topomerge.training.feature_scale import PairFeatures
 from topomerge.training.match_odds import Evidence
+from topomerge.types import Sim3
 
 EDGE = 0.1  # m
 
@@ -70,17 +73,38 @@ def belief_rows(*_: Any) -> list[dict[str, Any]]:
             features["sliced"] = float(flat)
             closely = {"bent": {**features, **{name: float(rng.uniform(0.1, 1.0)) for name in WINNER_INPUTS}}}
             error = [0.1, 0.0, 1.0] if right else [5.0, 0.0, 90.0]
+            pose = Sim3(0.0, (10.0 * number, 0.0, 0.0)).matrix.tolist()
+            closely |= {"label": int(right), "rival": number < 3, "bent_pose": pose}
             hypotheses.append({**features, **closely, "err": error})
         row = {"name": str(k), "common": 30.0 + k, "kind": "overlap", "building": f"b{k}", "hyps": hypotheses}
+        row["middle"] = [0.0, 0.0, 0.0]
         rows.append({**row, "sensors": ["tls", "laser2d" if flat else "depth"]})
     return rows
+
+
+def place_files(folder: Path) -> list[Path]:
+    """Pairs whose right hypothesis lays a square on itself, and whose wrong one on another square."""
+    folder.mkdir(parents=True)
+    rng, paths = np.random.default_rng(0), []
+    for k in range(12):
+        ground = rng.choice(np.array([1, 2, 2, 4], np.uint8), (8, 1, SIDE // 8, SIDE // 8)).repeat(8, axis=2).repeat(8, axis=3)
+        parts = np.concatenate([ground, ground], axis=1)
+        parts[4:, 1] = rng.permutation(parts[4:, 1].reshape(-1)).reshape(4, SIDE, SIDE)
+        hyps = [{"label": 1, "bent": {}}, {"label": 0, "bent": {}}]
+        row = {"building": f"b{k}", "kind": "overlap", "common": 90.0, "sensors": ["tls", "depth"], "hyps": hyps}
+        arrays = {"row": np.frombuffer(json.dumps(row).encode(), np.uint8), "owner": np.repeat([0, 1], 4).astype(np.int16)}
+        arrays |= {"parts": parts, "ceiling": np.full((8, 2, SIDE, SIDE), 60, np.uint8), "area": np.full(8, 20.0)}
+        arrays |= {"looked": np.ones((8, 2, LOOKED), np.float32), "middle": np.zeros((8, 3)), "about": np.zeros(1, np.uint8)}
+        paths.append(folder / f"{k}.npz")
+        archive.write(arrays, paths[-1])
+    return paths
 
 
 AMOUNTS = ("free", "clutter", "level", "ceilings", "ceiling_area")
 SHARES = ("ratio", "opposed", "conflict_share", "worst_conflict", "share")
 WINNER_INPUTS = (
     "in_place", "by_chance", "pieces", "free", "tall_conflict", "crossing", "worst_ratio", "squares", "bad_squares",
-    "moved_walls", "hanging_met", "hanging", "strain", "doubted",
+    "moved_walls", "hanging_met", "hanging", "strain", "doubted", "repeats", "place_mean", "place_worst", "place_area",
 )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, say, warn
-from topomerge.cli.options import CLOUD_OPTIONS, given, json_option, map_from, quiet, share
+from topomerge.cli.options import BELIEF_OPTIONS, CLOUD_OPTIONS, given, json_option, map_from, quiet
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def _add(args: argparse.Namespace) -> int:
     check_folder(args.folder)
     check_inputs(args.items)
     maps = [(Path(path).stem, replace(map_from(path, args), source=path)) for path in args.items]
-    return _report(add(args.folder, maps, atlas_html, **given(args, "scale", "threshold", "embedder")), args)
+    return _report(add(args.folder, maps, atlas_html, **given(args, "scale", "threshold", "embedder", "known", "risk")), args)
 
 
 def _remove(args: argparse.Namespace) -> int:
@@ -98,7 +98,7 @@ ATLAS = Command(
         option("folder", metavar="DIR", help="the atlas"),
         option("items", nargs="*", metavar="MAP", help="of add: clouds or .tmap; of remove: names, as `list` prints them"),
         option("--scale", choices=("fixed", "free"), help="free: the scales of the maps differ (default fixed)"),
-        option("--threshold", type=share, metavar="P", help="probability from which a link is believed (default 0.8)"),
+        *BELIEF_OPTIONS,
         option(
             "--descriptor",
             dest="embedder",

@@ -14,7 +14,7 @@ import topomerge
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, check_outputs, output_folder, say, warn
 from topomerge.cli.merge_points import point_files, points_written, with_points
-from topomerge.cli.options import CLOUD_OPTIONS, DESCRIPTOR, given, map_from, output, quiet, share
+from topomerge.cli.options import BELIEF_OPTIONS, CLOUD_OPTIONS, DESCRIPTOR, given, map_from, output, quiet
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) ->
         topomap, read, extract = _timed_map(path, args)
         maps.append(topomap)
         read_seconds, extract_seconds = read_seconds + read, extract_seconds + extract
-    choices = given(args, "force", "threshold", "rigid")
+    choices = given(args, "force", "threshold", "rigid", "known", "risk")
     result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices)
     result = replace(result, seconds={**result.seconds, "read": read_seconds, "extract": extract_seconds})
     warn(result.warnings)
@@ -98,7 +98,7 @@ MERGE = Command(
             help="also write the points of the inputs, bent and brought into the joined frame: A_merged.las, .laz or .ply",
         ),
         option("--force", action="store_true", help="write the best merge even if it is not believed (status 2 stays)"),
-        option("--threshold", type=share, metavar="P", help="probability from which a merge is believed (default 0.8)"),
+        *BELIEF_OPTIONS,
         DESCRIPTOR,
         *CLOUD_OPTIONS,
         quiet("print nothing but warnings and a refusal"),

@@ -75,6 +75,17 @@ DESCRIPTOR = option(
     metavar="NAME",
     help="learned (default: the embedder that ships), engineered, shapedna, feather, or the folder of a trained embedder",
 )
+BELIEF_OPTIONS = (
+    option(
+        "--known",
+        choices=("nothing", "building", "storey"),
+        help="what you know of the maps: all of one building, or of one storey (default nothing); the rest need not be ruled out",
+    ),
+    option(
+        "--risk", type=above_zero, metavar="N", help="false merges in a thousand pairs that you accept; the threshold follows"
+    ),
+    option("--threshold", type=share, metavar="P", help="probability from which a merge is believed (default 0.8)"),
+)
 SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of fusion/bend/drift.json
 CONTEXT_STEPS = option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)")
 CLOUD_OPTIONS = (

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from topomerge.fusion.posterior import POSTERIOR, WORDS, evidence_limit, in_words
 from topomerge.fusion.registration import Registration
 from topomerge.matching.poses import PoseHypothesis
 
-RIVAL_LAG = 1.5  # log odds: a hypothesis less far behind is as good
 Row = tuple[str, str, str]  # what, how much, what it says
 
 
@@ -23,8 +23,11 @@ def why(registration: Registration, threshold: float, force: bool = False) -> st
     words = [f"{'merged' if believed else 'not merged'}: probability {chance(registration.probability)} {sign} {threshold:.2f}"]
     words.append(f"{f['walls']:.0f} m2 of walls agree, {f['free']:.0f} m2 of free floor seen by both")
     words.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
-    if not believed and f["margin"] < RIVAL_LAG and len(registration.alternatives) > 1:
-        words.append("another place explains the maps as well")
+    if not believed:
+        if evidence_limit(f) < 1:
+            words.append("both maps show too little of one place for any verdict")
+        elif beside := in_words(registration.posterior, threshold):
+            words.append(beside)
     if force and not believed:
         words.append("joined all the same, as was asked for (--force)")
     return "; ".join(words)
@@ -56,11 +59,24 @@ def evidence_rows(registration: Registration) -> list[Row]:
     rows += _winner_rows(f)
     if np.isfinite(f.get("rmse", np.nan)):
         rows.append(("surfaces", f"{100 * f['rmse']:.1f} cm", "root mean square distance of surfaces that are one"))
+    if registration.places is not None and len(registration.places):
+        odds = registration.places.log_odds
+        words = (
+            f"{(odds > 0).sum()} look like one place, {(odds <= 0).sum()} rather like another one; each is coloured on the plan"
+        )
+        rows.append(("places compared", f"{len(odds)}", words))
     if len(registration.alternatives) > 1:
         times = np.exp(min(f["margin"], 15.0))
         words = f"{times:,.0f} times as probable" if times >= 1.5 else "about as probable"
         rows.append(("next best place", words, "how far the best hypothesis is ahead of the next one, each seen by itself"))
     return rows
+
+
+def posterior_rows(registration: Registration) -> list[tuple[str, str]]:
+    """What the place may be, in words, with its probability; most probable first."""
+    each = registration.posterior
+    names = sorted((n for n in POSTERIOR if each.get(n, 0.0) > 0), key=lambda n: -each[n])
+    return [(WORDS[n], chance(each[n])) for n in names]
 
 
 def _winner_rows(f: Mapping[str, float]) -> list[Row]:

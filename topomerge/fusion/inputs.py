@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.fusion.posterior import threshold_of
 from topomerge.fusion.verify import model
 from topomerge.types import TopometricMap
 
@@ -24,12 +25,17 @@ def check_scale(scale: str) -> None:
         raise InputError(f"scale must be {' or '.join(MERGE_SCALES)}, not {scale!r}")
 
 
-def checked_threshold(threshold: float | None) -> float:
-    """The probability from which a merge is believed; that of the calibration if None.
+def checked_threshold(threshold: float | None, risk: float | None = None) -> float:
+    """The probability from which a merge is believed: as it is given, or for at most `risk` false merges in a thousand pairs, or
+    that of the calibration.
 
     Raises:
-        InputError: not between 0 and 1.
+        InputError: not between 0 and 1, both given, or a risk that no threshold can promise.
     """
+    if risk is not None:
+        if threshold is not None:
+            raise InputError("threshold and risk both say when to believe a merge; give one of them")
+        return threshold_of(float(risk), model()["risk"])
     share = float(model()["threshold"]) if threshold is None else float(threshold)
     if not 0 <= share <= 1:
         raise InputError(f"threshold must be a probability between 0 and 1, not {threshold}")

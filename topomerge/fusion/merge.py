@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import fuse, rooms_in_common
 from topomerge.fusion.inputs import check_pair, check_poses, check_scale, checked_threshold, pair_warnings
+from topomerge.fusion.posterior import check_known
 from topomerge.fusion.prepared import registration_order
 from topomerge.fusion.registration import Registration, register
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
@@ -40,6 +42,8 @@ def merge(
     embedder: str | Descriptor = DEFAULT,
     poses: str = "search",
     rigid: bool = False,
+    known: str = "nothing",
+    risk: float | None = None,
 ) -> MergeResult:
     """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
 
@@ -53,18 +57,22 @@ def merge(
         poses: "search": of walls and of matched rooms (default); "rooms": of each matched pair of rooms by its surfaces alone, as
             the thesis does (two maps of one scale; with `embedder="shapedna"` its whole way).
         rigid: do not bend the maps.
+        known: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
+        risk: false merges in a thousand pairs, at the stated priors (docs/merging.md), that are acceptable: the threshold
+        follows.
 
     Raises:
-        InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale
-            or the poses, or poses of rooms without Open3D (`pip install topomerge[open3d]`).
-    """
+        InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale,
+            the poses or what is known, a threshold and a risk, or poses of rooms without Open3D (`pip install
+    topomerge[open3d]`)."""
     check_poses(poses, len(maps), scale)
     if poses == "rooms":
         check_open3d()
     if len(maps) < 2:
         raise InputError(f"merge takes two maps or more, {len(maps)} given; give another one")
     check_scale(scale)
-    settings = _Settings(scale, force, threshold, embedder, poses, rigid)
+    check_known(known)
+    settings = _Settings(scale, force, checked_threshold(threshold, risk), embedder, poses, rigid, known)
     return _merge_two(maps[0], maps[1], settings) if len(maps) == 2 else _merge_several(maps, settings)
 
 
@@ -74,20 +82,21 @@ class _Settings:
 
     scale: str
     force: bool
-    threshold: float | None
+    threshold: float
     embedder: str | Descriptor
     poses: str
     rigid: bool
+    known: str
 
 
 def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> MergeResult:
     check_pair(a, b, settings.scale)
-    threshold = checked_threshold(settings.threshold)
+    threshold = settings.threshold
     clock = _Clock()
     hypotheses = _room_hypotheses(a, b, settings, clock)
-    registration = register(
-        a, b, scale=settings.scale, proposed=hypotheses, searched=settings.poses == "search", rigid=settings.rigid
-    )
+    searched = settings.poses == "search"
+    choices: dict[str, Any] = {"rigid": settings.rigid, "known": settings.known}
+    registration = register(a, b, scale=settings.scale, proposed=hypotheses, searched=searched, **choices)
     believed = registration.transform is not None and registration.probability >= threshold
     result = MergeResult(
         "merged" if believed else "abstained",
@@ -118,7 +127,7 @@ def _merge_several(maps: Sequence[TopometricMap], settings: _Settings) -> MergeR
     began = time.perf_counter()
     registrations: RegistrationsByPair = {}
     descriptor = None if settings.embedder == DEFAULT else settings.embedder  # the default only says which pairs to try first
-    atlas_settings = AtlasSettings(settings.scale, settings.threshold, descriptor, settings.rigid)
+    atlas_settings = AtlasSettings(settings.scale, settings.threshold, descriptor, settings.rigid, settings.known)
     atlas = solve(maps, atlas_settings, registrations)
     reason, status = atlas.words(), "merged" if _with_first(atlas)[1:] else "abstained"
     if status == "abstained" and atlas.status != "abstained":

@@ -11,13 +11,15 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.fusion.bend.bend import Bend
-from topomerge.fusion.bend.judged import judged_as_bent
+from topomerge.fusion.candidates import Candidate, candidates
+from topomerge.fusion.evidence.places import Places
 from topomerge.fusion.judge import Judge
+from topomerge.fusion.posterior import check_known
 from topomerge.fusion.prepared import Map, Prepared, prepare
 from topomerge.fusion.refine import refine_pose
 from topomerge.fusion.scale import search_scaled
 from topomerge.fusion.search import search
-from topomerge.fusion.verify import MARGIN_CAP, model, probability, rank
+from topomerge.fusion.verify import MARGIN_CAP, Verdict, model, rank, verdict
 from topomerge.matching.poses import PoseHypothesis, wrapped
 from topomerge.matching.refinement import refine
 from topomerge.types import Sim3, VoxelGrid
@@ -41,6 +43,8 @@ class Registration:
         reason: in words.
         seconds: step -> s.
         bend: how the maps are bent onto each other under the transform; None where a rigid pose was asked for.
+        posterior: probability of this place and of each named alternative (`fusion.posterior`); they sum to 1.
+        places: what both maps show of each place that they share under it, and how much that speaks for it.
     """
 
     transform: Sim3 | None
@@ -51,6 +55,8 @@ class Registration:
     reason: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
     bend: Bend | None = None
+    places: Places | None = None
+    posterior: dict[str, float] = field(default_factory=dict)
 
 
 def register(
@@ -63,6 +69,7 @@ def register(
     yaws: Sequence[float] = (),
     searched: bool = True,
     rigid: bool = False,
+    known: str = "nothing",
 ) -> Registration:
     """The pose of map b in map a's frame. `register(b, a)` gives its inverse.
 
@@ -75,10 +82,12 @@ def register(
         searched: look for poses by correlation? Else the proposed ones are all there is.
         rigid: give the best rigid pose? Else both maps are bent, too. They are judged as bent all the same: drift is no
             contradiction.
+        known: "nothing", "building" or "storey": both maps are known to be of one (`posterior.KNOWN`).
 
     Raises:
-        InputError: an empty map, or another word for the scale.
+        InputError: an empty map, or another word for the scale or for what is known.
     """
+    check_known(known)
     if scale not in ("fixed", "free"):
         raise InputError(f"scale must be fixed or free, not {scale!r}")
     clock = _Clock()
@@ -86,7 +95,7 @@ def register(
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
         poses, turns = [pose.inverse() for pose in proposed], [-y for y in yaws]
-        swapped = register(b, a, scale=scale, proposed=poses, yaws=turns, searched=searched, rigid=rigid)
+        swapped = register(b, a, scale=scale, proposed=poses, yaws=turns, searched=searched, rigid=rigid, known=known)
         return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
     first, second = a.storeys, b.storeys
     if searched:
@@ -99,11 +108,12 @@ def register(
         return Registration(None, 0.0, False, reason=reason, seconds=clock.seconds)
     ranked = rank(hypotheses, Judge(first, second))
     clock("verify")
-    bent, winner = judged_as_bent(a, b, ranked[0].transform, scale == "free")
+    looked = candidates(a, b, ranked, scale == "free")
+    best, bent = looked[0], looked[0].bend
     clock("bend")
-    pose, rmse = bent.transform, winner.get("rmse", float("nan"))
+    pose, rmse = bent.transform, best.features["rmse"]
     if not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
-        aligned, misfit = fine(a, b, ranked[0].transform, scale == "free")
+        aligned, misfit = fine(a, b, best.hypothesis.transform, scale == "free")
         if rigid or bent.reason:
             pose, rmse = aligned, misfit
         else:  # bending is level: floors and ceilings say how high
@@ -111,7 +121,9 @@ def register(
             pose = replace(pose, translation=(*pose.translation[:2], height))
             bent = replace(bent, transform=pose)
     clock("refine")
-    return replace(_verdict(ranked, winner, pose, rmse, clock.seconds), bend=None if rigid else bent)
+    believed = _verdict(ranked, looked, verdict([c.features for c in looked], looked[0].closely(), known))
+    features = {**believed.features, "rmse": rmse}
+    return replace(believed, transform=pose, features=features, seconds=clock.seconds, bend=None if rigid else bent)
 
 
 class _Clock:
@@ -126,22 +138,26 @@ class _Clock:
         self.seconds[step], self.before = now - self.before, now
 
 
-def _verdict(
-    ranked: Sequence[PoseHypothesis], winner: dict[str, float], pose: Sim3, rmse: float, seconds: dict[str, float]
-) -> Registration:
-    """The best of ranked hypotheses, refined to `pose`, with its probability and the reason in words."""
-    margin = ranked[0].score - ranked[1].score if len(ranked) > 1 else MARGIN_CAP
-    rigid_conflict = ranked[0].features["conflict_share"]
-    features = {**ranked[0].features, **winner, "rigid_conflict_share": rigid_conflict, "margin": margin, "rmse": rmse}
-    chance, chances = probability(ranked, winner)
+def _verdict(ranked: Sequence[PoseHypothesis], looked: Sequence[Candidate], said: Verdict) -> Registration:
+    """The best of the candidates, with its probability and the reason in words."""
+    best, chance = looked[0], said.each[0]
+    margin = min(best.score - looked[1].score, MARGIN_CAP) if len(looked) > 1 else MARGIN_CAP
+    features = {**said.features, "rigid_conflict_share": best.hypothesis.features["conflict_share"], "margin": margin}
     accepted = chance >= model()["threshold"]
     share = 100 * features["conflict_share"]
     reason = (
         f"{'believed' if accepted else 'not believed'}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of "
         f"free floor seen by both, {share:.1f} % of the walls stand on free floor of the other map"
     )
-    others = tuple(replace(h, probability=p) for h, p in zip(ranked[:ALTERNATIVES], chances, strict=False))
-    return Registration(pose, chance, accepted, features, others, reason, seconds)
+    closely = {id(c.hypothesis) for c in looked}
+    others = [replace(c.hypothesis, score=c.score, probability=p) for c, p in zip(looked, said.each, strict=True)]
+    last = others[-1].score  # of those that were not looked at closely, the lag behind the best one is all that is known
+    for h in ranked:
+        if id(h) not in closely:
+            lag = max(ranked[0].score - h.score, best.score - last)
+            others.append(replace(h, score=best.score - lag, probability=float(chance * np.exp(-lag))))
+    pose, alternatives = best.bend.transform, tuple(others[:ALTERNATIVES])
+    return Registration(pose, chance, accepted, features, alternatives, reason, places=best.places, posterior=said.posterior)
 
 
 def fine(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
@@ -160,4 +176,7 @@ def _inverse(registration: Registration) -> Registration:
     others = tuple(replace(h, transform=h.transform.inverse()) for h in registration.alternatives)
     transform = None if registration.transform is None else registration.transform.inverse()
     bent = registration.bend and registration.bend.inverse()
-    return replace(registration, transform=transform, alternatives=others, bend=bent)
+    seen = registration.places
+    if seen is not None and registration.transform is not None:
+        seen = seen.inverse(registration.transform)
+    return replace(registration, transform=transform, alternatives=others, bend=bent, places=seen)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.bend.placement import Placement, bend_to_json, placements, with_bends
+from topomerge.fusion.evidence.places import Places
 from topomerge.fusion.registration import Registration
 from topomerge.io.listing import plain
 from topomerge.types import Sim3, TopometricMap
@@ -111,6 +112,8 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
         "status": result.status,
         "probability": min(max(float(result.probability), 0.0), 1.0),
         "reason": result.reason,
+        "alternatives": {name: round(p, 6) for name, p in registration.posterior.items()} if registration else {},
+        "places": places_to_json(registration.places) if registration and registration.places else [],
         "descriptor": result.descriptor,
         "maps": [{"source": m.source, "rooms": len(m.rooms), "storeys": len(m.storeys)} for m in result.maps],
         "transforms": transforms,
@@ -121,6 +124,14 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
     }
     plain_listing: dict[str, Any] = plain(listing)
     return plain_listing
+
+
+def places_to_json(places: Places) -> list[dict[str, Any]]:
+    """What each place says as plain values: where its middle is in the frame of the first map, m, how much floor both maps saw of
+    it, m2, and the log odds that it is one place and no look-alike."""
+    c = places.crops
+    each = zip(c.middle.tolist(), c.area.tolist(), places.log_odds.tolist(), strict=True)
+    return [{"at": [round(v, 2) for v in at], "m2": round(m2, 1), "log_odds": round(odds, 2)} for at, m2, odds in each]
 
 
 def transform_to_json(pose: Sim3, rmse: float, into: int = 0) -> dict[str, Any]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from topomerge.fusion.judge import Judge
+from topomerge.fusion.posterior import evidence_limit, limited, posterior
 from topomerge.io.weight_files import read_weights_json
 from topomerge.matching.poses import PoseHypothesis, PoseTolerance, distinct_hypotheses
 from topomerge.types import Array
@@ -74,6 +75,20 @@ def plausibility(f: Features) -> float:
     return _logit(_models(f)["pose"], vector(f))
 
 
+def quality_lag(ranked: Sequence[PoseHypothesis]) -> Array:
+    """(n,) by how many log odds each hypothesis is behind the first one without the amounts; inf where it explains too little to
+    be a rival."""
+    fitted = _models(ranked[0].features)["pose"]
+    vectors = np.array([vector(h.features) for h in ranked])
+    quality = vectors[:, QUALITY] @ (np.array(fitted["weight"]) / fitted["scale"])[QUALITY]
+    return np.where(vectors[:, 1] >= vectors[0, 1] + np.log(RIVAL_WALLS), quality[0] - quality, np.inf)
+
+
+def bent_score(f: Features) -> float:
+    """Log odds that a pose is right, seen by itself, once the maps are bent."""
+    return _logit(_models(f)["bent"], bent_pose_vector(f))
+
+
 def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[float, float, float, float]:
     """How far the first of ranked hypotheses is ahead, named `LEAD_VECTOR`: in log odds; in log odds without the amounts, of
     those that explain a share of what it does; in log odds of its share of the odds of all; and that share.
@@ -81,7 +96,7 @@ def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[
     A shift by one room along a row of rooms explains less, but nothing speaks against it: it is as good.
     """
     margin = min(float(scores[0] - scores[1]), MARGIN_CAP) if len(scores) > 1 else MARGIN_CAP
-    quality = vectors[:, QUALITY] @ (weights / scales)[QUALITY]
+    quality = vectors[:, BENT_QUALITY] @ (weights / scales)[BENT_QUALITY]
     rival = vectors[1:, 1] >= vectors[0, 1] + np.log(RIVAL_WALLS)
     ahead = float(quality[0] - quality[1:][rival].max()) if rival.any() else MARGIN_CAP
     share = float(1 / np.exp(scores - scores[0]).sum())
@@ -89,30 +104,49 @@ def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[
     return margin, float(np.clip(ahead, -2.0, MARGIN_CAP)), alone, share
 
 
-def probability(ranked: Sequence[PoseHypothesis], winner: Features) -> tuple[float, list[float]]:
-    """Probability that the first of ranked hypotheses is right, at most its share of the odds of all; and of each of them.
+@dataclass(frozen=True)
+class Verdict:
+    """Args:
+    posterior: probability of each of `posterior.POSTERIOR`; they sum to 1.
+    each: probability of each of the ranked poses, the first one that of this place (``here``).
+    features: of the first pose, all that it was judged by.
+    """
+
+    posterior: dict[str, float]
+    each: list[float]
+    features: dict[str, float]
+
+
+def verdict(rivals: Sequence[Features], winner: Features, known: str = "nothing") -> Verdict:
+    """Is the first of ranked poses right? At most its share of the odds of all, and at most what so much evidence can carry.
 
     Args:
-        winner: what the first one is judged by once the maps are bent (`bend.judged`).
+        rivals: features of each pose once the maps are bent, best first.
+        winner: features of the first one, with those of `winner_features`.
+        known: what the user knows, a key of `posterior.KNOWN`.
     """
-    models = _models(ranked[0].features)
-    pose = models["pose"]
-    vectors = np.array([vector(h.features) for h in ranked])
-    scores = np.array([h.score for h in ranked])
-    leads = lead(scores, vectors, np.array(pose["weight"]), np.array(pose["scale"]))
-    features = {**ranked[0].features, **winner}
-    seen = np.concatenate([vector(features), leads[:3], winner_vector(features), bend_vector(features)])
-    odds = _logit(models["winner"], seen)
-    shares = np.exp(scores - scores[0]) / np.exp(scores - scores[0]).sum()
-    first = min(1 / (1 + np.exp(-odds)), leads[3])
-    return float(first), (first * shares / shares[0]).tolist()
+    models = _models(rivals[0])
+    scores = np.array([bent_score(f) for f in rivals])
+    vectors = np.array([bent_pose_vector(f) for f in rivals])
+    leads = lead(scores, vectors, np.array(models["bent"]["weight"]), np.array(models["bent"]["scale"]))
+    seen = belief_vector(vectors[0], leads[:3], winner)
+    here = min(1 / (1 + np.exp(-_logit(models["winner"], seen))), leads[3])
+    every = limited(posterior(float(here), models["kinds"], seen, known), evidence_limit(winner))
+    shares = np.exp(scores - scores[0])
+    return Verdict(every, (every["here"] * shares).tolist(), dict(winner))
+
+
+def belief_vector(bent: Array, leads: Sequence[float], winner: Features) -> Array:
+    """What the models of the best pose see, named `BELIEF_VECTOR`: the pose once the maps are bent (`bent_pose_vector`), its
+    lead, and what only it is asked."""
+    return np.concatenate([bent, leads, [np.log1p(winner["repeats"])], winner_vector(winner), bend_vector(winner)])
 
 
 def _logit(fitted: Mapping[str, Any], x: Array) -> float:
     return float(np.dot((x - fitted["mean"]) / fitted["scale"], fitted["weight"]) + fitted["bias"])
 
 
-LEAD_VECTOR = ("margin", "ahead", "alone")
+LEAD_VECTOR = ("margin", "ahead", "alone", "repeats")
 WINNER_VECTOR = (
     "tall", "crossing", "worst_ratio", "squares", "bad_squares", "in_place", "out_of_place", "kept", "moved_walls", "hanging",
     "fallen", "held",
@@ -128,6 +162,20 @@ def bend_vector(f: Features) -> Array:
     joints give way, and the share of the pieces that were voted out. How far pieces moved is left out: simulated maps drift less
     than real ones, and a model that sees it takes real drift for a wrong pose."""
     return np.array([np.log(max(f["strain"], USUAL_STRAIN)), f["doubted"]])
+
+
+PLACE_VECTOR = ("place_mean", "place_total", "place_worst")
+BENT_POSE_VECTOR = (*POSE_VECTOR, *PLACE_VECTOR)
+BENT_QUALITY = [*QUALITY, BENT_POSE_VECTOR.index("place_mean"), BENT_POSE_VECTOR.index("place_worst")]
+BELIEF_VECTOR = (*BENT_POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR, *BEND_VECTOR)
+PLACE_AREA = 20.0  # m2 of floor that count as one place that tells something by itself
+
+
+def bent_pose_vector(f: Features) -> Array:
+    """(17,) what the models see of a pose once the maps are bent, named `BENT_POSE_VECTOR`: places depend on each other, so that
+    their log odds do not add up; how much their number counts is fitted."""
+    mean = f["place_mean"]
+    return np.append(vector(f), [mean, mean * np.log1p(f["place_area"] / PLACE_AREA), f["place_worst"]])
 
 
 def winner_vector(f: Features) -> Array:

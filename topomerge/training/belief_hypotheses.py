@@ -5,8 +5,9 @@ The belief in merges is fitted to them (`training.merge_belief`), and benchmarks
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,11 @@ import numpy as np
 from topomerge.datasets.core.derived import derive, read_derived
 from topomerge.datasets.pairs.grid_drawings import build_drawings
 from topomerge.datasets.pairs.grid_pairs import GridPair, GridRecipe, build_grids, load_grids
-from topomerge.fusion.bend.judged import judged_as_bent
+from topomerge.fusion.candidates import candidate, repeats, rivals
+from topomerge.fusion.evidence.crops import CROP_ARRAYS, Crops
+from topomerge.fusion.evidence.network import place_log_odds, read_weights
+from topomerge.fusion.evidence.network import weights as place_weights
+from topomerge.fusion.evidence.places import Places
 from topomerge.fusion.judge import Judge
 from topomerge.fusion.prepared import prepare
 from topomerge.fusion.scale import search_scaled
@@ -23,38 +28,94 @@ from topomerge.fusion.search import search
 from topomerge.fusion.verify import rank
 from topomerge.matching.poses import wrapped
 from topomerge.metrics import pose_right
-from topomerge.training.task_settings import MergeBelief
+from topomerge.training.task_settings import MergeBelief, PlaceEvidence
+from topomerge.training.tasks import weights_of
 from topomerge.types import Array, Sim3
 
 DESCRIBED = (
     *("sensors", "kind", "building", "source", "overlap", "differs", "walls_differ", "scaled"),
     *("lookalike", "furniture", "tellable", "repeats"),  # of look-alikes
+    "captures",  # of the development floor
 )
 RIGHT_POSE = (0.5, 5.0)  # m, degrees
+BENT = (1.5, 5.0)  # m, degrees: a map that is bent by drift fits in no one pose; neither right nor wrong
 SAME_WALLS = 3.0  # m2 of walls by which two storeys differ at most that no drawing tells apart
 ALIKE_WINGS = 0.3  # m by which walls of twin wings differ at most, where both maps look: drift does as much
 Row = dict[str, Any]  # of a pair: name, common, `DESCRIBED`, and its hypotheses `hyps`
 
 
-def belief_rows(recipe: GridRecipe, settings: MergeBelief, say: Any) -> list[Row]:
-    """The pairs of a set, drawings and strangers among them, with their judged hypotheses, cached."""
+def hypothesis_files(recipe: GridRecipe, settings: MergeBelief | PlaceEvidence, say: Any) -> list[Path]:
+    """Files of the judged hypotheses of a set's pairs, drawings and strangers among them (`judged_pair`), cached."""
     grids, _ = build_grids(recipe, settings, say)
     drawings, _ = build_drawings(recipe, settings, say) if any(recipe.drawings) else ([], None)
     rng = np.random.default_rng(len(grids))
     strangers: list[list[int]] = rng.integers(len(grids), size=(recipe.strangers, 2)).tolist() if grids else []
     sources = [[path] for path in (*drawings, *grids)] + [[grids[i], grids[j]] for i, j in strangers]
+    return judged_files(recipe.name, sources, settings, say)
+
+
+def judged_files(name: str, sources: Sequence[Sequence[Path]], settings: MergeBelief | PlaceEvidence, say: Any) -> list[Path]:
+    """Files of the judged hypotheses of pairs, or of map a of one and b of another one, cached."""
     options = {"hypotheses": settings.hypotheses, "inspected": settings.inspected}
-    files, _ = derive(f"{recipe.name}_hypotheses", judged_pair, sources, settings, options, say)
-    return [json.loads(read_derived(file)["row"].tobytes()) for file in files]
+    return derive(f"{name}_hypotheses", judged_pair, sources, settings, options, say)[0]
 
 
 def judged_pair(*paths: Path, hypotheses: int, inspected: int) -> dict[str, Array]:
-    """The row of one pair, or of map a of one and b of another one, as JSON."""
+    """The row of one pair, or of map a of one and b of another one, as JSON, and the squares of its places (`Crops`) with the
+    hypothesis that each is of (``owner``)."""
     pairs = [load_grids(path) for path in paths]
-    pair = pairs[0] if len(pairs) == 1 else together(*pairs)
+    return judged_arrays(pairs[0] if len(pairs) == 1 else together(*pairs), hypotheses, inspected)
+
+
+def judged_arrays(pair: GridPair, hypotheses: int, inspected: int) -> dict[str, Array]:
+    """As `judged_pair`."""
     about = {key: pair.about[key] for key in DESCRIBED if key in pair.about}
-    row = {"name": pair.name, "common": pair.common, **about, "hyps": judged(pair, hypotheses, inspected)}
-    return {"row": np.frombuffer(json.dumps(row).encode(), np.uint8)}
+    hyps, seen, middle = judged(pair, hypotheses, inspected)
+    row = {"name": pair.name, "common": pair.common, **about, "hyps": hyps, "middle": middle.tolist()}
+    owner = [np.full(len(c), k, np.int16) for k, c in seen.items()]
+    crops = {f: np.concatenate([getattr(c, f) for c in seen.values()]) for f in CROP_ARRAYS} if seen else {}
+    return {
+        "row": np.frombuffer(json.dumps(row).encode(), np.uint8),
+        "owner": np.concatenate([*owner, np.zeros(0, np.int16)]),
+        **crops,
+    }
+
+
+def half_of(building: str) -> int:
+    """0 or 1: the half of the buildings that one belongs to, of which networks of places are trained on one each."""
+    return hashlib.sha256(building.split(" + ")[0].encode()).digest()[0] % 2
+
+
+def belief_rows(recipe: GridRecipe, settings: MergeBelief, say: Any) -> list[Row]:
+    """The pairs of a set with their judged hypotheses, and what their places say."""
+    networks = place_networks(settings)
+    return [row_of(path, networks) for path in hypothesis_files(recipe, settings, say)]
+
+
+def place_networks(settings: MergeBelief) -> list[Mapping[str, Array]]:
+    """The networks of the runs that saw one half of the buildings each (`task=place_evidence half=1`, `half=2`); the one that
+    ships where none are named.
+
+    Raises:
+        InputError: a run without a network.
+    """
+    if not settings.halves:
+        return [place_weights()] * 2
+    return [read_weights(weights_of("place_evidence", run)) for run in settings.halves]
+
+
+def row_of(path: Path, networks: Sequence[Mapping[str, Array]]) -> Row:
+    """The row of a file, with what its places say (``place_mean`` and the like) by the network of the other half of the
+    buildings: what it was trained on it knows too well."""
+    data = read_derived(path)
+    row: Row = json.loads(data["row"].tobytes())
+    network = networks[1 - half_of(row["building"])]
+    for k, h in enumerate(row["hyps"]):
+        if "bent" in h:
+            pick = np.flatnonzero(data["owner"] == k)
+            crops = Crops(**{f: data[f][pick] for f in CROP_ARRAYS}) if len(pick) else Crops.none()
+            h["bent"] |= Places(crops, place_log_odds(crops, network)).features
+    return row
 
 
 def error(pose: Sim3, pair: GridPair) -> list[float] | None:
@@ -80,25 +141,44 @@ def together(first: GridPair, second: GridPair) -> GridPair:
     return GridPair(f"{first.name}+{second.name}", first.a, second.b, (first.free[0], second.free[1]), None, 0.0, about)
 
 
-def judged(pair: GridPair, hypotheses: int, inspected: int) -> list[dict[str, Any]]:
-    """Hypotheses with what they are judged by and their errors; the first ones with what the maps show once they are bent
-    (``bent``), which only the best one is asked."""
+def judged(pair: GridPair, hypotheses: int, inspected: int) -> tuple[list[Row], dict[int, Crops], Array]:
+    """Hypotheses with what they are judged by, their errors and their labels; those that registration looks at closely, and
+    besides the first right one and the first wrong ones, with what the maps show once they are bent (``bent``), their squares;
+    and the middle (3,) of the second map, m, where poses are compared."""
     first, second = (prepare(g, f) for g, f in zip((pair.a, pair.b), pair.free, strict=True))
     scaled = bool(pair.about.get("scaled"))
     turn = second.order < first.order
     if turn:
         first, second = second, first
-    rows = []
     poses = (search_scaled if scaled else search)(first.storeys, second.storeys)
-    for k, h in enumerate(rank(poses, Judge(first.storeys, second.storeys))[:hypotheses]):
-        pose = h.transform.inverse() if turn else h.transform
-        closely: dict[str, Any] = {}
-        if k < inspected:
-            bent = judged_as_bent(first, second, h.transform, scaled)[1]
-            closely = {"bent": {**h.features, **bent, "rigid_conflict_share": h.features["conflict_share"]}}
-            closely["pose"] = h.transform.matrix.tolist()
-        rows.append({**h.features, **closely, "err": error(pose, pair)})
-    return rows
+    ranked = rank(poses, Judge(first.storeys, second.storeys))[:hypotheses] if poses else []
+    errors = [error(h.transform.inverse() if turn else h.transform, pair) for h in ranked]
+    labels = [label_of(err, pair.about["sensors"]) for err in errors]
+    closely = set(rivals(ranked)) if ranked else set()
+    closely |= set(np.flatnonzero(np.array(labels) == 1)[:1].tolist()) | set(
+        np.flatnonzero(np.array(labels) == 0)[:inspected].tolist()
+    )
+    rows: list[Row] = []
+    seen: dict[int, Crops] = {}
+    for k, h in enumerate(ranked):
+        rows.append({**h.features, "err": errors[k], "label": labels[k], "score": h.score})
+        if k in closely:
+            bent = candidate(first, second, h, scaled)
+            pose = bent.bend.transform
+            errors[k] = error(pose.inverse() if turn else pose, pair)  # as registration gives it
+            rows[k] |= {"err": errors[k], "label": label_of(errors[k], pair.about["sensors"])}
+            rows[k] |= {
+                "bent": bent.closely() | {"repeats": repeats(ranked)},
+                "bent_pose": pose.matrix.tolist(),
+                "rival": k in rivals(ranked),
+            }
+            seen[k] = bent.places.crops
+    return rows, seen, np.append(second.storeys[0].middle, 0.0)
+
+
+def label_of(err: Sequence[float] | None, sensors: Any) -> int:
+    """1 right, 0 wrong, -1 neither: a map that is bent by drift fits in no one pose."""
+    return 1 if right(err, sensors) else -1 if right(err, sensors, BENT) else 0
 
 
 def fair(row: dict[str, Any]) -> bool:

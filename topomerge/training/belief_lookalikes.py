@@ -9,15 +9,13 @@ counted by themselves.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from topomerge.datasets.core.derived import derive, read_derived
 from topomerge.datasets.pairs.lookalikes import LookalikeRecipe, build_lookalikes
-from topomerge.training.belief_hypotheses import Row, judged_pair
+from topomerge.training.belief_hypotheses import Row, judged_files, place_networks, row_of
 from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array
 
@@ -28,9 +26,8 @@ def lookalike_rows(recipe: LookalikeRecipe, settings: MergeBelief, say: Any) -> 
     if settings.lookalikes == "none":
         return []
     paths, _ = build_lookalikes(recipe, settings, say)
-    options = {"hypotheses": settings.hypotheses, "inspected": settings.inspected}
-    files, _ = derive(f"{recipe.name}_hypotheses", judged_pair, [[path] for path in paths], settings, options, say)
-    rows = [json.loads(read_derived(file)["row"].tobytes()) for file in files]
+    networks = place_networks(settings)
+    rows = [row_of(file, networks) for file in judged_files(recipe.name, [[path] for path in paths], settings, say)]
     return [{**row, "judged_only": settings.lookalikes == "judged" or not teaches(row)} for row in rows]
 
 

@@ -7,43 +7,37 @@ of a pair. What is reported comes from cross-validation over buildings.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
+from topomerge.datasets.pairs.evaluation_pair import sim3_of
 from topomerge.errors import InputError
+from topomerge.fusion.posterior import threshold_of
 from topomerge.fusion.verify import (
-    BEND_VECTOR,
-    LEAD_VECTOR,
+    BASIN,
+    BELIEF_VECTOR,
+    BENT_POSE_VECTOR,
     POSE_VECTOR,
-    WINNER_VECTOR,
-    bend_vector,
+    Features,
+    belief_vector,
+    bent_pose_vector,
     lead,
     model,
     vector,
-    winner_vector,
 )
-from topomerge.training.belief_hypotheses import belief_rows, fair, kind_of, right
+from topomerge.matching.poses import PoseHypothesis, distinct_hypotheses
+from topomerge.training.belief_floor import floor_rows
+from topomerge.training.belief_hypotheses import belief_rows, fair, kind_of
 from topomerge.training.belief_lookalikes import lookalike_rows, lookalike_scores
+from topomerge.training.belief_models import fitted, fitted_kinds, folds, logits, prior_weights, risk_curve, what_it_is
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array
-
-BENT = (1.5, 5.0)  # m, degrees: a map that is bent by drift fits in no one pose; neither right nor wrong
-BENDING_STRENGTH = 10.0  # of four numbers: next to free
-BENT_FEATURES = (*POSE_VECTOR, *WINNER_VECTOR, *BEND_VECTOR)  # of the best hypothesis, once the maps are bent
-BELIEF_FEATURES = [*POSE_VECTOR, *LEAD_VECTOR, *WINNER_VECTOR, *BEND_VECTOR]
-SIGN = {
-    "ratio": 1, "walls": 1, "conflict": -1, "worst": -1, "free": 1, "opposed": -1, "lift": 1, "met": 1, "missed": -1, "share": 1,
-    "level": -1, "ceilings": -1, "margin": 1, "ahead": 1, "tall": -1, "crossing": 1, "worst_ratio": 1, "squares": 1,
-    "bad_squares": -1, "in_place": 1, "out_of_place": -1, "kept": 1, "moved_walls": -1, "hanging": 1, "fallen": -1, "held": 1,
-    "alone": 1, "odds": 1, "strain": -1, "doubted": -1,
-}  # fmt: skip
 
 
 def fit(settings: MergeBelief, say: Say) -> dict[str, float]:
@@ -60,164 +54,142 @@ def fit_belief(settings: MergeBelief, say: Say) -> Fitted:
     pairs; what left-out pairs say about them is reported of the pairs that each is for."""
     rows = [row for row in belief_rows(settings.data, settings, say) if row["hyps"] and fair(row)]
     rows += [row for row in lookalike_rows(settings.alike, settings, say) if row["hyps"]]
-    weights: dict[str, Any] = {"names": BELIEF_FEATURES, "threshold": settings.threshold}
-    metrics: dict[str, float] = {}
-    parts = []
+    rows += floor_rows(settings, say)
+    weights: dict[str, Any] = {"names": BELIEF_VECTOR}
+    parts = {}
     for name, flat in (("solid", False), ("flat", True)):
         chosen = rows if flat else [row for row in rows if "drawing" not in row["sensors"]]
-        weights[name], scored = fit_models(chosen, flat, settings)
-        parts.append(scored)
-        metrics |= {f"{key}_{name}": value for key, value in belief_scores(*ordinary(*scored), settings.threshold).items()}
-    rows_scored = [row for part in parts for row in part[0]]
-    believed, true = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
-    metrics |= belief_scores(*ordinary(rows_scored, believed, true), settings.threshold)
-    metrics |= lookalike_scores(rows_scored, believed, true, settings.threshold)
-    say(believed_by_kind(rows_scored, believed, true, settings.threshold))
+        weights[name], parts[name] = fit_models(chosen, flat, settings)
+    rows_scored = [row for part in parts.values() for row in part[0]]
+    believed, true = (np.concatenate([part[k] for part in parts.values()]) for k in (1, 2))
+    weights["risk"] = left_out_risk(rows_scored, believed, true)
+    least = weights["risk"][-1][1]
+    weights["threshold"] = threshold = threshold_of(max(settings.risk, least, 1e-9), weights["risk"])
+    metrics = {
+        f"{key}_{name}": v for name, part in parts.items() for key, v in belief_scores(*ordinary(*part), threshold).items()
+    }
+    metrics |= belief_scores(*ordinary(rows_scored, believed, true), threshold)
+    metrics |= lookalike_scores(rows_scored, believed, true, threshold)
+    say(believed_by_kind(rows_scored, believed, true, threshold))
     trained = sum(not row.get("judged_only") for row in rows)
     origin = {"set": settings.data.name, "split": settings.data.split, "pairs": trained, "lookalikes": settings.lookalikes}
-    return Fitted(weights=_rounded(weights), metrics=metrics, origin=origin)
+    return Fitted(weights=_rounded(weights), metrics=metrics | {"threshold": threshold}, origin=origin)
 
 
-def fitted(x: Array, y: Array, names: Sequence[str], strength: float, weight: Array | None = None) -> dict[str, Any]:
-    """Standardised logistic regression as plain numbers, in which what speaks for a merge never counts against it (`SIGN`)."""
-    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-6)
-    z, sign = (x - mean) / scale, np.where(y, 1.0, -1.0)
-    weight = np.ones(len(y)) if weight is None else weight
-
-    def loss(t: Array) -> tuple[float, Array]:
-        margin = sign * (z @ t[:-1] + t[-1])
-        slope = -weight * sign / (1 + np.exp(margin))
-        value = (weight * np.logaddexp(0, -margin)).sum() + (t[:-1] ** 2).sum() / (2 * strength)
-        return float(value), np.append(z.T @ slope + t[:-1] / strength, slope.sum())
-
-    bounds = [{1: (0, None), -1: (None, 0)}.get(SIGN.get(n, 0), (None, None)) for n in names] + [(None, None)]
-    t = minimize(loss, np.zeros(len(names) + 1), jac=True, bounds=bounds, method="L-BFGS-B").x
-    return {"mean": mean.tolist(), "scale": scale.tolist(), "weight": t[:-1].tolist(), "bias": float(t[-1])}
-
-
-def logits(model: dict[str, Any], x: Array) -> Array:
-    """(n,) log odds."""
-    out: Array = (x - model["mean"]) / model["scale"] @ np.array(model["weight"]) + model["bias"]
-    return out
-
-
-def label(hypothesis: dict[str, Any], row: dict[str, Any]) -> int:
-    """1 right, 0 wrong, -1 neither: a map that is bent by drift fits in no one pose."""
-    err = hypothesis["err"]
-    return 1 if right(err, row["sensors"]) else -1 if right(err, row["sensors"], BENT) else 0
+def left_out_risk(rows: Sequence[dict[str, Any]], believed: Array, true: Array) -> list[list[float]]:
+    """`risk_curve` of pairs that were left out, but for what nobody can tell apart, what trains nothing, and the floor."""
+    no = [row.get("tellable") is False or row.get("judged_only") or "weight" in row for row in rows]
+    chosen = ~np.array(no, bool)
+    truth = np.array([what_it_is(row, int(t)) for row, t in zip(rows, true, strict=True)])
+    return risk_curve(believed[chosen], true[chosen], truth[chosen])
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """All hypotheses of all pairs: of which pair (`owner`), what the first model sees (`x`), right or not (`y`: `label`), what
-    is known from looking closer (`near`; nan where nobody did). Of each pair its building, and whether it trains; the first
+    """Hypotheses of pairs: of which pair (`owner`), what the model of rigid poses sees (`x`), right or not (`y`: `label_of`);
+    what the model of bent maps sees (`bent`; nan where nobody looked closely), further features (`closely`), where it lies then
+    (`poses`), and does registration look at it closely (`rival`)? Of each pair its building, and whether it trains; the first
     `ordinary` buildings are those of ordinary pairs."""
 
     rows: list[dict[str, Any]]
     owner: Array
     x: Array
     y: Array
-    near: Array
+    bent: Array
+    closely: list[Features]
+    poses: Array
+    rival: Array
     building: Array
     trains: Array
     ordinary: int
 
+    @property
+    def looked(self) -> Array:
+        """(n,) bool: was it looked at closely?"""
+        return ~np.isnan(self.bent[:, 0])
+
 
 def tabled(rows: list[dict[str, Any]]) -> Table:
     """Hypotheses as arrays."""
-    hypotheses = [(i, h) for i, row in enumerate(rows) for h in row["hyps"]]
-    near = [_closely(h["bent"]) if "bent" in h else np.full(len(BENT_FEATURES), np.nan) for _, h in hypotheses]
+    owner = np.array([i for i, row in enumerate(rows) for _ in row["hyps"]])
+    hyps = [h for row in rows for h in row["hyps"]]
+    nothing = np.full(len(BENT_POSE_VECTOR), np.nan)
+    poses = np.array([h.get("bent_pose", np.full((4, 4), np.nan)) for h in hyps], float)
     names = [f"{int('lookalike' in row)}{row['building'].split(' + ')[0]}" for row in rows]  # ordinary ones first
-    y = np.array([label(h, rows[i]) for i, h in hypotheses])
-    x = np.array([vector(h) for _, h in hypotheses])
-    trains = np.array([not row.get("judged_only") for row in rows], bool)
-    owner, building = np.array([i for i, _ in hypotheses]), np.unique(names, return_inverse=True)[1]
-    return Table(rows, owner, x, y, np.array(near), building, trains, len({name for name in names if name[0] == "0"}))
+    return Table(
+        rows, owner, np.array([vector(h) for h in hyps]), np.array([h["label"] for h in hyps]),
+        np.array([bent_pose_vector(h["bent"]) if "bent" in h else nothing for h in hyps]), [h.get("bent", {}) for h in hyps],
+        poses, np.array([bool(h.get("rival")) for h in hyps]), np.unique(names, return_inverse=True)[1],
+        np.array([not row.get("judged_only") for row in rows], bool), len({name for name in names if name[0] == "0"}),
+    )  # fmt: skip
 
 
-def _closely(bent: dict[str, float]) -> Array:
-    """What the second model sees of a hypothesis, but for how far it is ahead."""
-    return np.concatenate([vector(bent), winner_vector(bent), bend_vector(bent)])
-
-
-def best(t: Table, scores: Array, pose: dict[str, Any], i: int, wrong: bool = False) -> tuple[int, Array, float] | None:
+def best(t: Table, scores: Array, bent: dict[str, Any], i: int, wrong: bool = False) -> tuple[int, Array, float] | None:
     """Row of the best hypothesis of pair i (of the wrong ones only, as if no search had found a right one), what the
     second model sees of it, and its share of the odds."""
-    rows = np.flatnonzero((t.owner == i) & ((t.y == 0) | (not wrong)))
+    rows = np.flatnonzero((t.owner == i) & t.looked & ((t.y == 0) if wrong else t.rival))
     rows = rows[np.argsort(-scores[rows], kind="stable")]
-    if not len(rows) or np.isnan(t.near[rows[0]]).any():
+    if not len(rows):
         return None
-    leads = lead(scores[rows], t.x[rows], np.array(pose["weight"]), np.array(pose["scale"]))
-    near, whole = t.near[rows[0]], len(POSE_VECTOR)
-    return int(rows[0]), np.concatenate([near[:whole], leads[:3], near[whole:]]), leads[3]
+    rows = rows[_distinct(t.poses[rows], np.array(t.rows[i]["middle"]))]
+    leads = lead(scores[rows], t.bent[rows], np.array(bent["weight"]), np.array(bent["scale"]))
+    first = int(rows[0])
+    return first, belief_vector(t.bent[first], leads[:3], t.closely[first]), leads[3]
 
 
-def folds(groups: Array, count: int, ordinary: int) -> Iterator[tuple[Array, Array]]:
-    """Rows to train on and rows to test on; no group is in both. Groups from `ordinary` on (of look-alikes) are dealt in turn, so
-    that the folds of the others are the same without them."""
-    first = int(groups[groups < ordinary].max(initial=-1)) + 1
-    of = np.append(np.random.default_rng(0).permutation(first), np.arange(first, groups.max() + 1))[groups] % count
-    for k in range(count):
-        yield np.flatnonzero(of != k), np.flatnonzero(of == k)
+def _distinct(poses: Array, middle: Array) -> list[int]:
+    """Which of ranked poses (n, 4, 4) end in no better one's place (as `fusion.candidates`)."""
+    hypotheses = [PoseHypothesis(sim3_of(pose)) for pose in poses]  # type: ignore[arg-type]
+    single = {id(h) for h in distinct_hypotheses(hypotheses, middle, BASIN)}
+    return [k for k, h in enumerate(hypotheses) if id(h) in single]
 
 
 def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) -> tuple[dict[str, Any], tuple[Any, Array, Array]]:
-    """Both models of these pairs; and of those that are flat, or are not: the rows, what left-out buildings' models believe of
-    their best hypothesis, and its label.
+    """The three models of these pairs; and of those that are flat, or are not: the rows, what left-out buildings' models believe
+    of their best hypothesis, and its label.
 
     Raises:
         InputError: too few pairs or buildings.
     """
     t = tabled(rows)
     sure = (t.y >= 0) & t.trains[t.owner]
-    if len(np.unique(t.building)) < 2 or len(np.unique(t.y[sure] > 0)) < 2:
+    closely = sure & t.looked
+    if len(np.unique(t.building)) < 2 or len(np.unique(t.y[closely] > 0)) < 2:
         raise InputError("data.sets: too few pairs: right and wrong hypotheses of two buildings are needed")
-    pose, scores = fitted(t.x[sure], t.y[sure] > 0, POSE_VECTOR, settings.pose_strength), np.zeros(len(t.y))
-    if settings.refit == "bending":
+    if settings.refit == "all":
+        pose = fitted(t.x[sure], t.y[sure] > 0, POSE_VECTOR, settings.pose_strength)
+    else:
         pose = model()["flat" if flat else "solid"]["pose"]
-        scores = logits(pose, t.x)
-    for train, test in folds(t.building[t.owner], settings.folds, t.ordinary) if settings.refit == "all" else ():
-        train = train[sure[train]]
-        scores[test] = logits(fitted(t.x[train], t.y[train] > 0, POSE_VECTOR, settings.pose_strength), t.x[test])
-    first = [(i, b) for i in range(len(t.rows)) if (b := best(t, scores, pose, i)) is not None]
-    others = [(i, best(t, scores, pose, i, True)) for i, _ in first if (t.y[t.owner == i] > 0).any()]
+    strength = settings.pose_strength
+    bent = fitted(t.bent[closely], t.y[closely] > 0, BENT_POSE_VECTOR, strength)
+    scores = np.full(len(t.y), -np.inf)
+    for train, test in folds(t.building[t.owner], settings.folds, t.ordinary):
+        train, test = train[closely[train]], test[t.looked[test]]
+        scores[test] = logits(fitted(t.bent[train], t.y[train] > 0, BENT_POSE_VECTOR, strength), t.bent[test])
+    first = [(i, b) for i in range(len(t.rows)) if (b := best(t, scores, bent, i)) is not None]
+    others = [(i, best(t, scores, bent, i, True)) for i, _ in first if (t.y[t.owner == i] > 0).any()]
     both = [*first, *((i, b) for i, b in others if b is not None)]
     x = np.array([b[1] for _, b in both])
     y = np.array([t.y[b[0]] for _, b in first] + [0] * (len(both) - len(first)))
     share = np.array([b[2] for _, b in first])
     building = np.array([t.building[i] for i, _ in both])
     certain = (y >= 0) & np.array([t.trains[i] for i, _ in both])
+    truth = np.array([what_it_is(t.rows[i], int(label)) for (i, _), label in zip(both, y, strict=True)])
     missed = np.where(np.arange(len(y)) < len(first), 1.0, settings.missed)
-    weight = missed * np.where(flat & (y == 0), settings.strict, 1.0)
+    missed *= [t.rows[i].get("weight", 1.0) for i, _ in both]
+    weight = prior_weights(truth, missed * certain) * np.where(flat & (y == 0), settings.strict, 1.0)
     believed = np.zeros(len(y))
     for train, test in folds(building, settings.folds, t.ordinary):
         train = train[certain[train]]
-        left_out = _winner(x[train], y[train] > 0, weight[train], flat, settings)
+        left_out = fitted(x[train], y[train] > 0, BELIEF_VECTOR, settings.winner_strength, weight[train])
         believed[test] = 1 / (1 + np.exp(-logits(left_out, x[test])))
-    winner = _winner(x[certain], y[certain] > 0, weight[certain], flat, settings)
+    winner = fitted(x[certain], y[certain] > 0, BELIEF_VECTOR, settings.winner_strength, weight[certain])
     same_kind = np.array([is_flat(t.rows[i]) == flat for i, _ in first], bool)
     scored = [t.rows[i] for (i, _), so in zip(first, same_kind, strict=True) if so]
-    fit_of = {"pairs": int(sum(t.trains[i] for i, _ in first)), "pose": pose, "winner": winner}
+    wrong = certain & (y == 0)
+    kinds = fitted_kinds(x[wrong], truth[wrong], weight[wrong], settings.kinds_strength)
+    fit_of = {"pairs": int(sum(t.trains[i] for i, _ in first)), "pose": pose, "bent": bent, "winner": winner, "kinds": kinds}
     return fit_of, (scored, np.minimum(believed[: len(first)], share)[same_kind], y[: len(first)][same_kind])
-
-
-def _winner(x: Array, y: Array, weight: Array, flat: bool, settings: MergeBelief) -> dict[str, Any]:
-    """The model of the best hypothesis: all of it, or (`refit` "bending") the one that is there, with what bending adds and a new
-    scale of its log odds: four numbers, for which a few hundred pairs are enough."""
-    if settings.refit == "all":
-        return fitted(x, y, BELIEF_FEATURES, settings.winner_strength, weight)
-    whole = len(BELIEF_FEATURES) - len(BEND_VECTOR)
-    before = model()["flat" if flat else "solid"]["winner"]
-    before = {**before, **{k: before[k][:whole] for k in ("mean", "scale", "weight")}}
-    odds = logits(before, x[:, :whole])
-    added = fitted(np.column_stack([odds, x[:, whole:]]), y, ["odds", *BEND_VECTOR], BENDING_STRENGTH, weight)
-    slope = added["weight"][0] / added["scale"][0]
-    return {
-        "mean": [*before["mean"], *added["mean"][1:]],
-        "scale": [*before["scale"], *added["scale"][1:]],
-        "weight": [*(slope * np.array(before["weight"])).tolist(), *added["weight"][1:]],
-        "bias": float(slope * (before["bias"] - added["mean"][0]) + added["bias"]),
-    }
 
 
 def belief_scores(rows: Sequence[dict[str, Any]], believed: Array, true: Array, threshold: float) -> dict[str, float]:
@@ -238,8 +210,8 @@ def belief_scores(rows: Sequence[dict[str, Any]], believed: Array, true: Array, 
 
 
 def ordinary(rows: Sequence[dict[str, Any]], believed: Array, true: Array) -> tuple[list[dict[str, Any]], Array, Array]:
-    """What is scored, without look-alikes: they would change the shares of all others."""
-    chosen = np.array(["lookalike" not in row for row in rows], bool)
+    """What is scored, without look-alikes and the development floor: they would change the shares of all others."""
+    chosen = np.array(["lookalike" not in row and "weight" not in row for row in rows], bool)
     return [row for row, so in zip(rows, chosen, strict=True) if so], np.asarray(believed)[chosen], np.asarray(true)[chosen]
 
 
@@ -265,9 +237,9 @@ def judge(settings: MergeBelief, file: Path, say: Say) -> dict[str, Any]:
         if not of:
             continue
         t, models = tabled(of), weights[name]
-        scores = logits(models["pose"], t.x)
+        scores = np.where(t.looked, logits(models["bent"], np.nan_to_num(t.bent)), -np.inf)
         for i, row in enumerate(of):
-            if (first := best(t, scores, models["pose"], i)) is not None:
+            if (first := best(t, scores, models["bent"], i)) is not None:
                 odds = float(logits(models["winner"], first[1][None])[0])
                 scored_rows.append(row)
                 believed.append(min(1 / (1 + np.exp(-odds)), first[2]))

@@ -115,6 +115,49 @@ class PlanSegmentation(NetworkTask):
 
 
 @dataclass
+class PlaceAugment:
+    """What is done to squares while training, beside turning and mirroring.
+
+    Args:
+        upper: share of the squares of which nothing is seen above a body.
+        noise: standard deviation of the factor that each plane of a square is multiplied by.
+    """
+
+    upper: float = 0.15
+    noise: float = 0.1
+
+
+@dataclass
+class PlaceEvidence(NetworkTask):
+    """Args:
+    steps: of an epoch; warmup: steps in which the rate rises.
+    hypotheses, inspected: of a pair, as of `MergeBelief`: the places are those of its hypotheses.
+    lookalikes: do those of `alike` that somebody can tell apart train, too?
+    half: 1 or 2: train on one half of the buildings only (`belief_hypotheses.half_of`); 0: on all.
+    widths: channels of the convolutions; dropout: of what they give.
+    """
+
+    task: str = "place_evidence"
+    name: str = "place_evidence"
+    data: GridRecipe = field(default_factory=GridRecipe)
+    heldout: GridRecipe = field(default_factory=GridRecipe)
+    hypotheses: int = 25
+    inspected: int = 3
+    epochs: int = 12
+    steps: int = 300
+    warmup: int = 100
+    batch: int = 64
+    decay: float = 1e-2
+    half: int = 0
+    lookalikes: bool = True
+    alike: LookalikeRecipe = field(default_factory=LookalikeRecipe)
+    widths: list[int] = field(default_factory=lambda: [24, 32, 48])
+    dropout: float = 0.2
+    augment: PlaceAugment = field(default_factory=PlaceAugment)
+    watch: str = "auc"
+
+
+@dataclass
 class DoorClassification(NetworkTask):
     """Args:
     hidden: units of each network; networks: that are averaged.
@@ -139,12 +182,15 @@ class DoorClassification(NetworkTask):
 class MergeBelief(TaskSettings):
     """Args:
     hypotheses: of a pair; inspected: how many of them are looked at more closely.
-    pose_strength, winner_strength: of the two models; the smaller, the simpler.
+    pose_strength, winner_strength, kinds_strength: of the models; the smaller, the simpler.
     missed: weight of a pair whose right hypothesis is taken away.
     strict: weight of a wrong hypothesis where a slice or a drawing hides what tells storeys apart: rather refused than wrong.
     folds: of buildings, for the scores.
-    threshold: probability from which on a merge is believed.
-    refit: all, or bending (the model that is there, with what the bending of maps adds to it).
+    floor: weight of a pair of the development floor; 0: it is not fitted to.
+    risk: false merges in a thousand pairs, drawn by the stated priors, that the threshold allows.
+    refit: all, or closely (the models that rank rigid poses stay as they are).
+    halves: runs of `place_evidence` on one half of the buildings each (half=1, half=2); a pair is judged by the network
+        that did not see its building. Empty: by the one that ships.
     lookalikes: none, judged (left-out models are tried on them) or fitted (they train, too; `belief_lookalikes`).
     alike, alike_heldout: the look-alikes to fit to and to judge on.
     """
@@ -154,14 +200,17 @@ class MergeBelief(TaskSettings):
     data: GridRecipe = field(default_factory=GridRecipe)
     heldout: GridRecipe = field(default_factory=GridRecipe)
     hypotheses: int = 25
-    inspected: int = 2
+    inspected: int = 3
     pose_strength: float = 1.0
     winner_strength: float = 0.3
+    kinds_strength: float = 0.03
     missed: float = 0.2
     strict: float = 1.25
     folds: int = 8
-    threshold: float = 0.8
+    floor: float = 0.5
+    risk: float = 20.0
     refit: str = "all"
+    halves: list[str] = field(default_factory=list)
     lookalikes: str = "none"
     alike: LookalikeRecipe = field(default_factory=LookalikeRecipe)
     alike_heldout: LookalikeRecipe = field(default_factory=LookalikeRecipe)
@@ -209,15 +258,21 @@ def check_task(settings: TaskSettings) -> None:
     for key, least in at_least.items():
         if getattr(settings, key, least) < least:
             raise InputError(f"{key} must be {least} or more, not {getattr(settings, key)}")
-    for key in ("rate", "pose_strength", "winner_strength"):
+    for key in ("rate", "pose_strength", "winner_strength", "kinds_strength"):
         if not getattr(settings, key, 1.0) > 0:
             raise InputError(f"{key} must be above 0, not {getattr(settings, key)}")
-    if not 0 <= getattr(settings, "threshold", 0.5) <= 1:
-        raise InputError(f"threshold must be 0 to 1, not {settings.threshold}")  # type: ignore[attr-defined]
+    if not 0 < getattr(settings, "risk", 20.0) <= 1000:
+        raise InputError(f"risk must be above 0 and at most 1000, not {settings.risk}")  # type: ignore[attr-defined]
+    if not 0 <= getattr(settings, "floor", 0.5) <= 10:
+        raise InputError(f"floor must be 0 to 10, not {settings.floor}")  # type: ignore[attr-defined]
+    if getattr(settings, "half", 0) not in (0, 1, 2):
+        raise InputError(f"half must be 0, 1 or 2, not {settings.half}")  # type: ignore[attr-defined]
     if isinstance(settings, MergeBelief) and settings.lookalikes not in LOOKALIKES_TAKEN:
         raise InputError(f"lookalikes must be {', '.join(LOOKALIKES_TAKEN)}, not {settings.lookalikes!r}")
-    if isinstance(settings, MergeBelief) and settings.refit not in ("all", "bending"):
-        raise InputError(f"refit must be all or bending, not {settings.refit!r}")
+    if isinstance(settings, MergeBelief) and settings.refit not in ("all", "closely"):
+        raise InputError(f"refit must be all or closely, not {settings.refit!r}")
+    if len(getattr(settings, "halves", [])) not in (0, 2):
+        raise InputError(f"halves must name two runs, not {settings.halves}")  # type: ignore[attr-defined]
     if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
         raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
     if isinstance(settings, PlanSegmentation):

@@ -12,7 +12,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.fusion.bend.placement import placements
-from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row
+from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row, posterior_rows
 from topomerge.fusion.fuse import room_of_rooms
 from topomerge.fusion.registration import Registration
 from topomerge.fusion.result import MergeResult, merge_to_json
@@ -27,6 +27,7 @@ from topomerge.viz.bend_plan import bend_table
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.merge_lines import lines_view
 from topomerge.viz.merge_plan import Drawn, blend_view, laid_alike
+from topomerge.viz.places_view import places_section
 from topomerge.viz.report import page, plan_view, scene_view, scroller, section, warnings
 from topomerge.viz.scene import scene_data
 from topomerge.viz.sheet import lay_out
@@ -95,6 +96,8 @@ def merge_html(result: MergeResult) -> str:
         data = {"scene-data": _scene(result, sheet.turn), "mates": _mates(result)}
     if registration is not None:
         sections.append(_evidence(result, registration))
+        if registration.places is not None and len(registration.places):
+            sections.append(places_section(a, drawn[0], registration.places))
     sections.append(_made(result))
     names = " + ".join(Path(m.source).name or "map" for m in result.maps)
     return page(names, "Merge of two maps", sections, data)
@@ -260,7 +263,11 @@ def _evidence(result: MergeResult, registration: Registration) -> Markup:
     rows = evidence_rows(registration)
     if not rows:
         return section(title, element("p", result.reason), "why")
-    parts = [_texts(("evidence", "measured", "what it says"), rows, "Evidence for the best hypothesis")]
+    parts = []
+    if registration.posterior:
+        words = "What the best place may be, with the odds of the stated priors (docs/merging.md)"
+        parts.append(_texts(("it is", "probability"), posterior_rows(registration), words))
+    parts.append(_texts(("evidence", "measured", "what it says"), rows, "Evidence for the best hypothesis"))
     if len(registration.alternatives) > 1:
         best, middle = registration.alternatives[0], result.maps[1].grid.centroids().mean(axis=0)
         others = [hypothesis_row(k, other, best, middle) for k, other in enumerate(registration.alternatives[:HYPOTHESES])]

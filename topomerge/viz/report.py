@@ -28,7 +28,7 @@ from topomerge.viz.sheet import Sheet, lay_out
 from topomerge.viz.svg import plan_svgs
 from topomerge.viz.tables import doors_table, facts, rooms_table, seconds_table, storeys_table
 
-SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "merge.js", "page.js")
+SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "merge.js", "places.js", "page.js")
 
 
 def save_report(map: TopometricMap, path: str | Path) -> None:

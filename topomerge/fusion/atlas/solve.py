@@ -23,6 +23,7 @@ from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.bend.bend import NEITHER_BENDS, bend_together
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.inputs import check_cells, check_scale, check_units, checked_threshold, without_rooms
+from topomerge.fusion.posterior import check_known
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
@@ -40,6 +41,8 @@ class AtlasSettings:
     threshold: float | None = None
     embedder: str | Descriptor | None = None
     rigid: bool = False
+    known: str = "nothing"
+    risk: float | None = None
 
 
 def atlas(
@@ -49,6 +52,8 @@ def atlas(
     threshold: float | None = None,
     embedder: str | Descriptor | None = None,
     rigid: bool = False,
+    known: str = "nothing",
+    risk: float | None = None,
     registrations: RegistrationsByPair | None = None,
 ) -> AtlasResult:
     """Bring maps together, as many as belong together.
@@ -60,14 +65,17 @@ def atlas(
         embedder: "learned", "engineered", "shapedna", "feather", the folder of a trained one, or a callable map -> (R, D):
             matched rooms propose poses, too. None: the learned descriptors only say which pairs to try first.
         rigid: leave the maps as they are? Else all that belong together are bent together, each by as much as its sensor drifts.
+        known: "nothing", "building" or "storey": all maps are known to be of one.
+        risk: false links in a thousand pairs that are acceptable; the threshold follows.
         registrations: made before, by the keys of both maps; those made now are added.
 
     Raises:
-        InputError: fewer than two maps, one map twice, a map without cells, maps in different units, a wrong threshold or scale.
+        InputError: fewer than two maps, one map twice, a map without cells, maps in different units, a wrong threshold, risk or
+            scale, or another word for what is known.
     """
     if len(maps) < 2:
         raise InputError(f"an atlas needs two or more maps, not {len(maps)}; give another one")
-    return solve(maps, AtlasSettings(scale, threshold, embedder, rigid), registrations)
+    return solve(maps, AtlasSettings(scale, threshold, embedder, rigid, known, risk), registrations)
 
 
 def solve(
@@ -88,12 +96,13 @@ def solve(
     """
     began = time.perf_counter()
     check_scale(settings.scale)
-    threshold = _log_odds(checked_threshold(settings.threshold))
+    check_known(settings.known)
+    threshold = _log_odds(checked_threshold(settings.threshold, settings.risk))
     names, map_keys, warnings = _checked(maps, names, keys, settings.scale)
     order = sorted(range(len(maps)), key=lambda k: map_keys[k])
     ordered = Maps([maps[k] for k in order], settings.embedder)
     registrations = {} if registrations is None else registrations
-    explorer = _Explorer(ordered, [map_keys[k] for k in order], settings.scale, threshold, registrations)
+    explorer = _Explorer(ordered, [map_keys[k] for k in order], settings, threshold, registrations)
     assembly = explorer.explored()
     result = _result(assembly, explorer, names, order, settings.rigid)
     return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=(*warnings, *result.warnings))
@@ -138,11 +147,14 @@ class _Explorer:
         threshold: log odds from which a link is believed.
     """
 
-    def __init__(self, maps: Maps, keys: Sequence[str], scale: str, threshold: float, registrations: RegistrationsByPair) -> None:
-        self.maps, self.keys, self.scale, self.registrations = maps, keys, scale, registrations
+    def __init__(
+        self, maps: Maps, keys: Sequence[str], settings: AtlasSettings, threshold: float, registrations: RegistrationsByPair
+    ) -> None:
+        self.maps, self.keys, self.scale, self.known = maps, keys, settings.scale, settings.known
+        self.registrations, scaled = registrations, settings.scale == "free"
         self.tried: dict[tuple[int, int], tuple[PoseHypothesis, ...]] = {}
-        self.checks = Checks(maps, scale == "free")
-        self.assembler = Assembler(len(maps), self.tried, self.checks, threshold, scale == "free")
+        self.checks = Checks(maps, scaled)
+        self.assembler = Assembler(len(maps), self.tried, self.checks, threshold, scaled)
         self.promise = np.zeros((len(maps), len(maps)))
         for i in range(len(maps)):
             for j in range(i):
@@ -174,7 +186,7 @@ class _Explorer:
     def _registered(self, i: int, j: int) -> tuple[PoseHypothesis, ...]:
         pair = (self.keys[i], self.keys[j])
         if pair not in self.registrations:
-            self.registrations[pair] = hypotheses(self.maps, i, j, self.scale)
+            self.registrations[pair] = hypotheses(self.maps, i, j, self.scale, self.known)
         return self.registrations[pair]
 
 

@@ -1,0 +1,108 @@
+"""The verdict as a posterior over named alternatives: this place, or what else could look as it does, under stated priors.
+
+What the user knows (maps of one team, of one building, of one storey) takes alternatives away; what is left shares the odds. So
+knowing more never lowers the probability of a pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.types import Array
+
+WRONG = ("elsewhere", "storey", "wing", "building", "outside")
+POSTERIOR = ("here", *WRONG)
+# Of the pairs that somebody would try, how many are of each kind, and (elsewhere) how often maps that do share a place are laid
+# on another one: an assumption, not a measurement; the models are fitted to pairs weighed so.
+PRIORS = {"here": 0.5, "elsewhere": 0.1, "storey": 0.08, "wing": 0.1, "building": 0.16, "outside": 0.06}
+KNOWN = {
+    "nothing": POSTERIOR,
+    "building": ("here", "elsewhere", "storey", "wing", "outside"),
+    "storey": ("here", "elsewhere", "wing", "outside"),
+}
+WORDS = {
+    "here": "this place",
+    "elsewhere": "another place in these maps",
+    "storey": "the same plan on another storey",
+    "wing": "a twin: a wing, module or room that looks the same",
+    "building": "another building",
+    "outside": "a place that the other map did not see",
+}
+LEAST_WALLS, LEAST_FLOOR = 1.0, 6.0  # m2 of wall columns that meet and of free floor that both saw: below, nothing can be sure
+FEW = 0.5  # probability that so little evidence can carry at most
+
+
+def check_known(known: str) -> None:
+    """Raise InputError for another word than those of `KNOWN`."""
+    if known not in KNOWN:
+        raise InputError(f"known must be {', '.join(KNOWN)}, not {known!r}")
+
+
+def posterior(here: float, kinds: Mapping[str, Any], x: Array, known: str = "nothing") -> dict[str, float]:
+    """Probability of each of `POSTERIOR`; they sum to 1.
+
+    Args:
+        here: probability of this place where nothing is known.
+        kinds: model of what it is if it is not: ``mean``, ``scale`` (F,), ``weight`` (5, F), ``bias`` (5,).
+        x: (F,) what that model sees.
+        known: what the user knows, a key of `KNOWN`.
+    """
+    scores = np.array(kinds["weight"]) @ ((x - kinds["mean"]) / kinds["scale"]) + kinds["bias"]
+    chances = np.exp(scores - scores.max())
+    others = (1 - here) * chances / chances.sum()
+    each = {"here": here, **dict(zip(WRONG, others.tolist(), strict=True))}
+    possible = {name: p if name in KNOWN[known] else 0.0 for name, p in each.items()}
+    total = sum(possible.values())
+    return {name: p / total for name, p in possible.items()} if total > 0 else {**dict.fromkeys(POSTERIOR, 0.0), "elsewhere": 1.0}
+
+
+def limited(each: Mapping[str, float], most: float) -> dict[str, float]:
+    """A posterior in which this place has at most the probability `most`; the alternatives get the rest as they share theirs."""
+    if each["here"] <= most:
+        return dict(each)
+    rest = 1 - each["here"]
+    names = [n for n in WRONG if each[n] > 0] or ["elsewhere"]
+    share = {n: each[n] / rest if rest > 0 and each[n] > 0 else 1 / len(names) for n in names}
+    return {"here": most, **{n: (1 - most) * share.get(n, 0.0) for n in WRONG}}
+
+
+def evidence_limit(features: Mapping[str, float]) -> float:
+    """The most that a pose may be believed for how much both maps show at all."""
+    return FEW if features["walls"] < LEAST_WALLS or features["free"] < LEAST_FLOOR else 1.0
+
+
+def threshold_of(risk: float, curve: Sequence[Sequence[float]]) -> float:
+    """The probability from which on a merge is believed so that of a thousand pairs, drawn by `PRIORS`, at most `risk` are merged
+    falsely.
+
+    Args:
+        curve: (threshold, false merges in a thousand), rising thresholds: measured on pairs that were left out.
+
+    Raises:
+        InputError: not above 0, or less than any threshold can promise.
+    """
+    if not 0 < risk <= 1000:
+        raise InputError(f"risk must be above 0 and at most 1000 false merges in a thousand pairs, not {risk:g}")
+    least = next((threshold for threshold, false in curve if false <= risk), None)
+    if least is None:
+        raise InputError(
+            f"risk {risk:g}: the least that was shown to be possible is {min(f for _, f in curve):.2g} in a thousand"
+        )
+    return float(least)
+
+
+def in_words(each: Mapping[str, float], threshold: float) -> str:
+    """What is likely beside this place: a sentence for a refusal, or nothing where no alternative stands out."""
+    if each["here"] >= threshold:
+        return ""
+    name = max(WRONG, key=lambda n: each[n])
+    if each[name] < 0.15:
+        return ""
+    if name == "storey" and each["here"] + each["storey"] >= threshold:
+        both = each["here"] + each["storey"]
+        return f"the place is sure ({both:.2f}), the storey is not ({each['here']:.2f} this one)"
+    return f"it may as well be {WORDS[name]} ({each[name]:.2f})"

@@ -1,0 +1,208 @@
+"""Task `place_evidence`: the network that says how much two squares from above speak for one place (`fusion.evidence.network`).
+
+Squares of simulated maps under their right pose and under wrong ones that the search proposed: another place of the building, a
+twin wing, another storey, another building. Furniture is moved, doors are opened and maps drift between the two. Turned, mirrored
+and exchanged, with heights taken away now and then, as other sensors miss them. Some of the buildings are watched.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from topomerge.datasets.core.derived import read_derived
+from topomerge.datasets.pairs.lookalikes import build_lookalikes
+from topomerge.errors import InputError
+from topomerge.fusion.evidence.network import UPPER_PLANES, network_log_odds, planes, read_weights
+from topomerge.io import archive
+from topomerge.models.place_network import PlaceNetwork, exported_weights
+from topomerge.training.belief_hypotheses import fair, half_of, hypothesis_files, judged_files
+from topomerge.training.loop import Say, State, mixed, pace
+from topomerge.training.networks import NetworkJob, run_network
+from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
+from topomerge.types import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Squares of many pairs.
+
+    Args:
+        planes: (n, side, side, PLANES) float16, what the network sees of each.
+        right: (n,) bool, is it one place?
+        weight: (n,) those of one hypothesis weigh as much as their number's root; of each two kinds of sensors right and wrong
+            ones weigh alike: else whoever sees a tablet knows that most of its pairs are wrong.
+        building: (n,) number of the building of the first map.
+        buildings: their names.
+    """
+
+    planes: Array
+    right: Array
+    weight: Array
+    building: Array
+    buildings: Sequence[str]
+
+
+def gathered(paths: Sequence[Path], half: int = 0) -> Places:
+    """The squares of the hypotheses of pairs (`belief_hypotheses`) that are right or wrong; none of those that are neither, and
+    none of pairs that nobody can tell apart.
+
+    Raises:
+        InputError: there is none.
+    """
+    seen, right, weight, building, names, sensors = [], [], [], [], [], []
+    for path in paths:
+        data = read_derived(path)
+        row = json.loads(data["row"].tobytes())
+        if row.get("tellable") is False or ("lookalike" not in row and not fair(row)) or half == 2 - half_of(row["building"]):
+            continue
+        name = row["building"].split(" + ")[0]
+        names.append(name)
+        label = np.array([h["label"] for h in row["hyps"]])[data["owner"]] if len(data["owner"]) else np.zeros(0)
+        pick = np.flatnonzero(label >= 0)
+        if not len(pick):
+            continue
+        owner = data["owner"][pick]
+        seen.append(planes(data["parts"][pick], data["ceiling"][pick], data["looked"][pick]).astype(np.float16))
+        right.append(label[pick] == 1)
+        weight.append(np.bincount(owner)[owner] ** -0.5)
+        building.append(np.full(len(pick), names.index(name)))
+        sensors.append(np.full(len(pick), "+".join(sorted(row["sensors"]))))
+    if not right:
+        raise InputError("data.sets: no pair has a hypothesis that shows a place in both maps")
+    arrays = [np.concatenate(part) for part in (seen, right, weight, building)]
+    arrays[2] = balanced(arrays[2], arrays[1], np.concatenate(sensors))
+    return Places(*arrays, names)
+
+
+def balanced(weight: Array, right: Array, group: Array) -> Array:
+    """(n,) weights with which right and wrong ones of each group weigh alike; a group of one side only weighs nothing, and others
+    as much as the root of the weight of their smaller side."""
+    _, owner = np.unique(group, return_inverse=True)
+    total = np.zeros((owner.max() + 1, 2))
+    np.add.at(total, (owner, right.astype(int)), weight)
+    share = np.sqrt(total.min(axis=1))[:, None] / np.maximum(total, 1e-9)
+    out: Array = weight * share[owner, right.astype(int)]
+    return out
+
+
+def some(places: Places, pick: Array) -> Places:
+    """Those of an index."""
+    return Places(places.planes[pick], places.right[pick], places.weight[pick], places.building[pick], places.buildings)
+
+
+class PlaceJob(NetworkJob):
+    """Squares, right ones and wrong ones alike."""
+
+    def __init__(self, settings: PlaceEvidence, learned: Places, watched: Places, name: str) -> None:
+        origin = {"set": name, "places": len(learned.right), "right": int(learned.right.sum()), "watched": len(watched.right)}
+        super().__init__(settings, PlaceNetwork(settings.widths, settings.dropout), origin)
+        self.options, self.learned, self.watched = settings, learned, watched
+        self.chance = learned.weight / learned.weight.sum()
+
+    def batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
+        """Squares, from a generator of each step."""
+        self.network.train()
+        options, learned = self.options, self.learned
+        for step in range(state.step, options.steps):
+            rng = np.random.default_rng([options.seed, 1, state.epoch, step])
+            rows = rng.choice(len(self.chance), options.batch, p=self.chance)
+            x = augmented(learned.planes[rows].astype(np.float32), options.augment, rng)
+            right = torch.from_numpy(learned.right[rows].astype(np.float32))
+            yield torch.from_numpy(x).permute(0, 3, 1, 2), right
+
+    def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
+        """One step of the optimizer."""
+        options, (x, right) = self.options, batch
+        total, done = options.epochs * options.steps, state.epoch * options.steps + state.step
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.rate * max(pace(done / total, min(options.warmup / total, 0.5)), 0.01)
+        loss = functional.binary_cross_entropy_with_logits(self.network(x), right)
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        return {"loss": float(loss.detach())}
+
+    def size(self, batch: tuple[torch.Tensor, ...]) -> int:
+        """Squares."""
+        return len(batch[0])
+
+    def weights(self) -> dict[str, Array]:
+        """As the package reads them: half precision, normalisation in them."""
+        assert isinstance(self.network, PlaceNetwork)
+        self.network.eval()
+        return {name: values.astype(np.float16) for name, values in exported_weights(self.network).items()}
+
+    def scores(self) -> dict[str, float]:
+        """Of the buildings that are watched."""
+        weights = {name: values.astype(np.float32) for name, values in self.weights().items()}
+        return place_scores(network_log_odds(self.watched.planes, weights), self.watched.right, self.watched.weight)
+
+    def write_weights(self, path: Path) -> None:
+        """An archive of arrays."""
+        archive.write(self.weights(), path)
+
+
+def augmented(x: Array, augment: PlaceAugment, rng: np.random.Generator) -> Array:
+    """Planes (n, side, side, PLANES) turned by quarters and mirrored, and some without what is above a body."""
+    x = np.rot90(x, int(rng.integers(4)), axes=(1, 2))
+    x = np.array(x[:, ::-1] if rng.random() < 0.5 else x)
+    blind = rng.random(len(x)) < augment.upper
+    x[np.ix_(blind, np.arange(x.shape[1]), np.arange(x.shape[2]), UPPER_PLANES)] = 0
+    noise = rng.normal(1.0, augment.noise, (len(x), 1, 1, x.shape[3]))
+    return np.asarray(x * noise, np.float32)
+
+
+def place_scores(odds: Array, right: Array, weight: Array) -> dict[str, float]:
+    """Area under the ROC curve and log loss of both sides alike, of weighted places."""
+    w = weight.astype(float)
+    for side in (True, False):
+        w[right == side] /= max(2 * w[right == side].sum(), 1e-9)
+    order = np.argsort(odds, kind="stable")
+    below = np.cumsum(np.where(right, 0.0, w)[order])
+    auc = float((w[order] * right[order] * below).sum() / max((w * right).sum() * below[-1], 1e-9))
+    return {"auc": auc, "log_loss": float((w * np.logaddexp(0, np.where(right, -odds, odds))).sum())}
+
+
+def fit(settings: PlaceEvidence, say: Say) -> dict[str, float]:
+    """Train; the scores of the best epoch.
+
+    Raises:
+        InputError: too few buildings to train on some and watch others.
+    """
+    paths = hypothesis_files(settings.data, settings, say)
+    if settings.lookalikes:
+        alike, _ = build_lookalikes(settings.alike, settings, say)
+        paths += judged_files(settings.alike.name, [[path] for path in alike], settings, say)
+    return train(settings, gathered(paths, settings.half), say)
+
+
+def train(settings: PlaceEvidence, places: Places, say: Say) -> dict[str, float]:
+    """Train on places; the scores of the best epoch.
+
+    Raises:
+        InputError: too few buildings to train on some and watch others.
+    """
+    order = np.random.default_rng(0).permutation(len(places.buildings))  # else the sources, which come in turn
+    watches = order[places.building] % settings.hold_out == 0
+    if not watches.any() or watches.all():
+        raise InputError("data.sets: too few pairs: buildings to train on and others to watch are needed")
+    torch.manual_seed(mixed(settings.seed))
+    learned, watched = some(places, np.flatnonzero(~watches)), some(places, np.flatnonzero(watches))
+    job = PlaceJob(settings, learned, watched, settings.data.name)
+    say(f"{len(learned.right)} places, {sum(p.numel() for p in job.network.parameters())} weights")
+    return run_network(job, settings, settings.steps, say)
+
+
+def judge(settings: PlaceEvidence, file: Path, say: Say) -> dict[str, Any]:
+    """Scores of weights on places of buildings that trained nothing."""
+    places = gathered(hypothesis_files(settings.heldout, settings, say))
+    scores = place_scores(network_log_odds(places.planes, read_weights(file)), places.right, places.weight)
+    return {**scores, "places": len(places.right)}
