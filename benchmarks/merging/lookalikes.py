@@ -61,7 +61,8 @@ def lookalike_row(pair: GridPair) -> Row:
     pose = registration.transform
     at_alike = replace(pair, truth=alike, about={**pair.about, "kind": "overlap"})
     errors = {"err": pose and error(pose, pair), "alike_err": pose and error(pose, at_alike)}
-    said = {"probability": registration.probability, "believed": registration.accepted, "seconds": seconds}
+    said = {"probability": registration.probability, "believed": registration.accepted, "posterior": registration.posterior}
+    said |= {"seconds": seconds}
     return {**about, **errors, **said}
 
 

@@ -25,10 +25,10 @@ from topomerge.datasets.real.cached_grids import real_grid_pairs
 from topomerge.datasets.real.sources import DEVELOPMENT_FOLDERS
 
 from benchmarks.merging.cached_pairs import buildings_of, hard_of, pair_files, places_of
-from topomerge.fusion.registration import register
+from topomerge.fusion.registration import Registration, register
 from topomerge.metrics import on_storey
 from topomerge.training.belief_hypotheses import error, kind_of, right
-from topomerge.types import Array, Sim3, VoxelGrid
+from topomerge.types import Array, Sim3
 
 SCALELESS = ("halmstad",)  # no metres per pixel are known
 REAL_SPLITS = {"real": None, "development": tuple(DEVELOPMENT_FOLDERS)}  # split -> sources of `datasets.real`; None: all
@@ -37,11 +37,16 @@ Answer = tuple[Sim3 | None, bool, float]  # T_ab, believed?, how much
 
 
 def ours(pair: GridPair) -> Answer:
-    """`register` with cells only, as maps have them; the scale is free where that of the source is unknown."""
-    a, b = (VoxelGrid(g.cells, g.origin, g.edge, g.shape) for g in (pair.a, pair.b))
-    scaled = pair.about["source"] in SCALELESS or pair.about.get("scaled")
-    registration = register(a, b, free=pair.free, scale="free" if scaled else "fixed")
+    """The answer of `registered`."""
+    registration = registered(pair)
     return registration.transform, registration.accepted, registration.probability
+
+
+def registered(pair: GridPair) -> Registration:
+    """`register` with cells and the middles of their points, as maps have them; the scale is free where that of the source is
+    unknown."""
+    scaled = pair.about["source"] in SCALELESS or pair.about.get("scaled")
+    return register(pair.a, pair.b, free=pair.free, scale="free" if scaled else "fixed")
 
 
 def upright(matrix: Array, pair: GridPair) -> Sim3 | None:
@@ -73,11 +78,13 @@ def run(split: str, limit: int, target: Path) -> None:
         if pair.name in done:
             continue
         began = time.process_time()
-        pose, believed, probability = ours(pair)
+        best = registered(pair)
+        pose = best.transform
         seconds = time.process_time() - began
         about = {k: pair.about.get(k) for k in ("sensors", "kind", "overlap", "differs", "scaled")}
         row = {"name": pair.name, "method": "ours", "common": pair.common, **about, **where_from(pair, split)}
-        row |= {"hard": hard_of(pair), "seconds": seconds, "believed": believed, "probability": probability}
+        row |= {"hard": hard_of(pair), "seconds": seconds, "believed": best.accepted}
+        row |= {"probability": best.probability, "posterior": best.posterior}
         row |= {"answered": pose is not None, **outcome(pose, pair)}
         with target.open("a") as out:
             out.write(json.dumps(row) + "\n")

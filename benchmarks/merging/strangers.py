@@ -141,7 +141,13 @@ def _row(about: Row, run: Callable[[], Registration]) -> Row:
     began = time.process_time()
     registration = run()
     seconds = time.process_time() - began
-    return {**about, "probability": registration.probability, "believed": registration.accepted, "seconds": seconds}
+    return {
+        **about,
+        "probability": registration.probability,
+        "believed": registration.accepted,
+        "seconds": seconds,
+        "posterior": registration.posterior,
+    }
 
 
 def main(split: str = "train", pairs: str = "100") -> None:

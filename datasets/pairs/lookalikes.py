@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ LOOKALIKE_FORMAT = 1  # raise it when the same item gives other bytes: it is par
 LEAST_SHARED = 1.0  # m2 of the same place that both maps show, from which on a pair has a truth
 POINT_SPACING = 0.06  # m between points of a scan, at least: the grids' cells are 0.1 m
 DAY = Difficulty(moved=0.03, gone=0.02, doors_moved=0.3, people=0.1)  # what a day changes
+MONTHS = Difficulty(moved=0.15, gone=0.1, doors_moved=0.3, people=0.1)  # between two visits of one place
 FURNITURE_SHARES = {
     "shifted-row": (0.5, 0.2, 0.15, 0.15),
     "hotel-corridors": (0.4, 0.35, 0.1, 0.15),
@@ -58,6 +59,8 @@ class LookalikeRecipe:
         pairs: of each kind of `lookalike_places.LOOKALIKES`.
         sensors: weight of each; empty: `grid_pairs.WEIGHTS`.
         scaled: share of the pairs whose second map has an unknown scale.
+        again: of each kind, so many beside: the first one of the two places, visited a second time. They belong together; without
+            them whatever is learned takes the look of these buildings for a sign of look-alikes.
         seed: of the draw of the set.
     """
 
@@ -67,6 +70,7 @@ class LookalikeRecipe:
     sensors: dict[str, float] = field(default_factory=dict)
     scaled: float = 0.1
     seed: int = 0
+    again: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,7 @@ class LookalikeItem:
         seed: of the building, from the seeds of its split.
         furniture: one of `FURNISHED`.
         scaled: has b an unknown scale?
+        again: are both maps of one place?
     """
 
     kind: str
@@ -86,11 +91,13 @@ class LookalikeItem:
     furniture: str
     sensors: tuple[str, str]
     scaled: bool
+    again: bool = False
 
     @property
     def name(self) -> str:
         """A hash of the inputs and of the versions of what is made from them."""
-        inputs = ["lookalikes", LOOKALIKE_FORMAT, GRID_FORMAT, *vars(self).values()]
+        values = list(vars(self).values())
+        inputs = ["lookalikes", LOOKALIKE_FORMAT, GRID_FORMAT, *(values if self.again else values[:-1])]
         return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:24]
 
 
@@ -100,23 +107,26 @@ def lookalike_items(recipe: LookalikeRecipe) -> list[LookalikeItem]:
     Raises:
         InputError: an unknown kind, sensor or split, or numbers out of range.
     """
-    for kind, count in recipe.pairs.items():
+    for kind, count in (*recipe.pairs.items(), *recipe.again.items()):
         if kind not in LOOKALIKES or count < 0:
             raise InputError(f"data.pairs.{kind}: {count}: give a number of pairs of {', '.join(LOOKALIKES)}")
-    if not any(recipe.pairs.values()) or not 0 <= recipe.scaled <= 1:
+    if not any((*recipe.pairs.values(), *recipe.again.values())) or not 0 <= recipe.scaled <= 1:
         raise InputError("data.pairs: give pairs of a kind or more, and data.scaled from 0 to 1")
     first, last = splits.seeds(recipe.split)
     sensors = dict(recipe.sensors or WEIGHTS["sensors"])
     names = sorted(sensors)
     weights = np.array([sensors[get_sensor(name).name] for name in names])
     out = []
-    for number in range(max(recipe.pairs.values())):
-        for kind in (k for k in LOOKALIKES if number < recipe.pairs.get(k, 0)):
-            rng = np.random.default_rng([recipe.seed, LOOKALIKES.index(kind), number])
-            a, b = rng.choice(len(names), 2, p=weights / weights.sum()).tolist()
-            furniture = str(rng.choice(FURNISHED, p=FURNITURE_SHARES[kind]))
-            seed, scaled = int(rng.integers(first, last + 1)), bool(rng.random() < recipe.scaled)
-            out.append(LookalikeItem(kind, number, seed, furniture, (names[a], names[b]), scaled))
+    both = ((recipe.pairs, False), (recipe.again, True))
+    rows = [
+        (n, k, again) for of, again in both for n in range(max(of.values(), default=0)) for k in LOOKALIKES if n < of.get(k, 0)
+    ]
+    for number, kind, again in rows:
+        rng = np.random.default_rng([recipe.seed, LOOKALIKES.index(kind), number])
+        a, b = rng.choice(len(names), 2, p=weights / weights.sum()).tolist()
+        furniture = str(rng.choice(FURNISHED, p=FURNITURE_SHARES[kind]))
+        seed, scaled = int(rng.integers(first, last + 1)), bool(rng.random() < recipe.scaled)
+        out.append(LookalikeItem(kind, number, seed, furniture, (names[a], names[b]), scaled, again))
     return out
 
 
@@ -139,9 +149,12 @@ def make_lookalike(item: LookalikeItem, given: None, folder: str) -> Row:
 def lookalike_arrays(item: LookalikeItem) -> dict[str, Array]:
     """The arrays of a pair: places, two days, two scans, and who could tell."""
     places = draw_places(item.kind, item.furniture, item.seed)
+    if item.again:
+        first, rooms = places.buildings[0], places.visited[0]
+        places = replace(places, buildings=(first, first), visited=(rooms, rooms), poses=(), same=True)
     rng = np.random.default_rng([item.seed, item.number, LOOKALIKES.index(item.kind)])
     frames = draw_frames(2, item.scaled, rng)
-    days = [session(building, DAY, rng) for building in places.buildings]
+    days = [session(building, MONTHS if item.again else DAY, rng) for building in places.buildings]
     clouds = [
         scan(day, name, rooms, rng, max(get_sensor(name).spacing, POINT_SPACING), frame=frame)
         for day, name, rooms, frame in zip(days, item.sensors, places.visited, frames, strict=True)

@@ -30,6 +30,7 @@ COLUMN_EDGE = 0.1  # m
 BODY_BANDS = np.concatenate([[BODY_HEIGHTS[0]], WALL_HEIGHTS])  # m, limits of the bands in which a map may have looked
 SLICE_ABOVE_FLOOR = 0.3  # m, guess of a slice's height above the floor
 SLICE_DRAWN = 1.375  # m above the floor, height at which slices are drawn
+SLAB = 0.1  # m between a ceiling and the floor above it, at least: that floor is no ceiling
 FLOOR_RADIUS = 1.5  # m, over which the floor may rise and fall
 STRAIGHT_RUN = 1.2  # m; what a slice shows in no straight run of this length is furniture
 BESIDE_RUN = 0.35  # m from such a run, and on one side of it at least, hardly anything stands
@@ -63,7 +64,8 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
     empty = None if free is None or not len(free) else _crossed(free, corner, cell)
     layers, storeys_seen = slices(grid), []
     storeys = [(z - SLICE_ABOVE_FLOOR, np.nan, z - SLICE_DRAWN) for z in layers] if layers else levels(grid)
-    for floor, ceiling, base in storeys:
+    above = [base for _, _, base in storeys[1:]] + [np.inf]
+    for (floor, ceiling, base), next_floor in zip(storeys, above, strict=True):
         z, crossing = points[:, 2], empty
         if layers:  # all that is near the layer is drawn at one height
             level = base + SLICE_DRAWN
@@ -75,7 +77,7 @@ def plans(map: TopometricMap | VoxelGrid, free: VoxelGrid | None = None, cell: f
         lattice = (heights, -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
         occupied = column_bits(ix, iy, z, *lattice)
         crossed = column_bits(*crossing, *lattice) if crossing else np.zeros(shape, np.uint32)
-        high = _ceiling(ix, iy, z, base, ceiling, shape)
+        high = _ceiling(ix, iy, np.where(z < next_floor - SLAB, z, np.nan), base, ceiling, shape)
         rasters = (occupied, crossed, heights, high - heights)
         storeys_seen.append(_plan(rasters, corner, cell, (floor, ceiling), bool(layers)))
     return storeys_seen

@@ -20,7 +20,7 @@ def floor_rows(settings: MergeBelief, say: Any) -> list[Row]:
     networks = place_networks(settings)
     paths = build_floor(settings.data.folder, settings.cache, say)
     rows = [row_of(path, networks) for path in judged_files("development_floor", [[p] for p in paths], settings, say)]
-    return [{**row, "weight": settings.floor} for row in rows if row["hyps"]]
+    return [{**row, "weight": settings.floor, "real": True} for row in rows if row["hyps"]]
 
 
 def captures_left_out(rows: Sequence[Row]) -> Iterator[tuple[list[Row], list[Row]]]:

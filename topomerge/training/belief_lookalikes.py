@@ -28,7 +28,8 @@ def lookalike_rows(recipe: LookalikeRecipe, settings: MergeBelief, say: Any) -> 
     paths, _ = build_lookalikes(recipe, settings, say)
     networks = place_networks(settings)
     rows = [row_of(file, networks) for file in judged_files(recipe.name, [[path] for path in paths], settings, say)]
-    return [{**row, "judged_only": settings.lookalikes == "judged" or not teaches(row)} for row in rows]
+    judged = [settings.lookalikes == "judged" or not teaches(row) for row in rows]
+    return [{**row, "judged_only": only, "weight": settings.alike_weight} for row, only in zip(rows, judged, strict=True)]
 
 
 def teaches(row: Row) -> bool:

@@ -69,13 +69,14 @@ def prior_weights(truth: Array, weight: Array) -> Array:
     return scaled
 
 
-def risk_curve(believed: Array, true: Array, truth: Array) -> list[list[float]]:
+def risk_curve(believed: Array, true: Array, truth: Array, weight: Array) -> list[list[float]]:
     """(threshold, false merges in a thousand pairs) for rising thresholds: of pairs drawn by `PRIORS`, by what left-out pairs
     show; kinds of which there are none count nothing.
 
     Args:
         believed, true: (n,) probability of the best hypothesis of each pair, and is it right (1), wrong (0) or neither?
         truth: (n,) what it is, of `POSTERIOR`.
+        weight: (n,) of each pair among those of its kind.
     """
     curve: list[list[float]] = []
     for threshold in THRESHOLDS:
@@ -83,7 +84,7 @@ def risk_curve(believed: Array, true: Array, truth: Array) -> list[list[float]]:
         for kind in WRONG:
             mine = (truth == kind) & (true == 0)
             if mine.any():
-                false += 1000 * PRIORS[kind] * float((believed[mine] >= threshold).mean())
+                false += 1000 * PRIORS[kind] * float(np.average(believed[mine] >= threshold, weights=weight[mine]))
         curve.append([threshold, min(false, curve[-1][1]) if curve else false])
     return curve
 

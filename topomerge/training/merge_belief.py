@@ -78,10 +78,11 @@ def fit_belief(settings: MergeBelief, say: Say) -> Fitted:
 
 def left_out_risk(rows: Sequence[dict[str, Any]], believed: Array, true: Array) -> list[list[float]]:
     """`risk_curve` of pairs that were left out, but for what nobody can tell apart, what trains nothing, and the floor."""
-    no = [row.get("tellable") is False or row.get("judged_only") or "weight" in row for row in rows]
+    no = [row.get("tellable") is False or row.get("judged_only") or row.get("real") for row in rows]
     chosen = ~np.array(no, bool)
     truth = np.array([what_it_is(row, int(t)) for row, t in zip(rows, true, strict=True)])
-    return risk_curve(believed[chosen], true[chosen], truth[chosen])
+    weight = np.array([row.get("weight", 1.0) for row in rows])
+    return risk_curve(believed[chosen], true[chosen], truth[chosen], weight[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +212,7 @@ def belief_scores(rows: Sequence[dict[str, Any]], believed: Array, true: Array, 
 
 def ordinary(rows: Sequence[dict[str, Any]], believed: Array, true: Array) -> tuple[list[dict[str, Any]], Array, Array]:
     """What is scored, without look-alikes and the development floor: they would change the shares of all others."""
-    chosen = np.array(["lookalike" not in row and "weight" not in row for row in rows], bool)
+    chosen = np.array(["lookalike" not in row and not row.get("real") for row in rows], bool)
     return [row for row, so in zip(rows, chosen, strict=True) if so], np.asarray(believed)[chosen], np.asarray(true)[chosen]
 
 

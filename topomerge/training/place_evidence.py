@@ -37,8 +37,9 @@ class Places:
     Args:
         planes: (n, side, side, PLANES) float16, what the network sees of each.
         right: (n,) bool, is it one place?
-        weight: (n,) those of one hypothesis weigh as much as their number's root; of each two kinds of sensors right and wrong
-            ones weigh alike: else whoever sees a tablet knows that most of its pairs are wrong.
+        weight: (n,) those of one hypothesis weigh as much as their number's root; of each two kinds of sensors, in
+            ordinary pairs and in look-alikes, right and wrong ones weigh alike: else whoever sees a tablet knows that most of its
+            pairs are wrong.
         building: (n,) number of the building of the first map.
         buildings: their names.
     """
@@ -74,7 +75,7 @@ def gathered(paths: Sequence[Path], half: int = 0) -> Places:
         right.append(label[pick] == 1)
         weight.append(np.bincount(owner)[owner] ** -0.5)
         building.append(np.full(len(pick), names.index(name)))
-        sensors.append(np.full(len(pick), "+".join(sorted(row["sensors"]))))
+        sensors.append(np.full(len(pick), "+".join([*sorted(row["sensors"]), *(["alike"] if "lookalike" in row else [])])))
     if not right:
         raise InputError("data.sets: no pair has a hypothesis that shows a place in both maps")
     arrays = [np.concatenate(part) for part in (seen, right, weight, building)]

@@ -192,7 +192,7 @@ class MergeBelief(TaskSettings):
     halves: runs of `place_evidence` on one half of the buildings each (half=1, half=2); a pair is judged by the network
         that did not see its building. Empty: by the one that ships.
     lookalikes: none, judged (left-out models are tried on them) or fitted (they train, too; `belief_lookalikes`).
-    alike, alike_heldout: the look-alikes to fit to and to judge on.
+    alike, alike_heldout: the look-alikes to fit to and to judge on; alike_weight: of one of them.
     """
 
     task: str = "merge_belief"
@@ -208,10 +208,11 @@ class MergeBelief(TaskSettings):
     strict: float = 1.25
     folds: int = 8
     floor: float = 0.5
-    risk: float = 20.0
+    risk: float = 30.0
     refit: str = "all"
     halves: list[str] = field(default_factory=list)
     lookalikes: str = "none"
+    alike_weight: float = 0.25
     alike: LookalikeRecipe = field(default_factory=LookalikeRecipe)
     alike_heldout: LookalikeRecipe = field(default_factory=LookalikeRecipe)
     watch: str = "right_believed"

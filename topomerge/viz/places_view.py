@@ -31,9 +31,7 @@ def places_section(a: TopometricMap, drawn: Drawn, places: Places) -> Markup:
     rooms = rooms_of(a, places)
     told = room_log_odds(places, rooms, len(a.rooms))
     sheet, plans = drawn
-    words = (
-        "Green rooms look the same in both maps, red ones rather like another room; grey ones were not compared, or say nothing."
-    )
+    words = "Green rooms look the same in both maps, red ones rather like another room; grey ones say nothing."
     view = plan_view(a, sheet, plans, room_shades(told))
     order = np.argsort(-np.abs(places.log_odds), kind="stable")[:MOST_SHOWN]
     by_room = sorted({int(rooms[k]) for k in order}, key=lambda i: told[i] if i >= 0 and np.isfinite(told[i]) else 0.0)

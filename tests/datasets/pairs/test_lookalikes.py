@@ -205,3 +205,21 @@ def test_parts_of_a_row_have_their_true_pose_and_a_false_one_whole_rooms_away() 
     assert np.allclose(alike[:3, :3], true[:3, :3], atol=1e-5)
     off = np.linalg.norm(alike[:3, 3] - true[:3, 3])
     assert min(abs(off - abs(p.translation[0])) for p in places.poses) < 1e-4
+
+
+def test_a_place_visited_again_is_a_right_merge_and_changes_no_other_item() -> None:
+    """Its walls lie on themselves under the true pose; who learns from look-alikes sees buildings of this style that are one."""
+    recipe = LookalikeRecipe(pairs={"same-room": 2}, again={"same-room": 1})
+    first, second, again = lookalike_items(recipe)
+    assert [first, second] == lookalike_items(LookalikeRecipe(pairs={"same-room": 2}))
+    assert (
+        again.again and again.name not in (first.name, replace(again, again=False).name) and replace(again, again=False) == first
+    )
+    pair = unpacked("x", lookalike_arrays(replace(again, sensors=("tls", "tls"), scaled=False)))
+    assert pair.about["kind"] == "overlap" and pair.about["tellable"] and pair.truth is not None and pair.common > 10
+    a, b = (
+        np.unique(np.floor(p[:, :2] / 0.3).astype(int), axis=0)
+        for p in (pair.a.centroids(), pair.truth.apply(pair.b.centroids()))
+    )
+    both = {tuple(row) for row in a.tolist()} & {tuple(row) for row in b.tolist()}
+    assert len(both) > 0.8 * min(len(a), len(b))

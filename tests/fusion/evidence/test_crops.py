@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.fusion.plans_of import MOVE, grid_of, office, part
+from tests.fusion.plans_of import MOVE, doubled, grid_of, office, part
 from topomerge.fusion.evidence.crops import LEAST_SEEN, PARTS, PIXEL, SIDE, crops
 from topomerge.fusion.storey_plan import plans
 from topomerge.matching.plan_fields import PlanFields
@@ -66,3 +66,13 @@ def test_heights_of_a_map_of_another_scale_grow_with_it(points):
     seen = crops(storeys(points), small, Sim3(0.0, (0.0, 0.0, 0.0), 1 / 0.85))
     both = (seen.ceiling > 0).all(axis=1)
     assert len(seen) > 8 and np.abs(np.diff(seen.ceiling.astype(int), axis=1)[:, 0][both]).mean() < 6
+
+
+def test_the_floor_above_is_no_other_ceiling(points):
+    """Below another storey the highest thing of a room is that one's floor: all of it higher, and no contradiction."""
+    both = storeys(doubled(office()))
+    for level, z in enumerate((0.0, 2.9)):
+        seen = crops(both[level : level + 1], storeys(points), Sim3(0.0, (0.0, 0.0, z)))
+        told = (seen.ceiling > 0).all(axis=1)
+        assert len(seen) > 8 and told.mean() > 0.3
+        assert np.abs(np.diff(seen.ceiling.astype(int), axis=1)[:, 0][told]).mean() < 3

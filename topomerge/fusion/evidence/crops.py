@@ -22,6 +22,7 @@ TILE = 48  # pixels of a tile
 LEAST_SEEN = 2.0  # m2 of a tile that both maps saw; less says nothing
 CEILINGS = (1.5, 0.02)  # m: the lowest ceiling that is told, and the step in which it is
 PARTS = ("wall", "free", "clutter", "low", "middle", "high", "hanging", "ceiling")  # bits of the first byte of a pixel
+ROOFED = 1 << PARTS.index("free") | 1 << PARTS.index("ceiling")  # bits of free floor under a ceiling
 HEIGHTS = ((0.25, 0.75), (0.75, 1.5), (1.5, 2.0))  # m above the floor: low, middle, high
 CROP_ARRAYS = ("parts", "ceiling", "looked", "middle", "area")
 LOOKED = 5  # numbers that say what a map looked at: a slice?, the three heights, ceilings
@@ -33,7 +34,8 @@ class Crops:
 
     Args:
         parts: (k, 2, SIDE, SIDE) uint8, bits named `PARTS`; of the first map and of the second one.
-        ceiling: (k, 2, SIDE, SIDE) uint8, height of the ceiling above the floor in steps (`CEILINGS`), 0 where none was seen.
+        ceiling: (k, 2, SIDE, SIDE) uint8, height of the ceiling above the floor in steps (`CEILINGS`), 0 where none was seen;
+            those of the second map raised to those of the first one (`levelled`).
         looked: (k, 2, LOOKED) float32 of 0 and 1: what the maps looked at.
         middle: (k, 3) m, of the squares, in the first map's frame, on its floor.
         area: (k,) m2 of the tile that both maps saw.
@@ -78,6 +80,7 @@ def _of_storeys(v: PlanFields, w: PlanFields, pose: Sim3) -> Crops:
     middle, area = _tiles(seen)
     if not len(area):
         return Crops.none()
+    drawn = (drawn[0], (drawn[1][0], levelled(drawn[1], drawn[0])))
     parts, ceiling = (np.stack([_cut(d[k], middle) for d in drawn], axis=1) for k in (0, 1))
     at = np.column_stack([(low + (middle + 0.5) * PIXEL) @ axes, np.full(len(middle), v.plan.floor_guess)])
     looked = np.stack([_looked(v.plan), _looked(w.plan)]).astype(np.float32)
@@ -107,6 +110,16 @@ def _drawn(fields: PlanFields, places: Array, scale: float) -> tuple[Array, Arra
     packed = sum(layer.astype(np.uint8) << k for k, layer in enumerate(layers))
     steps = np.clip(np.nan_to_num((scale * p.ceiling - CEILINGS[0]) / CEILINGS[1], nan=-1.0) + 1, 0, 255).astype(np.uint8)
     return np.where(inside, packed[i, j], 0).astype(np.uint8), np.where(inside, steps[i, j], 0).astype(np.uint8)
+
+
+def levelled(layers: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
+    """Bytes of the ceilings of a map, raised by the median of what the other one's are above them on floor that is free in both:
+    in the storey below another one, what a map takes for the ceiling may be the floor above."""
+    both = (layers[0] & other[0] & ROOFED) == ROOFED
+    if not both.any():
+        return layers[1]
+    lift = int(np.median(other[1][both].astype(int) - layers[1][both]))
+    return np.where(layers[1] > 0, np.clip(layers[1].astype(int) + lift, 1, 255), 0).astype(np.uint8)
 
 
 def _tiles(seen: Array) -> tuple[Array, Array]:
