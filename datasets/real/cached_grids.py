@@ -24,7 +24,12 @@ def real_grid_pairs(folder: str | Path, sources: Sequence[str] | None = None) ->
         if isinstance(pair, Pair):
             a, b = grid_of(pair.a), grid_of(pair.b)
             free = tuple(free_of(c, g) if c.poses is not None else c.free for c, g in ((pair.a, a), (pair.b, b)))
-            about = {"sensors": list(pair.sensors), "kind": pair.kind, "building": pair.building, "source": pair.source}
+            about: dict[str, object] = {
+                "sensors": list(pair.sensors),
+                "kind": pair.kind,
+                "building": pair.building,
+                "source": pair.source,
+            }
             about["overlap"] = pair.overlap
             common = common_area(pair, a, b, (free[0], free[1]))
             yield GridPair(name, a, b, (free[0], free[1]), pair.truth, common, about)

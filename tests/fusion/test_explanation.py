@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row, why
+from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row, posterior_rows, why
 from topomerge.fusion.registration import Registration
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
@@ -20,18 +20,30 @@ FEATURES = {
 
 def registration(probability: float, **features: float) -> Registration:
     best, other = PoseHypothesis(Sim3(), 2.0, features=FEATURES), PoseHypothesis(Sim3(), 1.0, features=FEATURES)
-    return Registration(Sim3(), probability, False, {**FEATURES, **features}, (best, other))
+    rest = (1 - probability) / 10
+    each = {"here": probability, "elsewhere": 6 * rest, **dict.fromkeys(("storey", "wing", "building", "outside"), rest)}
+    return Registration(Sim3(), probability, False, {**FEATURES, **features}, (best, other), posterior=each)
 
 
 def test_the_sentence_says_verdict_evidence_and_rival():
-    believed, refused = why(registration(0.91), 0.9), why(registration(0.89), 0.9)
+    believed, refused = why(registration(0.91), 0.9), why(registration(0.6), 0.9)
     evidence = "20 m2 of walls agree, 151 m2 of free floor seen by both; 6.2 % of the walls stand on free floor of the other map"
     assert believed == f"merged: probability 0.91 reaches 0.90; {evidence}"
-    assert refused == f"not merged: probability 0.89 is below 0.90; {evidence}; another place explains the maps as well"
-    assert "another place" not in why(registration(0.5, margin=2.0), 0.9)
+    assert (
+        refused == f"not merged: probability 0.60 is below 0.90; {evidence}; it may as well be another place in these maps (0.24)"
+    )
+    assert "another place" not in why(registration(0.89), 0.9)  # nothing stands out
+    little = why(registration(0.5, walls=0.4), 0.9)
+    assert little.endswith("both maps show too little of one place for any verdict")
     assert why(registration(0.9), 0.9, force=True) == f"merged: probability 0.90 reaches 0.90; {evidence}"
     assert why(registration(0.5), 0.9, force=True).endswith("joined all the same, as was asked for (--force)")
     assert why(Registration(None, 0.0, False, reason="no walls"), 0.9) == "not merged: no walls"
+
+
+def test_the_alternatives_in_words_most_probable_first():
+    rows = posterior_rows(registration(0.6))
+    assert rows[0] == ("this place", "0.60") and rows[1] == ("another place in these maps", "0.24") and len(rows) == 6
+    assert posterior_rows(Registration(None, 0.0, False)) == []
 
 
 def test_nothing_is_certain():

@@ -54,6 +54,28 @@ def refused(halves, stranger):
     return tm.merge([halves[0], stranger])
 
 
+def test_what_it_may_be_and_what_each_place_says_stand_in_the_listing(merged, refused):
+    for result in (merged, refused):
+        listing = merge_to_json(result)
+        assert sum(listing["alternatives"].values()) == pytest.approx(1.0, abs=1e-4)
+        assert listing["alternatives"]["here"] == pytest.approx(result.probability, abs=1e-5)
+        assert listing["places"] and all(set(p) == {"at", "m2", "log_odds"} for p in listing["places"])
+    at = np.array([p["at"] for p in merge_to_json(merged)["places"]])
+    assert (at[:, :2] > (-1, -1)).all() and (at[:, :2] < (25, 15)).all()  # in the frame of the first map
+
+
+def test_what_is_known_of_the_maps_raises_what_is_believed_and_a_risk_sets_the_threshold(halves, stranger, refused):
+    known = [tm.merge([halves[0], stranger], known=k).probability for k in ("building", "storey")]
+    assert refused.probability <= known[0] <= known[1]
+    assert " below 0.9" in tm.merge([halves[0], stranger], risk=5).reason
+    with pytest.raises(InputError, match="known must be nothing, building, storey"):
+        tm.merge(halves, known="house")
+    with pytest.raises(InputError, match="give one of them"):
+        tm.merge(halves, risk=5, threshold=0.9)
+    with pytest.raises(InputError, match=r"risk 1e-05: the least"):
+        tm.merge(halves, risk=1e-5)
+
+
 def test_two_halves_are_merged(merged, halves):
     assert merged.merged and merged.probability > 0.9 and "merged" in merged.reason
     middle = tuple(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0])
@@ -146,7 +168,7 @@ def test_cells_of_maps_that_were_joined_before_are_theirs(merged, halves):
 def test_json_has_the_schema(merged, refused):
     listing = merge_to_json(merged)
     assert list(listing)[:5] == ["format", "status", "probability", "reason", "descriptor"]
-    assert list(listing)[5:] == ["maps", "transforms", "bend", "matches", "seconds", "points"]
+    assert list(listing)[5:] == ["maps", "transforms", "bend", "matches", "seconds", "points", "alternatives", "places"]
     assert listing["descriptor"] == "learned"
     assert listing["format"] == 1 and listing["status"] == "merged" and 0 <= listing["probability"] <= 1
     assert listing["maps"][0] == {"source": "a.ply", "rooms": len(merged.maps[0].rooms), "storeys": 1}

@@ -36,6 +36,7 @@ NETWORKS = {
     "door_classification": ["epochs=2", "batch=64", "hidden=4", "networks=2"],
     "place_evidence": ["epochs=2", "steps=2", "batch=8", "widths=[4,4,4]", "hold_out=2", "lookalikes=false"],
 }
+WITHOUT_MORE = {"merge_belief": ["lookalikes=none", "floor=0"]}  # data that takes minutes to make
 FITS = ("merge_belief", "match_odds", "feature_scale")
 
 
@@ -59,7 +60,14 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(importlib.import_module(f"topomerge.training.{task}"), name, make)
 
     def of(task: str, *more: str) -> list[str]:
-        return [f"task={task}", f"runs={tmp_path / 'runs'}", "tensorboard=false", *NETWORKS.get(task, []), *more]
+        return [
+            f"task={task}",
+            f"runs={tmp_path / 'runs'}",
+            "tensorboard=false",
+            *NETWORKS.get(task, []),
+            *WITHOUT_MORE.get(task, []),
+            *more,
+        ]
 
     return of
 
@@ -187,7 +195,7 @@ SIMULATED = {
     "plan_segmentation": [*NETWORKS["plan_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "door_classification": ["data=plan_scans", "data.scans=4", "data.seed=0", "epochs=2", "hold_out=2", "heldout.scans=1"],
     "place_evidence": [*NETWORKS["place_evidence"], *SMALL_GRIDS],
-    "merge_belief": [*SMALL_GRIDS, "folds=2", "lookalikes=none"],
+    "merge_belief": [*SMALL_GRIDS, *WITHOUT_MORE["merge_belief"], "folds=2"],
     "match_odds": [*SMALL_PAIRS, "folds=2"],
     "feature_scale": SMALL_PAIRS,
 }  # fmt: skip

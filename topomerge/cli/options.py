@@ -84,7 +84,7 @@ BELIEF_OPTIONS = (
     option(
         "--risk", type=above_zero, metavar="N", help="false merges in a thousand pairs that you accept; the threshold follows"
     ),
-    option("--threshold", type=share, metavar="P", help="probability from which a merge is believed (default 0.8)"),
+    option("--threshold", type=share, metavar="P", help="probability from which a merge is believed (default 0.65)"),
 )
 SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of fusion/bend/drift.json
 CONTEXT_STEPS = option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)")

@@ -26,7 +26,7 @@ def why(registration: Registration, threshold: float, force: bool = False) -> st
     if not believed:
         if evidence_limit(f) < 1:
             words.append("both maps show too little of one place for any verdict")
-        elif beside := in_words(registration.posterior, threshold):
+        elif registration.posterior and (beside := in_words(registration.posterior, threshold)):
             words.append(beside)
     if force and not believed:
         words.append("joined all the same, as was asked for (--force)")

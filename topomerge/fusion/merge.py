@@ -58,7 +58,7 @@ def merge(
             the thesis does (two maps of one scale; with `embedder="shapedna"` its whole way).
         rigid: do not bend the maps.
         known: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
-        risk: false merges in a thousand pairs, at the stated priors (docs/merging.md), that are acceptable: the threshold
+        risk: false merges in a thousand pairs, at the stated priors (docs/method.md), that are acceptable: the threshold
         follows.
 
     Raises:

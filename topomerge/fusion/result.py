@@ -112,8 +112,6 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
         "status": result.status,
         "probability": min(max(float(result.probability), 0.0), 1.0),
         "reason": result.reason,
-        "alternatives": {name: round(p, 6) for name, p in registration.posterior.items()} if registration else {},
-        "places": places_to_json(registration.places) if registration and registration.places else [],
         "descriptor": result.descriptor,
         "maps": [{"source": m.source, "rooms": len(m.rooms), "storeys": len(m.storeys)} for m in result.maps],
         "transforms": transforms,
@@ -121,6 +119,8 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
         "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],
         "seconds": {step: round(float(result.seconds.get(step, 0.0)), 4) for step in MERGE_STEPS},
         "points": {str(k): name for k, name in sorted(result.points.items())},
+        "alternatives": {name: round(p, 6) for name, p in registration.posterior.items()} if registration else {},
+        "places": places_to_json(registration.places) if registration and registration.places else [],
     }
     plain_listing: dict[str, Any] = plain(listing)
     return plain_listing

@@ -3,7 +3,7 @@ stated priors of what a pair may be (`fusion.posterior`)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ def logits(model: dict[str, Any], x: Array) -> Array:
     return out
 
 
-def what_it_is(row: Mapping[str, Any], label: int) -> str:
+def what_it_is(row: dict[str, Any], label: int) -> str:
     """Which of `POSTERIOR` is the truth of a pair whose best hypothesis is right (label 1) or not."""
     if label == 1:
         return "here"

@@ -78,9 +78,9 @@ def gathered(paths: Sequence[Path], half: int = 0) -> Places:
         sensors.append(np.full(len(pick), "+".join([*sorted(row["sensors"]), *(["alike"] if "lookalike" in row else [])])))
     if not right:
         raise InputError("data.sets: no pair has a hypothesis that shows a place in both maps")
-    arrays = [np.concatenate(part) for part in (seen, right, weight, building)]
-    arrays[2] = balanced(arrays[2], arrays[1], np.concatenate(sensors))
-    return Places(*arrays, names)
+    is_right = np.concatenate(right)
+    weights = balanced(np.concatenate(weight), is_right, np.concatenate(sensors))
+    return Places(np.concatenate(seen), is_right, weights, np.concatenate(building), names)
 
 
 def balanced(weight: Array, right: Array, group: Array) -> Array:
@@ -102,8 +102,9 @@ def some(places: Places, pick: Array) -> Places:
 class PlaceJob(NetworkJob):
     """Squares, right ones and wrong ones alike."""
 
-    def __init__(self, settings: PlaceEvidence, learned: Places, watched: Places, name: str) -> None:
-        origin = {"set": name, "places": len(learned.right), "right": int(learned.right.sum()), "watched": len(watched.right)}
+    def __init__(self, settings: PlaceEvidence, learned: Places, watched: Places) -> None:
+        origin = {"set": settings.data.name, "split": settings.data.split, "places": len(learned.right)}
+        origin |= {"right": int(learned.right.sum()), "watched": len(watched.right)}
         super().__init__(settings, PlaceNetwork(settings.widths, settings.dropout), origin)
         self.options, self.learned, self.watched = settings, learned, watched
         self.chance = learned.weight / learned.weight.sum()
@@ -156,7 +157,8 @@ def augmented(x: Array, augment: PlaceAugment, rng: np.random.Generator) -> Arra
     x = np.rot90(x, int(rng.integers(4)), axes=(1, 2))
     x = np.array(x[:, ::-1] if rng.random() < 0.5 else x)
     blind = rng.random(len(x)) < augment.upper
-    x[np.ix_(blind, np.arange(x.shape[1]), np.arange(x.shape[2]), UPPER_PLANES)] = 0
+    for plane in UPPER_PLANES:
+        x[blind, :, :, plane] = 0
     noise = rng.normal(1.0, augment.noise, (len(x), 1, 1, x.shape[3]))
     return np.asarray(x * noise, np.float32)
 
@@ -197,7 +199,7 @@ def train(settings: PlaceEvidence, places: Places, say: Say) -> dict[str, float]
         raise InputError("data.sets: too few pairs: buildings to train on and others to watch are needed")
     torch.manual_seed(mixed(settings.seed))
     learned, watched = some(places, np.flatnonzero(~watches)), some(places, np.flatnonzero(watches))
-    job = PlaceJob(settings, learned, watched, settings.data.name)
+    job = PlaceJob(settings, learned, watched)
     say(f"{len(learned.right)} places, {sum(p.numel() for p in job.network.parameters())} weights")
     return run_network(job, settings, settings.steps, say)
 

@@ -265,7 +265,7 @@ def _evidence(result: MergeResult, registration: Registration) -> Markup:
         return section(title, element("p", result.reason), "why")
     parts = []
     if registration.posterior:
-        words = "What the best place may be, with the odds of the stated priors (docs/merging.md)"
+        words = "What the best place may be, with the odds of the stated priors (docs/method.md)"
         parts.append(_texts(("it is", "probability"), posterior_rows(registration), words))
     parts.append(_texts(("evidence", "measured", "what it says"), rows, "Evidence for the best hypothesis"))
     if len(registration.alternatives) > 1:

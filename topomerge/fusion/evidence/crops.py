@@ -76,7 +76,7 @@ def _of_storeys(v: PlanFields, w: PlanFields, pose: Sim3) -> Crops:
     flat = places.reshape(-1, 2)
     there = back.apply(np.column_stack([flat, np.zeros(len(flat))]))[:, :2].reshape(places.shape)
     drawn = (_drawn(v, places, 1.0), _drawn(w, there, pose.scale))
-    seen = (drawn[0][0] & 7 > 0) & (drawn[1][0] & 7 > 0)
+    seen = np.asarray((drawn[0][0] & 7 > 0) & (drawn[1][0] & 7 > 0))
     middle, area = _tiles(seen)
     if not len(area):
         return Crops.none()
@@ -104,10 +104,10 @@ def _drawn(fields: PlanFields, places: Array, scale: float) -> tuple[Array, Arra
     """Bytes of parts and of ceilings of a plan at places (..., 2), m in its frame; its heights grow by `scale`."""
     p = fields.plan
     cells = np.floor((places - p.origin) / p.edge).astype(np.int64)
-    inside = ((cells >= 0) & (cells < p.wall.shape)).all(axis=-1)
+    inside = np.asarray(((cells >= 0) & (cells < p.wall.shape)).all(axis=-1))
     i, j = np.moveaxis(np.where(inside[..., None], cells, 0), -1, 0)
     layers = [p.wall, p.free, p.clutter, *(p.occupied(*h) for h in HEIGHTS), fields.hung == 2, np.isfinite(p.ceiling)]
-    packed = sum(layer.astype(np.uint8) << k for k, layer in enumerate(layers))
+    packed = np.bitwise_or.reduce([layer.astype(np.uint8) << k for k, layer in enumerate(layers)])
     steps = np.clip(np.nan_to_num((scale * p.ceiling - CEILINGS[0]) / CEILINGS[1], nan=-1.0) + 1, 0, 255).astype(np.uint8)
     return np.where(inside, packed[i, j], 0).astype(np.uint8), np.where(inside, steps[i, j], 0).astype(np.uint8)
 

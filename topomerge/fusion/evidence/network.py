@@ -77,10 +77,11 @@ def _widened(bits: Array) -> Array:
     for axis in (-1, -2):
         pad = [(0, 0)] * bits.ndim
         pad[axis] = (SLACK, SLACK)
-        rim, out = np.moveaxis(np.pad(bits, pad), axis, 0), 0
-        for step in range(2 * SLACK + 1):
-            out = out | rim[step : step + side]
-        bits = np.moveaxis(np.asarray(out), 0, axis)
+        rim = np.moveaxis(np.pad(bits, pad), axis, 0)
+        out = rim[:side].copy()
+        for step in range(1, 2 * SLACK + 1):
+            out |= rim[step : step + side]
+        bits = np.moveaxis(out, 0, axis)
     return bits
 
 
