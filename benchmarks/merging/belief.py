@@ -40,7 +40,7 @@ PARTS = {  # what is left out
 }
 SHARES = (0.25, 0.5, 1.0)  # of the simulated pairs
 THRESHOLDS = (0.5, 0.6, 0.65, 0.7, 0.8, 0.9)
-LARGE = ("80-200", ">200")
+LARGE_AREAS = ("80-200", ">200")
 
 
 def without(rows: Sequence[Row], names: Sequence[str]) -> list[Row]:
@@ -98,7 +98,7 @@ def figures(judged: Sequence[Judged], floor: Sequence[Judged], threshold: float)
         mine = [j for j in chosen if label == 1 or j[2] == label]
         return f"{sum(p >= threshold and y == label for _, p, y in mine)} of {len(mine)}"
 
-    large = [j for j in ordinary if kind_of(j[0]) in LARGE]
+    large = [j for j in ordinary if kind_of(j[0]) in LARGE_AREAS]
     some = [j for j in ordinary if kind_of(j[0]) == "40-80"]
     kinds = [[j for j in ordinary if j[2] == 0 and what_it_is(j[0], 0) == k] for k in ("building", "storey", "wing")]
     alike = [j for j in judged if "lookalike" in j[0] and j[0]["tellable"] and j[2] == 0]
@@ -109,7 +109,7 @@ def figures(judged: Sequence[Judged], floor: Sequence[Judged], threshold: float)
     return [*cells, *(believed(k, 0) for k in (*kinds, alike)), f"{false:.0f}"]
 
 
-HEADS = (
+BELIEF_HEADS = (
     "≥ 80 m²", "40–80 m²", "development floor", "… wrong", "other buildings", "other storeys", "twin wings", "look-alikes",
     "false in 1,000",
 )  # fmt: skip
@@ -146,7 +146,7 @@ def without_floor(rows: Sequence[Row], floor: Sequence[Row], settings: MergeBeli
 
 def head(first: str) -> list[str]:
     """Two lines."""
-    return [f"| {first} | {' | '.join(HEADS)} |", "|---" * (len(HEADS) + 1) + "|"]
+    return [f"| {first} | {' | '.join(BELIEF_HEADS)} |", "|---" * (len(BELIEF_HEADS) + 1) + "|"]
 
 
 def line(first: str, cells: Sequence[str]) -> str:

@@ -18,6 +18,7 @@ from tests.scenes import Scene
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.solve import solve
 from topomerge.fusion.fuse import room_of_rooms
+from topomerge.fusion.inputs import checked_threshold, risk_threshold
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, merge_to_json
 from topomerge.matching.odds import match_probability
 from topomerge.types import Sim3, TopometricMap
@@ -64,16 +65,14 @@ def test_what_it_may_be_and_what_each_place_says_stand_in_the_listing(merged, re
     assert (at[:, :2] > (-1, -1)).all() and (at[:, :2] < (25, 15)).all()  # in the frame of the first map
 
 
-def test_what_is_known_of_the_maps_raises_what_is_believed_and_a_risk_sets_the_threshold(halves, stranger, refused):
-    known = [tm.merge([halves[0], stranger], known=k).probability for k in ("building", "storey")]
-    assert refused.probability <= known[0] <= known[1]
-    assert " below 0.9" in tm.merge([halves[0], stranger], risk=5).reason
-    with pytest.raises(InputError, match="known must be nothing, building, storey"):
-        tm.merge(halves, known="house")
-    with pytest.raises(InputError, match="give one of them"):
-        tm.merge(halves, risk=5, threshold=0.9)
+def test_what_the_maps_are_of_raises_what_is_believed_and_a_risk_sets_the_threshold(halves, stranger, refused):
+    each = [tm.merge([halves[0], stranger], same=same).probability for same in ("building", "storey")]
+    assert refused.probability <= each[0] <= each[1]
+    assert 0.5 <= risk_threshold(1000) < checked_threshold(None) < risk_threshold(5) < 1
+    with pytest.raises(InputError, match="same must be nothing, building, storey"):
+        tm.merge(halves, same="house")
     with pytest.raises(InputError, match=r"risk 1e-05: the least"):
-        tm.merge(halves, risk=1e-5)
+        risk_threshold(1e-5)
 
 
 def test_two_halves_are_merged(merged, halves):

@@ -8,12 +8,12 @@ import pytest
 from topomerge.errors import InputError
 from topomerge.fusion.posterior import (
     FEW,
-    KNOWN,
     POSTERIOR,
     PRIORS,
+    SAME,
     WORDS,
     WRONG,
-    check_known,
+    check_same,
     evidence_limit,
     in_words,
     limited,
@@ -35,7 +35,7 @@ def test_the_alternatives_sum_to_one_and_follow_their_model():
 
 @pytest.mark.parametrize("here", [0.0, 0.01, 0.5, 0.999, 1.0])
 def test_knowing_more_never_lowers_a_place(here):
-    nothing, building, storey = (posterior(here, KINDS, X, known) for known in ("nothing", "building", "storey"))
+    nothing, building, storey = (posterior(here, KINDS, X, same) for same in ("nothing", "building", "storey"))
     assert nothing["here"] <= building["here"] <= storey["here"]
     assert building["building"] == storey["building"] == storey["storey"] == 0 < building["storey"] + (here == 1)
     for each in (nothing, building, storey):
@@ -75,7 +75,7 @@ def test_a_sure_place_on_an_unsure_storey_is_told_so():
 
 
 def test_other_words_for_what_is_known_are_refused():
-    for known in KNOWN:
-        check_known(known)
-    with pytest.raises(InputError, match="known must be nothing, building, storey, not 'floor'"):
-        check_known("floor")
+    for same in SAME:
+        check_same(same)
+    with pytest.raises(InputError, match="same must be nothing, building, storey, not 'floor'"):
+        check_same("floor")

@@ -24,7 +24,7 @@ def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert weights.main([f"runs={tmp_path}"]) == 130
     assert made == ["plan_segmentation", "door_classification", "feature_scale", "match_odds"]
     assert "in all about" in capsys.readouterr().err
-    assert weights.main([f"runs={tmp_path}"]) == 0 and made[4:] == ["match_odds", "merge_belief", "embedding"]
+    assert weights.main([f"runs={tmp_path}"]) == 0 and made[4:] == ["match_odds", "place_evidence", "merge_belief", "embedding"]
     said = capsys.readouterr().err
     assert "plan_segmentation: is there" in said and set(TASKS) <= set(json.loads((tmp_path / "seconds.json").read_text()))
     assert weights.main([f"runs={tmp_path}", "only=nothing"]) == 1 and "only=nothing" in capsys.readouterr().err

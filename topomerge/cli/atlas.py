@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, say, warn
-from topomerge.cli.options import BELIEF_OPTIONS, CLOUD_OPTIONS, given, json_option, map_from, quiet
+from topomerge.cli.options import BELIEF_OPTIONS, CLOUD_OPTIONS, belief_choices, given, json_option, map_from, quiet
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,9 +33,10 @@ def _add(args: argparse.Namespace) -> int:
     if not args.items:
         raise InputError(f"{args.folder}: name the maps or clouds to add: topomerge atlas add {args.folder} MAP ...")
     check_folder(args.folder)
+    choices = belief_choices(args)
     check_inputs(args.items)
     maps = [(Path(path).stem, replace(map_from(path, args), source=path)) for path in args.items]
-    return _report(add(args.folder, maps, atlas_html, **given(args, "scale", "threshold", "embedder", "known", "risk")), args)
+    return _report(add(args.folder, maps, atlas_html, **given(args, "scale", "embedder"), **choices), args)
 
 
 def _remove(args: argparse.Namespace) -> int:

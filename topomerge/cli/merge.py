@@ -14,7 +14,7 @@ import topomerge
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, check_outputs, output_folder, say, warn
 from topomerge.cli.merge_points import point_files, points_written, with_points
-from topomerge.cli.options import BELIEF_OPTIONS, CLOUD_OPTIONS, DESCRIPTOR, given, map_from, output, quiet
+from topomerge.cli.options import BELIEF_OPTIONS, CLOUD_OPTIONS, DESCRIPTOR, belief_choices, given, map_from, output, quiet
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,13 +38,14 @@ def merge_command(args: argparse.Namespace) -> int:
 
 
 def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) -> int:
+    belief = belief_choices(args)
     maps, read_seconds, extract_seconds = [], 0.0, 0.0
     for path in args.inputs:
         topomap, read, extract = _timed_map(path, args)
         maps.append(topomap)
         read_seconds, extract_seconds = read_seconds + read, extract_seconds + extract
-    choices = given(args, "force", "threshold", "rigid", "known", "risk")
-    result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices)
+    choices = given(args, "force", "rigid")
+    result = topomerge.merge(maps, scale=args.scale_of_b, embedder=args.descriptor, poses=args.poses, **choices, **belief)
     result = replace(result, seconds={**result.seconds, "read": read_seconds, "extract": extract_seconds})
     warn(result.warnings)
     result = with_points(result, files)

@@ -48,6 +48,22 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: getattr(args, name) for name in names if hasattr(args, name)}
 
 
+def belief_choices(args: argparse.Namespace) -> dict[str, Any]:
+    """What `BELIEF_OPTIONS` say, as keywords of `merge` and `atlas`.
+
+    Raises:
+        InputError: a threshold and a risk, or a risk that no threshold can promise.
+    """
+    choices = given(args, "threshold", "same")
+    if hasattr(args, "risk"):
+        from topomerge.fusion.inputs import risk_threshold
+
+        if "threshold" in choices:
+            raise InputError("--threshold and --risk both say when to believe a merge; give one of them")
+        choices["threshold"] = risk_threshold(args.risk)
+    return choices
+
+
 def output(metavar: str, help: str) -> Argument:
     """Where to write what a command is for."""
     return option("-o", "--output", required=True, metavar=metavar, default=None, help=help)
@@ -78,13 +94,16 @@ DESCRIPTOR = option(
 BELIEF_OPTIONS = (
     option(
         "--known",
+        dest="same",
         choices=("nothing", "building", "storey"),
         help="what you know of the maps: all of one building, or of one storey (default nothing); the rest need not be ruled out",
     ),
     option(
         "--risk", type=above_zero, metavar="N", help="false merges in a thousand pairs that you accept; the threshold follows"
     ),
-    option("--threshold", type=share, metavar="P", help="probability from which a merge is believed (default 0.65)"),
+    option(
+        "--threshold", type=share, metavar="P", help="probability from which to believe (default 0.65, links of an atlas 0.8)"
+    ),
 )
 SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of fusion/bend/drift.json
 CONTEXT_STEPS = option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)")

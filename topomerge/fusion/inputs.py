@@ -13,6 +13,7 @@ from topomerge.types import TopometricMap
 
 MERGE_SCALES = ("fixed", "free")
 POSE_SOURCES = ("search", "rooms")
+LINK_BELIEVED = 0.8
 UNIT_SPAN = 300.0  # m, and
 UNIT_RATIO = 30.0  # times the other map: a map that spans this is in another unit
 UNIT_RATIO_MM = 300.0  # times the other map: in millimetres rather than centimetres
@@ -25,21 +26,36 @@ def check_scale(scale: str) -> None:
         raise InputError(f"scale must be {' or '.join(MERGE_SCALES)}, not {scale!r}")
 
 
-def checked_threshold(threshold: float | None, risk: float | None = None) -> float:
-    """The probability from which a merge is believed: as it is given, or for at most `risk` false merges in a thousand pairs, or
-    that of the calibration.
+def checked_threshold(threshold: float | None) -> float:
+    """The probability from which a merge is believed; that of the calibration if None.
 
     Raises:
-        InputError: not between 0 and 1, both given, or a risk that no threshold can promise.
+        InputError: not between 0 and 1.
     """
-    if risk is not None:
-        if threshold is not None:
-            raise InputError("threshold and risk both say when to believe a merge; give one of them")
-        return threshold_of(float(risk), model()["risk"])
     share = float(model()["threshold"]) if threshold is None else float(threshold)
     if not 0 <= share <= 1:
         raise InputError(f"threshold must be a probability between 0 and 1, not {threshold}")
     return share
+
+
+def link_threshold(threshold: float | None) -> float:
+    """The probability from which a link of an atlas is believed: at least `LINK_BELIEVED` where none is asked for, as a wrong
+    link drags all that hangs on it.
+
+    Raises:
+        InputError: not between 0 and 1.
+    """
+    return max(checked_threshold(None), LINK_BELIEVED) if threshold is None else checked_threshold(threshold)
+
+
+def risk_threshold(risk: float) -> float:
+    """The probability from which a merge is believed so that at most `risk` of a thousand pairs, drawn by the stated priors
+    (docs/method.md), are merged falsely, as left-out training pairs show it.
+
+    Raises:
+        InputError: a risk that no threshold can promise.
+    """
+    return threshold_of(float(risk), model()["risk"])
 
 
 def check_poses(poses: str, count: int, scale: str) -> None:

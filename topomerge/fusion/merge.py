@@ -21,7 +21,7 @@ from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import fuse, rooms_in_common
 from topomerge.fusion.inputs import check_pair, check_poses, check_scale, checked_threshold, pair_warnings
-from topomerge.fusion.posterior import check_known
+from topomerge.fusion.posterior import check_same
 from topomerge.fusion.prepared import registration_order
 from topomerge.fusion.registration import Registration, register
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
@@ -42,8 +42,7 @@ def merge(
     embedder: str | Descriptor = DEFAULT,
     poses: str = "search",
     rigid: bool = False,
-    known: str = "nothing",
-    risk: float | None = None,
+    same: str = "nothing",
 ) -> MergeResult:
     """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
 
@@ -51,19 +50,18 @@ def merge(
         maps: two topometric maps or more; `atlas` brings more than two together, as many as belong to the first one.
         scale: "fixed", or "free" where the scale of the second map is unknown.
         force: give the best transform and its joined map, too, where it is not believed; the status stays "abstained".
-        threshold: probability from which a merge is believed; that of the calibration if None.
+        threshold: probability from which a merge is believed; that of the calibration if None; `fusion.inputs.risk_threshold`
+            gives that of a stated risk.
         embedder: "learned" (default), "engineered", "shapedna", "feather", the folder of a trained one, or a callable
             map -> (R, D), for the matching of rooms.
         poses: "search": of walls and of matched rooms (default); "rooms": of each matched pair of rooms by its surfaces alone, as
             the thesis does (two maps of one scale; with `embedder="shapedna"` its whole way).
         rigid: do not bend the maps.
-        known: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
-        risk: false merges in a thousand pairs, at the stated priors (docs/method.md), that are acceptable: the threshold
-        follows.
+        same: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
 
     Raises:
         InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale,
-            the poses or what is known, a threshold and a risk, or poses of rooms without Open3D (`pip install
+            the poses or what the maps are of, or poses of rooms without Open3D (`pip install
     topomerge[open3d]`)."""
     check_poses(poses, len(maps), scale)
     if poses == "rooms":
@@ -71,8 +69,8 @@ def merge(
     if len(maps) < 2:
         raise InputError(f"merge takes two maps or more, {len(maps)} given; give another one")
     check_scale(scale)
-    check_known(known)
-    settings = _Settings(scale, force, checked_threshold(threshold, risk), embedder, poses, rigid, known)
+    check_same(same)
+    settings = _Settings(scale, force, threshold, embedder, poses, rigid, same)
     return _merge_two(maps[0], maps[1], settings) if len(maps) == 2 else _merge_several(maps, settings)
 
 
@@ -82,20 +80,20 @@ class _Settings:
 
     scale: str
     force: bool
-    threshold: float
+    threshold: float | None
     embedder: str | Descriptor
     poses: str
     rigid: bool
-    known: str
+    same: str
 
 
 def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> MergeResult:
     check_pair(a, b, settings.scale)
-    threshold = settings.threshold
+    threshold = checked_threshold(settings.threshold)
     clock = _Clock()
     hypotheses = _room_hypotheses(a, b, settings, clock)
     searched = settings.poses == "search"
-    choices: dict[str, Any] = {"rigid": settings.rigid, "known": settings.known}
+    choices: dict[str, Any] = {"rigid": settings.rigid, "same": settings.same}
     registration = register(a, b, scale=settings.scale, proposed=hypotheses, searched=searched, **choices)
     believed = registration.transform is not None and registration.probability >= threshold
     result = MergeResult(
@@ -127,7 +125,7 @@ def _merge_several(maps: Sequence[TopometricMap], settings: _Settings) -> MergeR
     began = time.perf_counter()
     registrations: RegistrationsByPair = {}
     descriptor = None if settings.embedder == DEFAULT else settings.embedder  # the default only says which pairs to try first
-    atlas_settings = AtlasSettings(settings.scale, settings.threshold, descriptor, settings.rigid, settings.known)
+    atlas_settings = AtlasSettings(settings.scale, settings.threshold, descriptor, settings.rigid, settings.same)
     atlas = solve(maps, atlas_settings, registrations)
     reason, status = atlas.words(), "merged" if _with_first(atlas)[1:] else "abstained"
     if status == "abstained" and atlas.status != "abstained":

@@ -19,7 +19,7 @@ POSTERIOR = ("here", *WRONG)
 # Of the pairs that somebody would try, how many are of each kind, and (elsewhere) how often maps that do share a place are laid
 # on another one: an assumption, not a measurement; the models are fitted to pairs weighed so.
 PRIORS = {"here": 0.5, "elsewhere": 0.1, "storey": 0.08, "wing": 0.1, "building": 0.16, "outside": 0.06}
-KNOWN = {
+SAME = {
     "nothing": POSTERIOR,
     "building": ("here", "elsewhere", "storey", "wing", "outside"),
     "storey": ("here", "elsewhere", "wing", "outside"),
@@ -32,30 +32,30 @@ WORDS = {
     "building": "another building",
     "outside": "a place that the other map did not see",
 }
-LEAST_WALLS, LEAST_FLOOR = 1.0, 6.0  # m2 of wall columns that meet and of free floor that both saw: below, nothing can be sure
+COMMON_WALLS, COMMON_FLOOR = 1.0, 6.0  # m2 of wall columns that meet and of free floor that both saw: below, nothing can be sure
 FEW = 0.5  # probability that so little evidence can carry at most
 
 
-def check_known(known: str) -> None:
-    """Raise InputError for another word than those of `KNOWN`."""
-    if known not in KNOWN:
-        raise InputError(f"known must be {', '.join(KNOWN)}, not {known!r}")
+def check_same(same: str) -> None:
+    """Raise InputError for another word than those of `SAME`."""
+    if same not in SAME:
+        raise InputError(f"same must be {', '.join(SAME)}, not {same!r}")
 
 
-def posterior(here: float, kinds: Mapping[str, Any], x: Array, known: str = "nothing") -> dict[str, float]:
+def posterior(here: float, kinds: Mapping[str, Any], x: Array, same: str = "nothing") -> dict[str, float]:
     """Probability of each of `POSTERIOR`; they sum to 1.
 
     Args:
         here: probability of this place where nothing is known.
         kinds: model of what it is if it is not: ``mean``, ``scale`` (F,), ``weight`` (5, F), ``bias`` (5,).
         x: (F,) what that model sees.
-        known: what the user knows, a key of `KNOWN`.
+        same: what the user knows the maps to be of, a key of `SAME`.
     """
     scores = np.array(kinds["weight"]) @ ((x - kinds["mean"]) / kinds["scale"]) + kinds["bias"]
     chances = np.exp(scores - scores.max())
     others = (1 - here) * chances / chances.sum()
     each = {"here": here, **dict(zip(WRONG, others.tolist(), strict=True))}
-    possible = {name: p if name in KNOWN[known] else 0.0 for name, p in each.items()}
+    possible = {name: p if name in SAME[same] else 0.0 for name, p in each.items()}
     total = sum(possible.values())
     return {name: p / total for name, p in possible.items()} if total > 0 else {**dict.fromkeys(POSTERIOR, 0.0), "elsewhere": 1.0}
 
@@ -72,7 +72,7 @@ def limited(each: Mapping[str, float], most: float) -> dict[str, float]:
 
 def evidence_limit(features: Mapping[str, float]) -> float:
     """The most that a pose may be believed for how much both maps show at all."""
-    return FEW if features["walls"] < LEAST_WALLS or features["free"] < LEAST_FLOOR else 1.0
+    return FEW if features["walls"] < COMMON_WALLS or features["free"] < COMMON_FLOOR else 1.0
 
 
 def threshold_of(risk: float, curve: Sequence[Sequence[float]]) -> float:

@@ -14,7 +14,7 @@ from topomerge.fusion.bend.bend import Bend
 from topomerge.fusion.candidates import Candidate, candidates
 from topomerge.fusion.evidence.places import Places
 from topomerge.fusion.judge import Judge
-from topomerge.fusion.posterior import check_known
+from topomerge.fusion.posterior import check_same
 from topomerge.fusion.prepared import Map, Prepared, prepare
 from topomerge.fusion.refine import refine_pose
 from topomerge.fusion.scale import search_scaled
@@ -66,10 +66,9 @@ def register(
     scale: str = "fixed",
     proposed: Sequence[Sim3] = (),
     free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
-    yaws: Sequence[float] = (),
     searched: bool = True,
     rigid: bool = False,
-    known: str = "nothing",
+    same: str = "nothing",
 ) -> Registration:
     """The pose of map b in map a's frame. `register(b, a)` gives its inverse.
 
@@ -78,28 +77,27 @@ def register(
         scale: "fixed", or "free" where b's unit may differ (looked for between 0.5 and 2).
         proposed: poses T_ab of matched rooms, tried beside those of the correlation.
         free: cells of a and of b known to be empty; topometric maps bring their own.
-        yaws: further turns of b to try, rad.
         searched: look for poses by correlation? Else the proposed ones are all there is.
         rigid: give the best rigid pose? Else both maps are bent, too. They are judged as bent all the same: drift is no
             contradiction.
-        known: "nothing", "building" or "storey": both maps are known to be of one (`posterior.KNOWN`).
+        same: "nothing", "building" or "storey": both maps are known to be of one (`posterior.SAME`).
 
     Raises:
         InputError: an empty map, or another word for the scale or for what is known.
     """
-    check_known(known)
+    check_same(same)
     if scale not in ("fixed", "free"):
         raise InputError(f"scale must be fixed or free, not {scale!r}")
     clock = _Clock()
     a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
-        poses, turns = [pose.inverse() for pose in proposed], [-y for y in yaws]
-        swapped = register(b, a, scale=scale, proposed=poses, yaws=turns, searched=searched, rigid=rigid, known=known)
+        poses = [pose.inverse() for pose in proposed]
+        swapped = register(b, a, scale=scale, proposed=poses, searched=searched, rigid=rigid, same=same)
         return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
     first, second = a.storeys, b.storeys
     if searched:
-        hypotheses = (search_scaled if scale == "free" else search)(first, second, proposed, yaws)
+        hypotheses = (search_scaled if scale == "free" else search)(first, second, proposed)
     else:
         hypotheses = refine(first, second, [PoseHypothesis(pose, from_rooms=True) for pose in proposed])
     clock("search")
@@ -109,21 +107,26 @@ def register(
     ranked = rank(hypotheses, Judge(first, second))
     clock("verify")
     looked = candidates(a, b, ranked, scale == "free")
-    best, bent = looked[0], looked[0].bend
     clock("bend")
-    pose, rmse = bent.transform, best.features["rmse"]
-    if not any(v.plan.sliced for v in (*first, *second)):  # a slice has no planes
-        aligned, misfit = fine(a, b, best.hypothesis.transform, scale == "free")
-        if rigid or bent.reason:
-            pose, rmse = aligned, misfit
-        else:  # bending is level: floors and ceilings say how high
-            height = aligned.translation[2] + (aligned.scale - pose.scale) * float(b.middle[2])  # there, where scales differ
-            pose = replace(pose, translation=(*pose.translation[:2], height))
-            bent = replace(bent, transform=pose)
+    bent, rmse = _refined(a, b, looked[0], scale == "free", rigid)
     clock("refine")
-    believed = _verdict(ranked, looked, verdict([c.features for c in looked], looked[0].closely(), known))
+    believed = _verdict(ranked, looked, verdict([c.features for c in looked], looked[0].closely(), same))
     features = {**believed.features, "rmse": rmse}
-    return replace(believed, transform=pose, features=features, seconds=clock.seconds, bend=None if rigid else bent)
+    return replace(believed, transform=bent.transform, features=features, seconds=clock.seconds, bend=None if rigid else bent)
+
+
+def _refined(a: Prepared, b: Prepared, best: Candidate, scaled: bool, rigid: bool) -> tuple[Bend, float]:
+    """The bending of the best candidate with its pose by surfaces (all of it where the maps stay rigid, else its height), and the
+    root mean square distance of the surfaces, m. A slice has no planes, and stays as it is."""
+    bent = best.bend
+    if any(v.plan.sliced for v in (*a.storeys, *b.storeys)):
+        return bent, best.features["rmse"]
+    aligned, misfit = fine(a, b, best.hypothesis.transform, scaled)
+    if rigid or bent.reason:
+        return replace(bent, transform=aligned), misfit
+    pose = bent.transform  # bending is level: floors and ceilings say how high
+    height = aligned.translation[2] + (aligned.scale - pose.scale) * float(b.middle[2])  # there, where scales differ
+    return replace(bent, transform=replace(pose, translation=(*pose.translation[:2], height))), best.features["rmse"]
 
 
 class _Clock:

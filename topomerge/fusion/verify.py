@@ -117,13 +117,13 @@ class Verdict:
     features: dict[str, float]
 
 
-def verdict(rivals: Sequence[Features], winner: Features, known: str = "nothing") -> Verdict:
+def verdict(rivals: Sequence[Features], winner: Features, same: str = "nothing") -> Verdict:
     """Is the first of ranked poses right? At most its share of the odds of all, and at most what so much evidence can carry.
 
     Args:
         rivals: features of each pose once the maps are bent, best first.
         winner: features of the first one, with those of `winner_features`.
-        known: what the user knows, a key of `posterior.KNOWN`.
+        same: what the user knows the maps to be of, a key of `posterior.SAME`.
     """
     models = _models(rivals[0])
     scores = np.array([bent_score(f) for f in rivals])
@@ -131,7 +131,7 @@ def verdict(rivals: Sequence[Features], winner: Features, known: str = "nothing"
     leads = lead(scores, vectors, np.array(models["bent"]["weight"]), np.array(models["bent"]["scale"]))
     seen = belief_vector(vectors[0], leads[:3], winner)
     here = min(1 / (1 + np.exp(-_logit(models["winner"], seen))), leads[3])
-    every = limited(posterior(float(here), models["kinds"], seen, known), evidence_limit(winner))
+    every = limited(posterior(float(here), models["kinds"], seen, same), evidence_limit(winner))
     shares = np.exp(scores - scores[0])
     return Verdict(every, (every["here"] * shares).tolist(), dict(winner))
 

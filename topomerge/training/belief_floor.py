@@ -9,7 +9,7 @@ from topomerge.datasets.real.cached_grids import build_floor
 from topomerge.training.belief_hypotheses import Row, judged_files, place_networks, row_of
 from topomerge.training.task_settings import MergeBelief
 
-GROUPS = 5  # of captures; those of two groups are left out at a time
+CAPTURE_GROUPS = 5  # of captures; those of two groups are left out at a time
 
 
 def floor_rows(settings: MergeBelief, say: Any) -> list[Row]:
@@ -26,10 +26,10 @@ def floor_rows(settings: MergeBelief, say: Any) -> list[Row]:
 def captures_left_out(rows: Sequence[Row]) -> Iterator[tuple[list[Row], list[Row]]]:
     """Rows of the floor to fit to and to judge, so that each row is judged once, by fits that saw neither of its captures."""
     names = sorted({name for row in rows for name in row["captures"].split("-")})
-    group = {name: k % GROUPS for k, name in enumerate(names)}
+    group = {name: k % CAPTURE_GROUPS for k, name in enumerate(names)}
     of = [{group[name] for name in row["captures"].split("-")} for row in rows]
-    for first in range(GROUPS):
-        for second in range(first, GROUPS):
+    for first in range(CAPTURE_GROUPS):
+        for second in range(first, CAPTURE_GROUPS):
             judged = [row for row, groups in zip(rows, of, strict=True) if groups == {first, second}]
             if judged:
                 yield [row for row, groups in zip(rows, of, strict=True) if not groups & {first, second}], judged

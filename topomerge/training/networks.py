@@ -12,7 +12,7 @@ import torch
 
 from topomerge.checkpoint import NETWORK_FILE, load_state, write_network
 from topomerge.training.log import Log
-from topomerge.training.loop import Job, Loop, Say, Schedule, State
+from topomerge.training.loop import Job, Loop, Say, Schedule, State, pace
 from topomerge.training.run_folder import export_files, write_card, write_settings
 from topomerge.training.task_settings import NetworkTask
 from topomerge.training.tasks import TASKS
@@ -36,6 +36,16 @@ class NetworkJob(ABC):
     def write_network(self, folder: Path) -> None:
         """The weights as torch has them."""
         write_network(self.network, folder)
+
+    def descend(self, loss: torch.Tensor, options: Any, state: State) -> dict[str, float]:
+        """One step of the optimizer at the rate of its place in the run: it rises over `options.warmup` steps, then falls."""
+        total, done = options.epochs * options.steps, state.epoch * options.steps + state.step
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.rate * max(pace(done / total, min(options.warmup / total, 0.5)), 0.01)
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        return {"loss": float(loss.detach())}
 
     @abstractmethod
     def write_weights(self, path: Path) -> None:

@@ -24,7 +24,7 @@ from topomerge.fusion.evidence.network import UPPER_PLANES, network_log_odds, pl
 from topomerge.io import archive
 from topomerge.models.place_network import PlaceNetwork, exported_weights
 from topomerge.training.belief_hypotheses import fair, half_of, hypothesis_files, judged_files
-from topomerge.training.loop import Say, State, mixed, pace
+from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import NetworkJob, run_network
 from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
 from topomerge.types import Array
@@ -123,14 +123,8 @@ class PlaceJob(NetworkJob):
     def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
         """One step of the optimizer."""
         options, (x, right) = self.options, batch
-        total, done = options.epochs * options.steps, state.epoch * options.steps + state.step
-        for group in self.optimizer.param_groups:
-            group["lr"] = options.rate * max(pace(done / total, min(options.warmup / total, 0.5)), 0.01)
         loss = functional.binary_cross_entropy_with_logits(self.network(x), right)
-        self.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        self.optimizer.step()
-        return {"loss": float(loss.detach())}
+        return self.descend(loss, options, state)
 
     def size(self, batch: tuple[torch.Tensor, ...]) -> int:
         """Squares."""

@@ -21,7 +21,7 @@ from topomerge.extraction.classified_storey import COLUMN_CLASSES
 from topomerge.extraction.plans.plan_network import column_probabilities, evidence, read_weights
 from topomerge.io import archive
 from topomerge.models.plan_unet import PlanUNet, exported_weights
-from topomerge.training.loop import Say, State, mixed, pace
+from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import NetworkJob, run_network
 from topomerge.training.task_settings import PlanAugment, PlanLoss, PlanSegmentation
 from topomerge.types import Array
@@ -77,15 +77,9 @@ class PlanJob(NetworkJob):
     def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
         """One step of the optimizer."""
         options, (x, truth, weight) = self.options, batch
-        total, done = options.epochs * options.steps, state.epoch * options.steps + state.step
-        for group in self.optimizer.param_groups:
-            group["lr"] = options.rate * max(pace(done / total, min(options.warmup / total, 0.5)), 0.01)
         each = functional.cross_entropy(self.network(x), truth, reduction="none")
         loss = (each * weight).sum() / weight.sum()
-        self.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        self.optimizer.step()
-        return {"loss": float(loss.detach())}
+        return self.descend(loss, options, state)
 
     def size(self, batch: tuple[torch.Tensor, ...]) -> int:
         """Crops."""

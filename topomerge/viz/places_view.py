@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from topomerge.fusion.evidence.crops import PARTS
-from topomerge.fusion.evidence.places import MOST_TOLD, Places
+from topomerge.fusion.evidence.places import MOST_ODDS, Places
 from topomerge.fusion.joined_doors import laid_floor
 from topomerge.fusion.resampling import Laying
 from topomerge.types import Array, Sim3, TopometricMap
@@ -29,13 +29,13 @@ UNKNOWN = (160, 160, 156)
 def places_section(a: TopometricMap, drawn: Drawn, places: Places) -> Markup:
     """The plan of map a with its rooms in the colours of what they say, and the places that say most."""
     rooms = rooms_of(a, places)
-    told = room_log_odds(places, rooms, len(a.rooms))
+    odds = room_log_odds(places, rooms, len(a.rooms))
     sheet, plans = drawn
     words = "Green rooms look the same in both maps, red ones rather like another room; grey ones say nothing."
-    view = plan_view(a, sheet, plans, room_shades(told))
+    view = plan_view(a, sheet, plans, room_shades(odds))
     order = np.argsort(-np.abs(places.log_odds), kind="stable")[:MOST_SHOWN]
-    by_room = sorted({int(rooms[k]) for k in order}, key=lambda i: told[i] if i >= 0 and np.isfinite(told[i]) else 0.0)
-    groups = [_room(i, [int(k) for k in order if rooms[k] == i], told, places) for i in by_room]
+    by_room = sorted({int(rooms[k]) for k in order}, key=lambda i: odds[i] if i >= 0 and np.isfinite(odds[i]) else 0.0)
+    groups = [_room(i, [int(k) for k in order if rooms[k] == i], odds, places) for i in by_room]
     note = (
         "Click a room to see what was compared there, map a on the left, map b on the right; rooms that speak against come first."
     )
@@ -61,22 +61,22 @@ def rooms_of(map: TopometricMap, places: Places) -> Array:
 
 def room_log_odds(places: Places, rooms: Array, count: int) -> Array:
     """(count,) mean log odds of the places in each room; nan where nothing was compared."""
-    told = np.clip(places.log_odds, -MOST_TOLD, MOST_TOLD)
+    odds = np.clip(places.log_odds, -MOST_ODDS, MOST_ODDS)
     inside = rooms >= 0
-    total, weight = (np.bincount(rooms[inside], w[inside], count) for w in (told * places.crops.area, places.crops.area))
+    total, weight = (np.bincount(rooms[inside], w[inside], count) for w in (odds * places.crops.area, places.crops.area))
     return np.where(weight > 0, total / np.maximum(weight, 1e-9), np.nan)
 
 
-def room_shades(told: Array) -> Array:
+def room_shades(odds: Array) -> Array:
     """(R, 3) uint8 from red (against) over grey to green (for)."""
-    share = np.nan_to_num(np.clip(told / MOST_TOLD, -1, 1))[:, None]
+    share = np.nan_to_num(np.clip(odds / MOST_ODDS, -1, 1))[:, None]
     return np.where(share >= 0, SILENT + share * (FOR - SILENT), SILENT - share * (AGAINST - SILENT)).round().astype(np.uint8)
 
 
-def _room(room: int, shown: Sequence[int], told: Array, places: Places) -> Markup:
+def _room(room: int, shown: Sequence[int], odds: Array, places: Places) -> Markup:
     """A room's places, folded."""
     name = room_link("a", room) if room >= 0 else Markup("beside rooms")
-    words = f" {said(float(told[room]))}, {len(shown)} shown" if room >= 0 else f" {len(shown)} shown"
+    words = f" {said(float(odds[room]))}, {len(shown)} shown" if room >= 0 else f" {len(shown)} shown"
     cards = [_card(k, places) for k in shown]
     return element("details", element("summary", name, words), element("div", *cards, class_="cards"), data_room_of_a=room)
 
@@ -94,7 +94,7 @@ def said(odds: float) -> str:
     """Log odds in words."""
     if abs(odds) < 0.5:
         return "says little"
-    times = np.exp(min(abs(odds), MOST_TOLD))
+    times = np.exp(min(abs(odds), MOST_ODDS))
     return f"{times:.0f} times as likely {'the same place' if odds > 0 else 'another place'}"
 
 

@@ -80,14 +80,14 @@ def test_what_walls_on_free_floor_say(monkeypatch):
 
 
 def test_hypotheses_share_the_probability_that_one_of_them_is_right(monkeypatch):
-    def registered(*_: object, scale: str, proposed: list[Sim3]) -> Registration:
-        assert scale == "free" and proposed == []
+    def registered(*_: object, scale: str, proposed: list[Sim3], same: str) -> Registration:
+        assert scale == "free" and proposed == [] and same == "storey"
         places = [PoseHypothesis(Sim3(0.0, (float(k), 0.0, 0.0)), score) for k, score in enumerate((5.0, 4.0, 4.9, 1.0))]
         return Registration(Sim3(0.0, (0.01, 0.0, 0.0)), 0.6, False, {"walls": 9.0}, tuple(places))
 
     monkeypatch.setattr(pairs, "register", registered)
     maps: Any = SimpleNamespace(matched=False, prepared=lambda k: k)
-    ranked = hypotheses(maps, 0, 1, "free")
+    ranked = hypotheses(maps, 0, 1, "free", "storey")
     assert [h.transform.translation[0] for h in ranked] == [0.01, 1.0, 2.0, 3.0] and ranked[0].features == {"walls": 9.0}
     assert [h.probability for h in ranked] == pytest.approx([0.6, 0.6 * np.exp(-1), 0.4, 0.6 * np.exp(-4)])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.fusion.plans_of import MOVE, doubled, grid_of, office, part
-from topomerge.fusion.evidence.crops import LEAST_SEEN, PARTS, PIXEL, SIDE, crops
+from topomerge.fusion.evidence.crops import CROP_PIXEL, LEAST_SEEN, PARTS, SIDE, crops
 from topomerge.fusion.storey_plan import plans
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.types import Sim3
@@ -47,7 +47,7 @@ def test_walls_furniture_and_ceilings_are_where_they_are(points):
     k = int(np.hypot(*(seen.middle[:, :2] - (6.7, 2.4)).T).argmin())  # a table of 1.4 x 0.8 m
     low = seen.parts[k, 0] >> PARTS.index("low") & 1
     table = (seen.parts[k, 0] & CLUTTER > 0) & (low > 0)
-    assert table.sum() * PIXEL**2 == pytest.approx(1.4 * 0.8, rel=0.4)
+    assert table.sum() * CROP_PIXEL**2 == pytest.approx(1.4 * 0.8, rel=0.4)
     told = seen.ceiling[seen.ceiling > 0]
     assert 1.5 + (np.median(told) - 1) * 0.02 == pytest.approx(2.6, abs=0.15)
     assert seen.looked[:, :, 0].max() == 0 and seen.looked[:, :, 1:].min() == 1

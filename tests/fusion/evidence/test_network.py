@@ -9,7 +9,7 @@ import pytest
 from topomerge.errors import InputError
 from topomerge.fusion.evidence.crops import LOOKED, PARTS, SIDE, Crops
 from topomerge.fusion.evidence.network import PLANES, place_log_odds, planes, read_weights, weights
-from topomerge.fusion.evidence.places import MOST_TOLD, Places
+from topomerge.fusion.evidence.places import MOST_ODDS, Places
 from topomerge.io import archive
 from topomerge.types import Sim3
 
@@ -67,8 +67,8 @@ def test_no_squares_give_nothing():
 def test_the_mean_and_the_worst_of_places_by_hand():
     crops = Crops(*squares(count=4), np.zeros((4, 3)), np.array([10.0, 10.0, 10.0, 20.0]))
     found = Places(crops, np.array([9.0, -9.0, 1.0, 2.0])).features
-    assert found["place_mean"] == pytest.approx((MOST_TOLD - MOST_TOLD + 1 + 4) / 5) and found["place_area"] == 50
-    assert found["place_worst"] == pytest.approx((-MOST_TOLD + 1) / 2)  # the worst third of the floor
+    assert found["place_mean"] == pytest.approx((MOST_ODDS - MOST_ODDS + 1 + 4) / 5) and found["place_area"] == 50
+    assert found["place_worst"] == pytest.approx((-MOST_ODDS + 1) / 2)  # the worst third of the floor
     back = Places(crops, np.arange(4.0)).inverse(Sim3(0.0, (1.0, 0.0, 0.0)))
     assert (back.crops.parts == crops.parts[:, ::-1]).all() and (back.crops.middle[:, 0] == -1).all()
 

@@ -17,7 +17,7 @@ from scipy import ndimage
 from topomerge.errors import InputError
 from topomerge.extraction.classified_storey import COLUMN_CLASSES, INSIDE_CLASS
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.io.weight_files import weights_file
+from topomerge.io.weight_files import read_layers, weights_file
 from topomerge.numpy_nn import convolution, linear, softmax
 from topomerge.types import Array
 
@@ -96,18 +96,8 @@ def read_weights(path: Path) -> dict[str, Array]:
     Raises:
         InputError: not the network that this version knows, or damaged.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            layers = {name: file[name].astype(np.float32) for name in file.files}
-    except Exception as error:  # zip, header and data each have their own errors
-        raise InputError(f"{path}: is no network of plans ({error}); install topomerge again") from error
     names = [f"{n}{k}" for n in DOWN_LEVELS for k in (1, 2)] + [f"{n}1" for n in UP_LEVELS]
-    channels = dict.fromkeys(names, 9) | {"out": 1}
-    for name, taps in channels.items():
-        w, b = layers.get(f"{name}.w"), layers.get(f"{name}.b")
-        fits = w is not None and b is not None and w.ndim == 2 and not w.shape[0] % taps and b.shape == w.shape[1:]
-        if not fits or not np.isfinite(layers[f"{name}.w"]).all() or not np.isfinite(layers[f"{name}.b"]).all():
-            raise InputError(f"{path}: is no network of plans (layer {name}); install topomerge again")
+    layers = read_layers(path, "plans", dict.fromkeys(names, 9) | {"out": 1})
     if layers["a1.w"].shape[0] != 9 * EVIDENCE_CHANNELS or layers["out.w"].shape[1] != len(COLUMN_CLASSES):
         raise InputError(f"{path}: was trained with other inputs or outputs; install topomerge again")
     return layers

@@ -50,10 +50,10 @@ class Check:
     features: Mapping[str, float]
 
 
-def hypotheses(maps: Maps, i: int, j: int, scale: str = "fixed", known: str = "nothing") -> tuple[PoseHypothesis, ...]:
+def hypotheses(maps: Maps, i: int, j: int, scale: str = "fixed", same: str = "nothing") -> tuple[PoseHypothesis, ...]:
     """Where map j may lie in map i, most probable first; each with its share of the probability that one of them is right."""
     poses = _room_poses(maps, i, j, scale) if maps.matched else []
-    registration = register(maps.prepared(i), maps.prepared(j), scale=scale, proposed=poses, known=known)
+    registration = register(maps.prepared(i), maps.prepared(j), scale=scale, proposed=poses, same=same)
     if registration.transform is None or not registration.alternatives:
         return ()
     best, probability = registration.alternatives[0].score, registration.probability

@@ -47,7 +47,7 @@ def registrations_to_json(
 
 def _stamp(settings: Mapping[str, Any]) -> str:
     """What registrations depend on beside the maps."""
-    inputs = [__version__, model(), settings["scale"], str(settings["embedder"]), settings["known"]]
+    inputs = [__version__, model(), settings["scale"], str(settings["embedder"]), settings["same"]]
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:16]
 
 

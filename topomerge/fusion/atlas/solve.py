@@ -22,8 +22,8 @@ from topomerge.fusion.atlas.pose_graph import residual
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.bend.bend import NEITHER_BENDS, bend_together
 from topomerge.fusion.bend.deformation import Deformation
-from topomerge.fusion.inputs import check_cells, check_scale, check_units, checked_threshold, without_rooms
-from topomerge.fusion.posterior import check_known
+from topomerge.fusion.inputs import check_cells, check_scale, check_units, link_threshold, without_rooms
+from topomerge.fusion.posterior import check_same
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
@@ -41,8 +41,7 @@ class AtlasSettings:
     threshold: float | None = None
     embedder: str | Descriptor | None = None
     rigid: bool = False
-    known: str = "nothing"
-    risk: float | None = None
+    same: str = "nothing"
 
 
 def atlas(
@@ -52,8 +51,7 @@ def atlas(
     threshold: float | None = None,
     embedder: str | Descriptor | None = None,
     rigid: bool = False,
-    known: str = "nothing",
-    risk: float | None = None,
+    same: str = "nothing",
     registrations: RegistrationsByPair | None = None,
 ) -> AtlasResult:
     """Bring maps together, as many as belong together.
@@ -61,12 +59,11 @@ def atlas(
     Args:
         maps: topometric maps or `.tmap` files, two or more; of files only a few are in memory at once.
         scale: "fixed", or "free" where the scales of the maps differ in unknown ways.
-        threshold: probability from which a link is believed; that of the calibration if None.
+        threshold: probability from which a link is believed; 0.8 if None: a wrong link drags all that hangs on it.
         embedder: "learned", "engineered", "shapedna", "feather", the folder of a trained one, or a callable map -> (R, D):
             matched rooms propose poses, too. None: the learned descriptors only say which pairs to try first.
         rigid: leave the maps as they are? Else all that belong together are bent together, each by as much as its sensor drifts.
-        known: "nothing", "building" or "storey": all maps are known to be of one.
-        risk: false links in a thousand pairs that are acceptable; the threshold follows.
+        same: "nothing", "building" or "storey": all maps are known to be of one.
         registrations: made before, by the keys of both maps; those made now are added.
 
     Raises:
@@ -75,7 +72,7 @@ def atlas(
     """
     if len(maps) < 2:
         raise InputError(f"an atlas needs two or more maps, not {len(maps)}; give another one")
-    return solve(maps, AtlasSettings(scale, threshold, embedder, rigid, known, risk), registrations)
+    return solve(maps, AtlasSettings(scale, threshold, embedder, rigid, same), registrations)
 
 
 def solve(
@@ -96,8 +93,8 @@ def solve(
     """
     began = time.perf_counter()
     check_scale(settings.scale)
-    check_known(settings.known)
-    threshold = _log_odds(checked_threshold(settings.threshold, settings.risk))
+    check_same(settings.same)
+    threshold = _log_odds(link_threshold(settings.threshold))
     names, map_keys, warnings = _checked(maps, names, keys, settings.scale)
     order = sorted(range(len(maps)), key=lambda k: map_keys[k])
     ordered = Maps([maps[k] for k in order], settings.embedder)
@@ -150,7 +147,7 @@ class _Explorer:
     def __init__(
         self, maps: Maps, keys: Sequence[str], settings: AtlasSettings, threshold: float, registrations: RegistrationsByPair
     ) -> None:
-        self.maps, self.keys, self.scale, self.known = maps, keys, settings.scale, settings.known
+        self.maps, self.keys, self.scale, self.same = maps, keys, settings.scale, settings.same
         self.registrations, scaled = registrations, settings.scale == "free"
         self.tried: dict[tuple[int, int], tuple[PoseHypothesis, ...]] = {}
         self.checks = Checks(maps, scaled)
@@ -186,7 +183,7 @@ class _Explorer:
     def _registered(self, i: int, j: int) -> tuple[PoseHypothesis, ...]:
         pair = (self.keys[i], self.keys[j])
         if pair not in self.registrations:
-            self.registrations[pair] = hypotheses(self.maps, i, j, self.scale, self.known)
+            self.registrations[pair] = hypotheses(self.maps, i, j, self.scale, self.same)
         return self.registrations[pair]
 
 

@@ -16,7 +16,7 @@ from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.refinement import storeys_at
 from topomerge.types import Array, Sim3
 
-PIXEL = 0.1  # m
+CROP_PIXEL = 0.1  # m
 SIDE = 64  # pixels of a square
 TILE = 48  # pixels of a tile
 LEAST_SEEN = 2.0  # m2 of a tile that both maps saw; less says nothing
@@ -71,7 +71,7 @@ def _of_storeys(v: PlanFields, w: PlanFields, pose: Sim3) -> Crops:
     if (size < 1).any():
         return Crops.none()
     index = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1]), indexing="ij"), axis=-1)
-    places = (low + (index + 0.5) * PIXEL) @ axes  # in a's frame
+    places = (low + (index + 0.5) * CROP_PIXEL) @ axes  # in a's frame
     back = pose.inverse()
     flat = places.reshape(-1, 2)
     there = back.apply(np.column_stack([flat, np.zeros(len(flat))]))[:, :2].reshape(places.shape)
@@ -82,7 +82,7 @@ def _of_storeys(v: PlanFields, w: PlanFields, pose: Sim3) -> Crops:
         return Crops.none()
     drawn = (drawn[0], (drawn[1][0], levelled(drawn[1], drawn[0])))
     parts, ceiling = (np.stack([_cut(d[k], middle) for d in drawn], axis=1) for k in (0, 1))
-    at = np.column_stack([(low + (middle + 0.5) * PIXEL) @ axes, np.full(len(middle), v.plan.floor_guess)])
+    at = np.column_stack([(low + (middle + 0.5) * CROP_PIXEL) @ axes, np.full(len(middle), v.plan.floor_guess)])
     looked = np.stack([_looked(v.plan), _looked(w.plan)]).astype(np.float32)
     return Crops(parts, ceiling, np.repeat(looked[None], len(area), axis=0), at, area)
 
@@ -96,8 +96,8 @@ def _common_box(a: StoreyPlan, b: StoreyPlan, pose: Sim3, axes: Array) -> tuple[
         at = move.apply(np.column_stack([corners, np.zeros(4)]))[:, :2] @ axes.T
         lows.append(at.min(axis=0))
         highs.append(at.max(axis=0))
-    low = np.floor(np.max(lows, axis=0) / PIXEL) * PIXEL
-    return low, np.ceil((np.min(highs, axis=0) - low) / PIXEL).astype(int)
+    low = np.floor(np.max(lows, axis=0) / CROP_PIXEL) * CROP_PIXEL
+    return low, np.ceil((np.min(highs, axis=0) - low) / CROP_PIXEL).astype(int)
 
 
 def _drawn(fields: PlanFields, places: Array, scale: float) -> tuple[Array, Array]:
@@ -128,9 +128,9 @@ def _tiles(seen: Array) -> tuple[Array, Array]:
     across = seen.shape[1] // TILE + 1
     tile = at[:, 0] // TILE * across + at[:, 1] // TILE
     count = np.bincount(tile, minlength=1)
-    many = np.flatnonzero(count * PIXEL**2 >= LEAST_SEEN)
+    many = np.flatnonzero(count * CROP_PIXEL**2 >= LEAST_SEEN)
     middle = np.column_stack([np.bincount(tile, at[:, k], minlength=1)[many] / count[many] for k in (0, 1)])
-    return np.round(middle).astype(int), count[many] * PIXEL**2
+    return np.round(middle).astype(int), count[many] * CROP_PIXEL**2
 
 
 def _cut(layer: Array, middle: Array) -> Array:

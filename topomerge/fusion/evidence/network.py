@@ -11,7 +11,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.fusion.evidence.crops import CEILINGS, PARTS, Crops
-from topomerge.io.weight_files import weights_file
+from topomerge.io.weight_files import read_layers, weights_file
 from topomerge.numpy_nn import convolution, linear, relu
 from topomerge.types import Array
 
@@ -37,14 +37,14 @@ def planes(parts: Array, ceiling: Array, looked: Array) -> Array:
     bit = {name: (parts & mask) > 0 for name, mask in BITS.items()}
     spread = _widened(parts)
     near = {name: (spread & mask) > 0 for name, mask in BITS.items()}
-    known = (parts & GROUND) > 0
+    explored = (parts & GROUND) > 0
     standing = near["wall"] | near["clutter"]
     empty = bit["free"] & ~standing
-    out = [known.all(axis=1), known[:, 0] != known[:, 1], bit["free"].all(axis=1)]
+    out = [explored.all(axis=1), explored[:, 0] != explored[:, 1], bit["free"].all(axis=1)]
     out += _compared(bit["wall"], empty, near["wall"])
     out += _compared(bit["clutter"] & ~near["wall"], empty, standing)
     for n, name in enumerate(HEIGHT_PARTS):
-        seen = known & (looked[:, :, 1 + n, None, None] > 0)
+        seen = explored & (looked[:, :, 1 + n, None, None] > 0)
         there = bit[name] & seen & ~near["wall"]
         out += _compared(there, seen & ~near[name] & bit["free"], near[name])
     roof = bit["ceiling"] & bit["free"]
@@ -114,17 +114,10 @@ def read_weights(path: Path) -> dict[str, Array]:
     Raises:
         InputError: not the network that this version knows, or damaged.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            layers = {name: file[name].astype(np.float32) for name in file.files}
-    except Exception as error:  # zip, header and data each have their own errors
-        raise InputError(f"{path}: is no network of places ({error}); install topomerge again") from error
+    layers = read_layers(path, "places", {**dict.fromkeys(CONVOLUTIONS, 9), "f": 2, "out": 1})
     wide = PLANES
     for name in (*CONVOLUTIONS, "f", "out"):
-        rows = {"f": 2 * wide, "out": wide}.get(name, 9 * wide)
-        w, b = layers.get(f"{name}.w"), layers.get(f"{name}.b")
-        fits = w is not None and b is not None and w.ndim == 2 and w.shape[0] == rows and b.shape == w.shape[1:]
-        if not fits or not np.isfinite(layers[f"{name}.w"]).all() or not np.isfinite(layers[f"{name}.b"]).all():
+        if layers[f"{name}.w"].shape[0] != {"f": 2 * wide, "out": wide}.get(name, 9 * wide):
             raise InputError(f"{path}: is no network of places (layer {name}); install topomerge again")
         wide = layers[f"{name}.b"].shape[0]
     return layers

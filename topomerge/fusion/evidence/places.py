@@ -12,7 +12,7 @@ from topomerge.fusion.evidence.network import place_log_odds
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.types import Array, Sim3
 
-MOST_TOLD = 4.0  # log odds: one place never says more
+MOST_ODDS = 4.0  # log odds: one place never says more
 WORST = 1 / 3  # of the places: the worst ones
 
 
@@ -41,14 +41,14 @@ class Places:
     def features(self) -> dict[str, float]:
         """For the whole-map models: mean of the log odds, that of the worst ones, and the m2 of floor that they are of. Large
         places count more, none more than a full tile."""
-        told = np.clip(self.log_odds, -MOST_TOLD, MOST_TOLD)
+        odds = np.clip(self.log_odds, -MOST_ODDS, MOST_ODDS)
         area, total = self.crops.area, float(self.crops.area.sum())
-        if not len(told):
+        if not len(odds):
             return {"place_mean": 0.0, "place_worst": 0.0, "place_area": 0.0}
-        order = np.argsort(told, kind="stable")
+        order = np.argsort(odds, kind="stable")
         share = np.cumsum(area[order]) / total
         worst = order[: max(int(np.searchsorted(share, WORST)) + 1, 1)]
-        mean, low = (float(np.average(told[k], weights=area[k])) for k in (slice(None), worst))
+        mean, low = (float(np.average(odds[k], weights=area[k])) for k in (slice(None), worst))
         return {"place_mean": mean, "place_worst": low, "place_area": total}
 
 
