@@ -149,3 +149,16 @@ addEventListener("load", () => setTimeout(() => {
     assert title
     seen = json.loads(title[1].replace("&quot;", '"'))
     assert seen == {"both": ["1", "1"], "b": ["0", "1"], "mates": True}
+
+
+def test_options_that_contradict_each_other_are_no_files_fault(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.ply", "b.ply"):
+        Path(name).write_text("never read")
+    for words, message in (
+        (["--risk", "5", "--threshold", "0.5"], "--threshold and --risk"),
+        (["--risk", "1e-5"], "--risk 1e-05:"),
+    ):
+        assert cli(["merge", "a.ply", "b.ply", "-o", "m", *words]) == 1
+        assert capsys.readouterr().err.startswith(f"topomerge: {message}")
+    assert not Path("m").exists()

@@ -60,7 +60,10 @@ def belief_choices(args: argparse.Namespace) -> dict[str, Any]:
 
         if "threshold" in choices:
             raise InputError("--threshold and --risk both say when to believe a merge; give one of them")
-        choices["threshold"] = risk_threshold(args.risk)
+        try:
+            choices["threshold"] = risk_threshold(args.risk)
+        except InputError as error:
+            raise InputError(f"--{error}") from error
     return choices
 
 

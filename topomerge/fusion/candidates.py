@@ -75,10 +75,8 @@ def rivals(ranked: Sequence[PoseHypothesis]) -> list[int]:
 
 def candidates(a: Prepared, b: Prepared, ranked: Sequence[PoseHypothesis], scaled: bool) -> list[Candidate]:
     """The hypotheses worth it, each with the maps bent, best first; those that end in one pose once."""
-    count = {"repeats": float(repeats(ranked))}
-    looked = [candidate(a, b, ranked[k], scaled) for k in rivals(ranked)]
-    looked = [replace(c, features=c.features | count) for c in looked]
-    looked.sort(key=lambda c: -c.score)
+    looked = sorted((candidate(a, b, ranked[k], scaled) for k in rivals(ranked)), key=lambda c: -c.score)
+    looked[0].features["repeats"] = float(repeats(ranked))  # asked of the best one only
     moved = [replace(c.hypothesis, transform=c.bend.transform) for c in looked]
     single = {id(h) for h in distinct_hypotheses(moved, np.append(b.storeys[0].middle, 0.0), BASIN)}
     return [c for c, h in zip(looked, moved, strict=True) if id(h) in single]

@@ -154,10 +154,9 @@ def judged(pair: GridPair, hypotheses: int, inspected: int) -> tuple[list[Row], 
     ranked = rank(poses, Judge(first.storeys, second.storeys))[:hypotheses] if poses else []
     errors = [error(h.transform.inverse() if turn else h.transform, pair) for h in ranked]
     labels = [label_of(err, pair.about["sensors"]) for err in errors]
-    closely = set(rivals(ranked)) if ranked else set()
-    closely |= set(np.flatnonzero(np.array(labels) == 1)[:1].tolist()) | set(
-        np.flatnonzero(np.array(labels) == 0)[:inspected].tolist()
-    )
+    registered = set(rivals(ranked)) if ranked else set()
+    right_one, wrong_ones = (np.flatnonzero(np.array(labels) == label) for label in (1, 0))
+    closely = registered | set(right_one[:1].tolist()) | set(wrong_ones[:inspected].tolist())
     rows: list[Row] = []
     seen: dict[int, Crops] = {}
     for k, h in enumerate(ranked):
@@ -170,7 +169,7 @@ def judged(pair: GridPair, hypotheses: int, inspected: int) -> tuple[list[Row], 
             rows[k] |= {
                 "bent": bent.closely() | {"repeats": repeats(ranked)},
                 "bent_pose": pose.matrix.tolist(),
-                "rival": k in rivals(ranked),
+                "rival": k in registered,
             }
             seen[k] = bent.places.crops
     return rows, seen, np.append(second.storeys[0].middle, 0.0)
