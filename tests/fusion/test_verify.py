@@ -154,6 +154,8 @@ def test_the_probability_is_at_most_the_share_of_the_odds():
     worse = {**GOOD, "walls": 60.0, "free": 300.0}
     halved = verdict([GOOD, GOOD, worse], {**GOOD, **QUIET})
     behind = np.exp(bent_score(worse) - bent_score(GOOD))
+    for same in ("building", "storey"):  # whatever is known of the maps, two places are as good
+        assert verdict([GOOD, GOOD, worse], {**GOOD, **QUIET}, same).each[0] <= 1 / (2 + behind) + 1e-12
     assert halved.each[0] <= 1 / (2 + behind) and halved.each[1] == pytest.approx(halved.each[0])
     assert halved.each[2] == pytest.approx(halved.each[0] * behind)
     assert tuple(halved.posterior) == POSTERIOR and halved.posterior["here"] == halved.each[0]
