@@ -9,11 +9,12 @@ import torch
 from topomerge.models.layers import Standardise, mlp
 from topomerge.models.nodes import NodeEncoder
 from topomerge.models.pointnet import LocalPointNet, PointNet
+from topomerge.models.surroundings import SurroundingsEncoder
 from topomerge.models.voxelcnn import VoxelCNN
 from topomerge.models.yaw import Turned
 from torch import Tensor, nn
 
-from topomerge.embedding.network import GRAPH, TABLE_PARTS, Network, check, needed, pair_tensors, tensors
+from topomerge.embedding.network import CROP_PART, GRAPH, TABLE_PARTS, Network, check, needed, pair_tensors, tensors
 from topomerge.embedding.schema import width
 
 POINT_ENCODERS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}
@@ -42,6 +43,8 @@ class GeometryEncoder(nn.Module):
         for part in geometry.parts:
             if part in POINT_ENCODERS:
                 self.parts[part] = Turned(POINT_ENCODERS[part](self.width), geometry.yaws, geometry.canonical)
+            elif part == CROP_PART:
+                self.parts[part] = SurroundingsEncoder(self.width, network.dropout)
             else:
                 self.parts[part] = Table(width(TABLE_PARTS[part]), self.width, network.dropout)
         self.join = nn.Sequential(nn.LayerNorm(len(self.parts) * self.width), nn.ReLU(), nn.Dropout(network.dropout))
@@ -87,8 +90,16 @@ class Embedder(nn.Module):
 
     def forward(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         pairs: list[Tensor | None] = [tensors[name] for name in self.pairs] or [None, None]
-        rooms = self.node(self.geometry(tensors), *(tensors[name] for name in GRAPH), *pairs)
+        rooms = self.node(self.geometry(tensors), *(tensors[name] for name in GRAPH), *pairs, tensors.get("edge_way"))
         return nn.functional.normalize(self.project(rooms), dim=1), self.dustbin(rooms)[:, 0]
+
+    def turned(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Embeddings (R, D), or, of a network that tells turns apart, (R, 4, D): of the map turned by 0 to 3 quarter turns; and
+        the mean of the dustbins (R,)."""
+        if self.network.turns == 1:
+            return self(tensors)
+        rows, bins = zip(*(self(quarter_turned(tensors, k)) for k in range(self.network.turns)), strict=True)
+        return torch.stack(rows, dim=1), torch.stack(bins).mean(dim=0)
 
     def fit_scales(self, graphs: Iterable[Mapping[str, Any]]) -> None:
         """Take the statistics of all inputs from the graphs of the training set."""
@@ -101,6 +112,17 @@ class Embedder(nn.Module):
         ]
         for name, scale in tables:
             scale.fit(torch.cat([graph[name] for graph in graphs]))
+
+
+def quarter_turned(tensors: Mapping[str, Tensor], turns: int) -> dict[str, Tensor]:
+    """A map turned by so many quarter turns, counter-clockwise seen from above."""
+    out = dict(tensors)
+    if CROP_PART in out:
+        out[CROP_PART] = out[CROP_PART].rot90(turns, (1, 2))
+    if "edge_way" in out:
+        ways = torch.view_as_complex(out["edge_way"].reshape(len(out["edge_way"]), 2, 2).contiguous())
+        out["edge_way"] = torch.view_as_real(ways * 1j**turns).flatten(1)
+    return out
 
 
 def match_scores(a: Tensor, b: Tensor, bin_a: Tensor, bin_b: Tensor, temperature: Tensor | float) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from topomerge.models.layers import Standardise
 from torch import Tensor, nn
 from torch_geometric.nn import GATv2Conv, SAGEConv
 
-from topomerge.embedding.network import ROOM_KNOTS, Node, pair_tensors
+from topomerge.embedding.network import ROOM_KNOTS, WAY_LIMIT, WAY_UNIT, Node, pair_tensors
 from topomerge.embedding.schema import column, width
 
 
@@ -53,6 +53,7 @@ class NodeEncoder(nn.Module):
         if settings.edges and settings.kind != "none":
             columns = width("edge_attr")
             self.edges = Standardise(columns)
+            columns += width("edge_way") if settings.ways else 0
             hidden = (columns + ROOM_KNOTS, 2 * settings.width) if settings.around else (columns,)
             self.edge = dense(*hidden, settings.width)
         if pair_tables := pair_tensors(settings)[1:]:
@@ -66,9 +67,15 @@ class NodeEncoder(nn.Module):
         self.out = channels * (count + 1) if settings.jump == "cat" else channels
 
     def forward(
-        self, rooms: Tensor, edge_index: Tensor, edge_attr: Tensor, pair_index: Tensor | None, pair_attr: Tensor | None
+        self,
+        rooms: Tensor,
+        edge_index: Tensor,
+        edge_attr: Tensor,
+        pair_index: Tensor | None,
+        pair_attr: Tensor | None,
+        way: Tensor | None = None,
     ) -> Tensor:
-        edges = self._edges(edge_attr, pair_index, pair_attr)
+        edges = self._edges(edge_attr, pair_index, pair_attr, way)
         ways = edge_index.flip(0)  # edges lead from a room to its neighbours; messages come back
         states = [rooms]
         for layer, norm in zip(self.layers, self.norms, strict=True):
@@ -79,13 +86,16 @@ class NodeEncoder(nn.Module):
             return torch.cat(states, dim=1)
         return torch.stack(states).amax(dim=0) if self.settings.jump == "max" else states[-1]
 
-    def _edges(self, edge_attr: Tensor, pair_index: Tensor | None, pair_attr: Tensor | None) -> Tensor | None:
+    def _edges(self, edge_attr: Tensor, pair_index: Tensor | None, pair_attr: Tensor | None, way: Tensor | None) -> Tensor | None:
         """(E, settings.width) of the edges, from their features and the doors beside them."""
         if self.edges is None or self.edge is None:
             return None
         scaled = self.edges(edge_attr)
         if self.settings.around:
             scaled = torch.cat([scaled, bumps(edge_attr[:, self.distance])], dim=1)
+        if self.settings.ways:
+            assert way is not None
+            scaled = torch.cat([scaled, (way / WAY_UNIT).clamp(-WAY_LIMIT, WAY_LIMIT)], dim=1)
         edges: Tensor = self.edge(scaled)
         for layer in self.doors:
             assert self.pairs is not None and pair_index is not None and pair_attr is not None

@@ -10,10 +10,13 @@ import torch
 
 from topomerge.embedding.door_layout import door_layout
 from topomerge.embedding.schema import width
+from topomerge.embedding.surroundings import CROP, SHEET_PLANES
 from topomerge.io import archive
 from topomerge.training.packed import GraphPair
+from topomerge.training.turned_views import with_views
 
-LATER = ("engineered", "shapedna", "near_index", "near_attr")  # reckoned when a set is read
+LATER = ("engineered", "shapedna", "near_index", "near_attr", "surroundings", "edge_way")  # reckoned when a set is read
+VIEWS = ("surroundings", "edge_way")
 
 
 def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Tensor]:
@@ -27,7 +30,15 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
     middle[:, 2] = door[:, 2] = 1.0
     near = [torch.from_numpy(array) for array in door_layout(index.numpy(), middle.numpy(), door.repeat(2, 1).numpy())]
     size = 1 + 3 * torch.rand((rooms, 1, 3), generator=g)
-    return {
+    anchor = 10 + CROP * torch.rand((rooms, 2), generator=g)
+    columns = torch.stack(torch.meshgrid(*[torch.arange(CROP + 20.0)] * 2, indexing="ij"), dim=-1)
+    views = {
+        "sheet": torch.randint(0, 256, (*columns.shape[:2], len(SHEET_PLANES)), generator=g, dtype=torch.uint8),
+        "sheet_room": (columns[:, :, None] - anchor).norm(dim=3).argmin(dim=2).to(torch.int16),
+        "anchor": anchor,
+        "turn": torch.zeros(1, dtype=torch.float64),
+    }
+    tensors = {
         "x": 10 * torch.rand((rooms, width("x")), generator=g),
         "engineered": torch.rand((rooms, width("engineered")), generator=g),
         "shapedna": torch.rand((rooms, width("shapedna")), generator=g),
@@ -41,6 +52,7 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
         "pos": middle,
         "edge_pos": door.repeat(2, 1),
     }
+    return with_views({**tensors, **views}, VIEWS)
 
 
 def turned(tensors: dict[str, torch.Tensor], angle: float) -> dict[str, torch.Tensor]:
@@ -56,14 +68,17 @@ def shuffled(tensors: dict[str, torch.Tensor], seed: int = 0) -> tuple[dict[str,
     rooms, edges = torch.randperm(len(tensors["x"]), generator=g), torch.randperm(len(tensors["edge_attr"]) // 2, generator=g)
     edges = torch.cat([edges, edges + len(edges)])  # an edge and its way back stand half of all apart
     new_room, new_edge = rooms.argsort(), edges.argsort()
-    out = {name: tensors[name][rooms] for name in ("x", "engineered", "shapedna", "room_points", "pos")}
+    out = {name: tensors[name][rooms] for name in ("x", "engineered", "shapedna", "room_points", "pos", "anchor")}
+    out |= {"sheet": tensors["sheet"], "sheet_room": new_room[tensors["sheet_room"].long()].to(torch.int16)}
+    out["turn"] = tensors["turn"]
     out |= {"edge_index": new_room[tensors["edge_index"][:, edges]], "edge_attr": tensors["edge_attr"][edges]}
     out |= {
         "edge_pos": tensors["edge_pos"][edges],
         "near_index": new_edge[tensors["near_index"]],
         "near_attr": tensors["near_attr"],
     }
-    return out | {"door_index": new_edge[tensors["door_index"]], "door_attr": tensors["door_attr"]}, rooms
+    out |= {"door_index": new_edge[tensors["door_index"]], "door_attr": tensors["door_attr"]}
+    return with_views(out, VIEWS), rooms
 
 
 def pair(seed: int, rooms: int = 7) -> GraphPair:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from topomerge.extraction.extract import extract as extract
     from topomerge.extraction.parameters import PRESETS as PRESETS
     from topomerge.extraction.voxels import voxelise as voxelise
+    from topomerge.fusion.atlas.find import find as find
     from topomerge.fusion.atlas.result import AtlasResult as AtlasResult
     from topomerge.fusion.atlas.solve import atlas as atlas
     from topomerge.fusion.merge import merge as merge
@@ -46,6 +47,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "AtlasResult": "topomerge.fusion.atlas.result",
+    "find": "topomerge.fusion.atlas.find",
     "InputError": "topomerge.errors",
     "MergeResult": "topomerge.fusion.result",
     "PRESETS": "topomerge.extraction.parameters",

@@ -15,6 +15,7 @@ from topomerge.types import Array
 LEAKY_SLOPE = 0.2  # of the leaky rectifier below 0 (Velickovic et al. 2018)
 LAYER_NORM_EPSILON = 1e-5  # added to the variance, as torch does
 CONVOLVED_ROWS = 64  # rows of an image at a time; all at once would take nine times its memory
+CONVOLVED_PIXELS = 1 << 14  # of several images at a time
 
 
 def linear(x: Array, weight: Array, bias: Array | None = None) -> Array:
@@ -75,6 +76,20 @@ def convolution(x: Array, weight: Array, bias: Array, stride: int = 1) -> Array:
         taps = [x[at + u : at + u + stride * n : stride, v : v + stride * ny : stride] for u in range(3) for v in range(3)]
         columns = np.concatenate(taps, axis=-1).reshape(n * ny, -1)
         out[i : i + n] = (columns @ weight + bias).reshape(n, ny, -1)
+    return np.maximum(out, 0.0, out=out)
+
+
+def convolutions(x: Array, weight: Array, bias: Array, stride: int = 1) -> Array:
+    """`convolution` of several images (n, nx, ny, c) at once -> (n, nx / stride, ny / stride, k)."""
+    n, nx, ny = x.shape[0], x.shape[1] // stride, x.shape[2] // stride
+    x = np.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    out = np.empty((n, nx, ny, weight.shape[1]), np.float32)
+    step = max(CONVOLVED_PIXELS // (nx * ny), 1)
+    for i in range(0, n, step):
+        some = x[i : i + step]
+        taps = [some[:, u : u + stride * nx : stride, v : v + stride * ny : stride] for u in range(3) for v in range(3)]
+        columns = np.concatenate(taps, axis=-1).reshape(-1, weight.shape[0])
+        out[i : i + step] = (columns @ weight + bias).reshape(len(some), nx, ny, -1)
     return np.maximum(out, 0.0, out=out)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,19 +15,22 @@ from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.builder import Row, make_item
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.pairs.atlases import make_atlas
 from topomerge.datasets.pairs.degrade import UNCHANGED, degraded
 from topomerge.datasets.pairs.drawing import with_plan
 from topomerge.datasets.pairs.evaluation_pair import evaluation_arrays, pair_statistics, save_maps
 from topomerge.datasets.pairs.items import Item, difficulty_of
 from topomerge.datasets.pairs.pairs import Pair, make_pair
+from topomerge.datasets.pairs.recipe import SIDES
 from topomerge.datasets.pairs.truth import room_truth, true_matches
 
 from topomerge.embedding.graph import from_arrays, graph_arrays
+from topomerge.embedding.surroundings import sheet_arrays
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io import archive
 from topomerge.io.listing import plain
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, PointCloud, TopometricMap
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -70,30 +74,70 @@ def make_arrays(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]
     Raises:
         InputError: no candidate has such a pair, or a map has hardly a room.
     """
+    if item.more:
+        return several_maps(item, plans)
     pair = degraded(_first_pair(item, plans), item.change, item.seed)
-    return pair_arrays(pair, extracted(pair, item), entries_of(item))
+    return pair_arrays(pair, extracted((pair.a, pair.b), item), entries_of(item))
+
+
+def several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array]:
+    """The arrays of an item of three or more maps of a building: those of each map, and under "matches.ac", "transform.ac" and so
+    on what is true of each two; "matches" and "transform" are those of the first two.
+
+    Raises:
+        InputError: no candidate has such walks, or a map has hardly a room.
+    """
+    sensors, sides = (*item.sensors, *item.more), SIDES[: 2 + len(item.more)]
+    for k in range(len(item.buildings)):
+        try:
+            rng = np.random.default_rng([item.seed, k])
+            atlas = make_atlas(candidate(item, k, plans)[0], sensors, rng, item.rooms, False, difficulty_of(item), item.source)
+            break
+        except InputError:
+            if k + 1 == len(item.buildings):
+                raise
+    maps = extracted(atlas.maps, item)
+    truths = [room_truth(m, cloud) for m, cloud in zip(maps, atlas.maps, strict=True)]
+    arrays = _map_arrays(sides, maps, truths, item.points_per_room)
+    for i, j in itertools.combinations(range(len(maps)), 2):
+        ending = "" if (i, j) == (0, 1) else f".{sides[i]}{sides[j]}"
+        arrays[f"matches{ending}"] = true_matches(truths[i], truths[j], atlas.shared[i, j])
+        arrays[f"transform{ending}"] = (atlas.truth[i].inverse() @ atlas.truth[j]).matrix
+    entries = {**entries_of(item), "building": atlas.building, "sides": sides, "sensors": list(sensors)}
+    text = json.dumps(plain({**entries, "extracted": [len(t) for t in truths]}), sort_keys=True, ensure_ascii=False)
+    return arrays | {"about": np.frombuffer(text.encode(), np.uint8)}
+
+
+def _map_arrays(sides: str, maps: Sequence[TopometricMap], truths: Sequence[Array], points_per_room: int) -> dict[str, Array]:
+    """Graph, storeys from above and true rooms of each map."""
+    arrays: dict[str, Array] = {}
+    for side, map, truth in zip(sides, maps, truths, strict=True):
+        arrays |= {f"{side}.{name}": array for name, array in graph_arrays(map, points_per_room).items()}
+        arrays |= {f"{side}.{name}": array for name, array in sheet_arrays(map).items()}
+        arrays |= {f"{side}.true_{name}": truth[name] for name in ("room", "iou", "one")}
+    return arrays
 
 
 def make_evaluation_arrays(item: Item, plans: Sequence[Sequence[Plan]], folder: Path) -> dict[str, Array]:
     """As `make_arrays`, with what evaluation needs (`evaluation_pair`); the maps are written into the folder."""
     pair = degraded(_first_pair(item, plans), item.change, item.seed)
-    maps = extracted(pair, item)
+    maps = extracted((pair.a, pair.b), item)
     arrays = pair_arrays(pair, maps, {**entries_of(item), **pair_statistics(pair, maps)})
     arrays |= evaluation_arrays(pair, maps, (arrays["a.true_room"], arrays["b.true_room"]))
     save_maps(maps, folder, item.name)
     return arrays
 
 
-def extracted(pair: Pair, item: Item) -> tuple[TopometricMap, TopometricMap]:
-    """The maps of both clouds; with the space that rays crossed where they are kept.
+def extracted(clouds: Sequence[PointCloud], item: Item) -> tuple[TopometricMap, ...]:
+    """The maps of clouds; with the space that rays crossed where they are kept.
 
     Raises:
         InputError: hardly a room comes out of one of them.
     """
-    a, b = (extract(cloud, voxel_size=item.voxel_size, carve=item.maps) for cloud in (pair.a, pair.b))
-    if min(len(a.rooms), len(b.rooms)) < FEWEST_ROOMS:
+    maps = tuple(extract(cloud, voxel_size=item.voxel_size, carve=item.maps) for cloud in clouds)
+    if min(len(m.rooms) for m in maps) < FEWEST_ROOMS:
         raise InputError(f"fewer than {FEWEST_ROOMS} rooms were extracted from a map of {' or '.join(item.sensors)}")
-    return a, b
+    return maps
 
 
 def entries_of(item: Item) -> dict[str, Any]:
@@ -103,6 +147,8 @@ def entries_of(item: Item) -> dict[str, Any]:
         del entries["change"]
     if not item.maps:
         del entries["maps"]
+    if not item.more:
+        del entries["more"]
     return {**entries, "file": f"{item.name}.npz", "asked_overlap": item.overlap, "points_per_room": item.points_per_room}
 
 
@@ -110,10 +156,7 @@ def pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: Mapping
     """The arrays of a file: the graphs of two maps, their true rooms, and what stands about them."""
     truths = [room_truth(m, cloud) for m, cloud in zip(maps, (pair.a, pair.b), strict=True)]
     matches = true_matches(truths[0], truths[1], pair.shared)
-    arrays: dict[str, Array] = {}
-    for side, map, truth in zip("ab", maps, truths, strict=True):
-        arrays |= {f"{side}.{name}": array for name, array in graph_arrays(map, item_entries["points_per_room"]).items()}
-        arrays |= {f"{side}.true_{name}": truth[name] for name in ("room", "iou", "one")}
+    arrays = _map_arrays("ab", maps, truths, item_entries["points_per_room"])
     arrays["matches"] = matches
     arrays["transform"] = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.matrix
     entries = {

@@ -22,7 +22,7 @@ from topomerge.embedding import graph
 from topomerge.io.listing import plain
 
 # Raise it when the same item gives other bytes, by whatever step: simulation, extraction, truth. It is part of the files' names.
-PAIR_FORMAT = 6
+PAIR_FORMAT = 7
 EXTRACTION = "topomerge.extraction.extract"
 MAKER = "topomerge.datasets.pairs.example"  # what makes the files
 CANDIDATES = 4  # buildings tried for an item: not every one has two parts with the overlap that is wanted
@@ -41,6 +41,7 @@ class Item:
         difficulty: what differs from the defaults.
         maps: are the extracted maps kept beside the pair?
         change: what is done to the clouds before they are extracted, and how much (`degrade`).
+        more: sensors of further maps of the building, in the same file (`several_maps`).
     """
 
     source: str
@@ -61,6 +62,7 @@ class Item:
     over_stairs: bool = False
     maps: bool = False
     change: tuple[str, float] = UNCHANGED
+    more: tuple[str, ...] = ()
 
     @property
     def pair_settings(self) -> PairSettings:
@@ -77,7 +79,7 @@ class Item:
         results raises, and the digest of the weights that the extraction reads, which change by training alone.
         """
         values = asdict(self)
-        later = {"maps": False, "change": UNCHANGED}  # these came later: at their defaults older names hold
+        later = {"maps": False, "change": UNCHANGED, "more": ()}  # these came later: at their defaults older names hold
         values = {key: value for key, value in values.items() if key not in later or value != later[key]}
         maker = code_digest(MAKER) if self.maps else data_digest(EXTRACTION)
         inputs = [PAIR_FORMAT, graph.GRAPH_FORMAT, maker, plain(values)]
@@ -136,6 +138,8 @@ def _draw(recipe: Recipe, shelves: Mapping[str, _Shelf], i: int) -> Item:
         hard, storeys = ("", 2) if source == "procedural" or of else ("other-building", 1)
     digest_of = {} if source == "procedural" else of or shelf.singles
     storeys = storeys if source == "procedural" else 2 if of else 1
+    walks = np.random.default_rng([recipe.seed, i, 2])
+    further = tuple(_pick(recipe.sensors, walks) for _ in range(recipe.walks - 2)) if not hard and overlap > 0 else ()
     first, last = splits.seeds(recipe.split)
     names = sorted(digest_of)
     chosen = [names[i] for i in rng.integers(len(names), size=CANDIDATES + 1)] if names else []
@@ -158,6 +162,7 @@ def _draw(recipe: Recipe, shelves: Mapping[str, _Shelf], i: int) -> Item:
         difficulty=_difficulty(recipe.spread, rng),
         voxel_size=recipe.voxel_size,
         points_per_room=recipe.points_per_room,
+        more=further,
         over_stairs=bool(more.random() < recipe.over_stairs and not hard and storeys > 1),
     )
 

@@ -23,6 +23,7 @@ LEAST_PLAN_ROOMS = 5  # of a real plan: fewer have no two parts
 LEAST_PLAN_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told apart
 LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
 PLACES = {**splits.FOLDERS, "ipa": splits.TEST_ONLY["ipa"][0]}  # source -> folder; IPA's are for the test only
+SIDES = "abcdef"  # names of the maps of a building in a file
 Library = Mapping[str, Mapping[str, tuple[Plan, ...]]]  # source -> name -> plans of its storeys, lowest first
 
 
@@ -47,6 +48,8 @@ class Recipe:
         stacks: share of the real buildings with two storeys, where the source has sibling storeys that fit (`stack`).
         over_stairs: share of the overlapping pairs in buildings of several storeys whose walks lead over stairs.
         maps: keep the extracted maps (`evaluation_pair`), too: for evaluation.
+        walks: maps of each building that is no hard negative: of more than two, all pairs are taken (`several_maps`), and the
+            overlaps are as they come.
         vary: name of a change (`degrade.CHANGES`) -> values; every pair is made once for each of all these.
     """
 
@@ -69,6 +72,7 @@ class Recipe:
     stacks: float = 0.0
     over_stairs: float = 0.0
     maps: bool = False
+    walks: int = 2
     vary: dict[str, list[float]] = field(default_factory=dict)
 
 
@@ -101,6 +105,8 @@ def check(recipe: Recipe) -> None:
         check_change(what, values)
     if recipe.pairs < 1 or not recipe.overlaps or len(recipe.rooms) != 2 or not 3 <= recipe.rooms[0] <= recipe.rooms[1]:
         raise InputError("pairs must be 1 or more, overlaps one or more, rooms [fewest, most] with 3 or more each")
+    if not 2 <= recipe.walks <= len(SIDES) or (recipe.walks > 2 and (recipe.maps or recipe.vary)):
+        raise InputError(f"walks must be 2 to {len(SIDES)}, and 2 where maps are kept or changed, not {recipe.walks}")
     if not 0.02 <= recipe.voxel_size <= 1 or recipe.points_per_room < 1:
         raise InputError("voxel_size must be 0.02 to 1 m, and points_per_room 1 or more")
 

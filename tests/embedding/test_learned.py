@@ -18,6 +18,8 @@ from topomerge.embedding.graph import graph_arrays
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.embedding.room_cells import joined
+from topomerge.embedding.surroundings import sheet_arrays
+from topomerge.embedding.turns import TurnedRows
 from topomerge.embedding.weights import SETTINGS_FILE, WEIGHTS_FILE, embedder_folder, read_weights, unpacked
 from topomerge.errors import InputError
 
@@ -25,13 +27,15 @@ ROOT = Path(__file__).parent.parent.parent
 CONFIGS = ROOT / "configs"
 PRETRAINED = ROOT / "topomerge" / "embedding" / "pretrained"
 GEOMETRIES = ("scalars", "engineered", "shapedna", "scalars_engineered", "scalars_shapedna")
+GEOMETRIES += ("surroundings", "scalars_surroundings")
 SAGE = Network(Geometry(["scalars"], width=8), Node("sage", 1, width=4), size=8)
 
 
 def graphs() -> dict[str, dict[str, np.ndarray]]:
     """Arrays of varied maps: a house of one room, one without doors, several storeys, rooms that nothing leads to."""
     two = building(2, 3)
-    graphs = {"storeys": graph_arrays(two), "small": graph_arrays(building(1)), "one": graph_arrays(joined(two, np.arange(3)))}
+    maps = {"storeys": two, "small": building(1), "one": joined(two, np.arange(3))}
+    graphs = {name: graph_arrays(map) | sheet_arrays(map) for name, map in maps.items()}
     alone = dict(graphs["small"])
     for name, array in alone.items():
         if name.startswith(("edge", "door")):
@@ -62,6 +66,11 @@ def saved(torch, network: Network, folder: Path, seed: int = 0) -> Path:
     return folder
 
 
+def plain(rows):
+    """Rows of all turns behind each other, or plain ones."""
+    return rows.flat() if isinstance(rows, TurnedRows) else rows
+
+
 def compare(folder: Path, several: dict[str, dict[str, np.ndarray]]) -> None:
     """Both ways give the same embeddings and dustbins."""
     from topomerge.models.learned import load_with_torch
@@ -69,7 +78,7 @@ def compare(folder: Path, several: dict[str, dict[str, np.ndarray]]) -> None:
     ours, theirs = load_embedder(folder), load_with_torch(folder)
     assert ours.temperature == pytest.approx(theirs.temperature, abs=1e-7) and ours.about == theirs.about
     for name, arrays in several.items():
-        for rows, wanted in zip(ours.graph(arrays), theirs.graph(arrays), strict=True):
+        for rows, wanted in zip(*(map(plain, learned.graph(arrays)) for learned in (ours, theirs)), strict=True):
             assert rows.shape == wanted.shape and rows.dtype == np.float64
             assert np.abs(rows - wanted).max() < 1e-5, name
 

@@ -1,4 +1,5 @@
-"""The command `atlas`: many maps in one folder, to which maps are added and from which they are taken away."""
+"""The command `atlas`: many maps in one folder, to which maps are added, from which they are taken away, and in which a place is
+found."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +20,13 @@ if TYPE_CHECKING:
     from topomerge.fusion.atlas.result import AtlasResult
 
 
+ROOMS_SHOWN = 8  # pairs of rooms of a map that `find` prints
+
+
 def atlas_command(args: argparse.Namespace) -> int:
-    """`topomerge atlas add|remove|list DIR …`. Status 2 of the first two: no maps are connected."""
-    if args.verb == "add":
-        return _add(args)
+    """`topomerge atlas add|remove|list|find DIR …`. Status 2 of the first two: no maps are connected."""
+    if args.verb in ("add", "find"):
+        return _add(args) if args.verb == "add" else _find(args)
     return _remove(args) if args.verb == "remove" else _list(args)
 
 
@@ -47,6 +51,24 @@ def _remove(args: argparse.Namespace) -> int:
         names = ", ".join(e.name for e in read_atlas(args.folder).entries)
         raise InputError(f"{args.folder}: name the maps to take out; it holds {names or 'none'}")
     return _report(remove(args.folder, args.items, atlas_html), args)
+
+
+def _find(args: argparse.Namespace) -> int:
+    from topomerge.fusion.atlas.find import find
+
+    if len(args.items) != 1:
+        raise InputError(f"{args.folder}: name the one map or cloud to look for: topomerge atlas find {args.folder} MAP")
+    check_inputs(args.items)
+    sightings = find(args.folder, map_from(args.items[0], args), args.first)
+    if args.json:
+        sys.stdout.write(json.dumps([asdict(s) for s in sightings], indent=1, ensure_ascii=False) + "\n")
+        return 0
+    rows = [("map", "share", "rooms (of the new map = of the atlas' map)")]
+    for s in sightings:
+        rows.append((s.name, f"{s.share:.2f}", ", ".join(f"{i} = {j}" for i, j, _ in s.rooms[:ROOMS_SHOWN]) or "none alike"))
+    widths = [max(len(row[c]) for row in rows) for c in range(2)]
+    say("\n".join(f"{name:<{widths[0]}}  {share:<{widths[1]}}  {rooms}" for name, share, rooms in rows))
+    return 0
 
 
 def _report(result: AtlasResult, args: argparse.Namespace) -> int:
@@ -92,12 +114,17 @@ def _table(listing: Mapping[str, Any]) -> str:
 ATLAS = Command(
     "atlas",
     atlas_command,
-    "keep many maps together: add, remove, list",
+    "keep many maps together: add, remove, list, find",
     "topomerge atlas add house/ ground.ply cellar.tmap attic.las",
     (
-        option("verb", choices=("add", "remove", "list"), help="add maps (a new folder becomes an atlas), remove or list"),
+        option(
+            "verb",
+            choices=("add", "remove", "list", "find"),
+            help="add maps (a new folder becomes an atlas), remove, list, or find which of them a new map shows",
+        ),
         option("folder", metavar="DIR", help="the atlas"),
-        option("items", nargs="*", metavar="MAP", help="of add: clouds or .tmap; of remove: names, as `list` prints them"),
+        option("items", nargs="*", metavar="MAP", help="of add, find: clouds or .tmap; of remove: names, as `list` prints them"),
+        option("--first", type=int, default=5, metavar="N", help="of find: maps that are named (default 5)"),
         option("--scale", choices=("fixed", "free"), help="free: the scales of the maps differ (default fixed)"),
         *BELIEF_OPTIONS,
         option(
@@ -107,10 +134,11 @@ ATLAS = Command(
             help="let matched rooms propose places, too; takes twice as long (default: geometry only)",
         ),
         *CLOUD_OPTIONS,
-        json_option("of list: print atlas.json"),
+        json_option("of list: print atlas.json; of find: the maps and rooms"),
         quiet("print nothing but warnings and what stands apart"),
     ),
     paths=("folder", "items"),
     description="Keep many maps together: those that belong to each other are joined, the others stay apart and are named. "
-    "Status 2: nothing is connected.",
+    "Status 2: nothing is connected. find names the maps and rooms that a new map shows, most likely first; merge tells whether "
+    "it is so.",
 )

@@ -11,12 +11,13 @@ from topomerge.cli.options import CLOUD_OPTIONS, CONTEXT_STEPS, DESCRIPTOR, map_
 
 
 def embed_command(args: argparse.Namespace) -> int:
-    """`topomerge embed`: describe each room of a map; write a NumPy array (rooms, numbers)."""
+    """`topomerge embed`: describe each room of a map; write a NumPy array (rooms, numbers), or (rooms, 4, numbers)."""
     check_outputs([args.output], [args.input])
     from topomerge.embedding.embedders import embedder
+    from topomerge.embedding.turns import numbers
 
     describe = embedder(args.descriptor, args.k)
-    rows = describe(map_from(args.input, args))
+    rows = numbers(describe(map_from(args.input, args)))
     import numpy as np
 
     def save(path: Path) -> None:
@@ -25,7 +26,7 @@ def embed_command(args: argparse.Namespace) -> int:
 
     write_all([(args.output, save)])
     if not args.quiet:
-        print(f"{len(rows)} rooms, {rows.shape[1]} numbers each -> {args.output}")
+        print(f"{len(rows)} rooms, {' x '.join(map(str, rows.shape[1:]))} numbers each -> {args.output}")
     return 0
 
 
@@ -36,7 +37,7 @@ EMBED = Command(
     "topomerge embed a.tmap --descriptor shapedna --k 1 -o a.npy",
     (
         option("input", metavar="A", help="a .tmap, or a cloud, which is extracted first"),
-        output("A.npy", "NumPy array, a row for each room"),
+        output("A.npy", "NumPy array, a row for each room, or one for each quarter turn of it"),
         DESCRIPTOR,
         CONTEXT_STEPS,
         *CLOUD_OPTIONS,

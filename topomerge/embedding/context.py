@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from topomerge.embedding.room_cells import Descriptor, joined, neighbours
+from topomerge.embedding.turns import TurnedRows, numbers
 from topomerge.errors import InputError
 from topomerge.types import Array, TopometricMap
 
@@ -25,7 +26,8 @@ def with_context(descriptor: Descriptor, k: int = 1, how: str = "join") -> Descr
             mean of their descriptors.
 
     Raises:
-        InputError: k is no whole number from 0 to `MOST_STEPS`, or `how` is unknown.
+        InputError: k is no whole number from 0 to `MOST_STEPS`, `how` is unknown; or, when called, the descriptor gives rows
+            for quarter turns, which see their surroundings themselves.
     """
     if not isinstance(k, int) or isinstance(k, bool) or not 0 <= k <= MOST_STEPS:
         raise InputError(f"steps of context must be a whole number from 0 to {MOST_STEPS}, not {k}")
@@ -36,6 +38,8 @@ def with_context(descriptor: Descriptor, k: int = 1, how: str = "join") -> Descr
 
     def describe(map: TopometricMap) -> Array:
         rows = descriptor(map)
+        if isinstance(rows, TurnedRows):
+            raise InputError("steps of context are for descriptors of single rooms; this one sees what is around: leave k out")
         parts = [rows]
         for step in range(1, k + 1):
             around = neighbours(map, step)
@@ -56,6 +60,6 @@ def _joined(descriptor: Descriptor, map: TopometricMap, around: list[Array], row
     for room, rooms in enumerate(around):
         key = tuple(rooms.tolist())
         if key not in by_rooms:
-            by_rooms[key] = descriptor(joined(map, rooms))[0] if len(key) > 1 else rows[room]
+            by_rooms[key] = numbers(descriptor(joined(map, rooms)))[0] if len(key) > 1 else rows[room]
         out[room] = by_rooms[key]
     return out

@@ -10,6 +10,7 @@ import numpy as np
 
 from topomerge.embedding.engineered import engineered
 from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.turns import numbers
 from topomerge.errors import InputError
 from topomerge.types import Array, TopometricMap
 
@@ -31,7 +32,7 @@ def feather(features: Descriptor | None = None, steps: int = 2, points: int = 6,
     theta = np.linspace(largest / points, largest, points)
 
     def describe(map: TopometricMap) -> Array:
-        angle = describe_rooms(map)[:, :, None] * theta
+        angle = numbers(describe_rooms(map))[:, :, None] * theta
         walk, reached = walk_matrix(map), np.eye(len(map.rooms))
         parts: list[Array] = []
         for _ in range(steps):

@@ -11,20 +11,27 @@ import numpy as np
 
 from topomerge import numpy_nn as nn
 from topomerge.embedding.network import (
+    CROP_CHANNELS,
+    CROP_PART,
     DOOR_KNOT_STEP,
     DOOR_KNOTS,
     ROOM_KNOTS,
     SCORE_BOUND,
+    WAY_LIMIT,
+    WAY_UNIT,
     Network,
     needed,
     pair_tensors,
     tensors,
 )
 from topomerge.embedding.schema import TABLES, column, width
+from topomerge.embedding.surroundings import CROP, CROP_PLANES
 from topomerge.types import Array
 
 SCALED_LIMIT = 5.0  # standard deviations beyond which inputs are cut off (`models.layers.Standardise`)
 COLDEST = 0.02  # least temperature; the largest is 1
+NORM_EPSILON = 1e-5  # added to the variance, as torch does
+FULL_VALUE = 255  # of a pixel
 
 
 class Forward:
@@ -48,6 +55,7 @@ class Forward:
         """
         graph = {name: np.zeros((2, width(name))) for name in tensors(self.network) if name in TABLES}
         graph |= {name: np.array([[0, 1], [1, 0]]) for name in tensors(self.network) if name not in TABLES}
+        graph |= {CROP_PART: np.zeros((2, CROP, CROP, len(CROP_PLANES)), np.uint8)} if CROP_PART in graph else {}
         with np.errstate(all="ignore"):
             embedding, _ = self(graph)
         if embedding.shape[1] != self.network.size:
@@ -66,11 +74,29 @@ class Forward:
         parts = []
         for part in self.network.geometry.parts:
             name = f"geometry.parts.{part}"
+            if part == CROP_PART:
+                parts.append(self._crops(name, graph[part]))
+                continue
             parts.append(self._mlp(f"{name}.each", self._scaled(f"{name}.scale", graph[needed(part)])))
         rooms = self._linear("geometry.out", nn.relu(self._norm("geometry.join.0", np.concatenate(parts, axis=1))))
         if rooms.shape[1] != self.network.geometry.width:
             raise ValueError(f"rooms are {rooms.shape[1]} wide, not {self.network.geometry.width}")
         return rooms
+
+    def _crops(self, name: str, crops: Array) -> Array:
+        """`models.surroundings.SurroundingsEncoder`, in float32: the norms are part of the convolutions."""
+        x = crops.astype(np.float32) / FULL_VALUE
+        for k, wide in enumerate(CROP_CHANNELS):
+            norm = f"{name}.norms.{k}"
+            weight, bias, mean, variance = (
+                self._get(f"{norm}.{which}", (wide,)) for which in ("weight", "bias", "running_mean", "running_var")
+            )
+            factor = weight / np.sqrt(np.maximum(variance, 0) + NORM_EPSILON)
+            kernel = self._get(f"{name}.convolutions.{k}.weight", (wide, x.shape[-1], 3, 3)) * factor[:, None, None, None]
+            rows = kernel.transpose(2, 3, 1, 0).reshape(-1, wide).astype(np.float32)
+            x = nn.convolutions(x, rows, (bias - factor * mean).astype(np.float32), stride=2)
+        flat = x.transpose(0, 3, 1, 2).reshape(len(x), -1).astype(np.float64)
+        return self._linear(f"{name}.out", flat)
 
     def _edges(self, graph: Mapping[str, Array]) -> Array | None:
         """(E, width) of the edges, from their features and the doors beside them."""
@@ -81,6 +107,8 @@ class Forward:
         if node.around:
             distance = np.asarray(graph["edge_attr"], np.float64)[:, column("edge_attr", "distance"), None]
             scaled = np.concatenate([scaled, np.exp(-((distance - np.arange(ROOM_KNOTS)) ** 2))], axis=1)
+        if node.ways:
+            scaled = np.concatenate([scaled, np.clip(graph["edge_way"] / WAY_UNIT, -WAY_LIMIT, WAY_LIMIT)], axis=1)
         edges = nn.relu(self._norm("node.edge.1", self._linear("node.edge.0", scaled)))
         if node.around:
             edges = nn.relu(self._norm("node.edge.4", self._linear("node.edge.3", edges)))

@@ -1,7 +1,8 @@
-"""A trained embedder as what `match`, `merge` and the command line take: a callable map -> (R, D).
+"""A trained embedder as what `match`, `merge` and the command line take: a callable map -> (R, D), or `TurnedRows` where what a
+room looks like depends on how the map is turned.
 
-Networks that read numbers (of rooms, doors and pairs of doors) are run with NumPy (`embedding.forward`): no torch, which takes
-seconds to import. Networks that read points need torch.
+Networks that read numbers (of rooms, doors and pairs of doors) and what stands around a room are run with NumPy
+(`embedding.forward`): no torch, which takes seconds to import. Networks that read points need torch.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ import numpy as np
 from topomerge.embedding.door_layout import door_layout
 from topomerge.embedding.forward import Forward
 from topomerge.embedding.graph import POINTS_PER_ROOM, graph_arrays
-from topomerge.embedding.network import TABLE_PARTS, Network, tensors
+from topomerge.embedding.network import CROP_PART, TABLE_PARTS, Network, tensors
 from topomerge.embedding.point_features import point_features, point_spectra
 from topomerge.embedding.rooms_around import with_rooms_around
+from topomerge.embedding.surroundings import crops, sheet_arrays
+from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls, edge_ways, quarter_turned
 from topomerge.embedding.weights import does_not_fit, read_weights
 from topomerge.errors import InputError
 from topomerge.numpy_nn import softmax
@@ -41,7 +44,7 @@ def load_embedder(path: str | Path | None = None) -> Learned:
         with resources.as_file(resources.files("topomerge.embedding").joinpath("pretrained")) as folder:
             return load_embedder(folder)
     network, weights, about = read_weights(path)
-    if not set(network.geometry.parts) <= set(TABLE_PARTS):
+    if not set(network.geometry.parts) <= {*TABLE_PARTS, CROP_PART}:
         try:  # the networks of torch stand above this package
             embedder: Learned = import_module("topomerge.models.learned").load_with_torch(path)
         except ModuleNotFoundError as error:
@@ -56,7 +59,7 @@ def load_embedder(path: str | Path | None = None) -> Learned:
 
 
 class Learned:
-    """Callable map -> (R, D) float64 of length 1; the same map gives the same rows.
+    """Callable map -> (R, D) float64 of length 1, or `TurnedRows`; the same map gives the same rows.
 
     Args:
         run: arrays of a graph -> embeddings (R, D), dustbins (R,).
@@ -68,7 +71,7 @@ class Learned:
     def __init__(self, run: Run, network: Network, temperature: float, about: Mapping[str, Any] | None = None) -> None:
         self.run, self.network, self.temperature, self.about = run, network, temperature, dict(about or {})
 
-    def __call__(self, map: TopometricMap) -> Array:
+    def __call__(self, map: TopometricMap) -> Rows:
         return self.graph(self.arrays(map))[0]
 
     def matchability(self, map: TopometricMap) -> Array:
@@ -78,13 +81,16 @@ class Learned:
     def probabilities(self, a: TopometricMap, b: TopometricMap) -> tuple[Array, Array]:
         """That each room of a (R_a, R_b + 1) is each of b, in the last place none of them; and of b likewise (R_b, R_a + 1)."""
         (ea, da), (eb, db) = (self.graph(self.arrays(m)) for m in (a, b))
+        ea, eb = aligned(ea, eb)
         logits = ea @ eb.T / self.temperature
         return softmax(np.column_stack([logits, da])), softmax(np.column_stack([logits.T, db]))
 
-    def graph(self, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
-        """Embeddings (R, D) and dustbins (R,), as logits, of what `embedding.graph.graph_arrays` gives."""
+    def graph(self, arrays: Mapping[str, Array]) -> tuple[Rows, Array]:
+        """Embeddings and dustbins (R,), as logits, of what `arrays` gives."""
+        turns = self.network.turns
         if not len(arrays["x"]):
-            return np.zeros((0, self.network.size)), np.zeros(0)
+            none = np.zeros((0, turns, self.network.size))
+            return (none[:, 0] if turns == 1 else TurnedRows(none, np.zeros((0, 2)))), np.zeros(0)
         inputs, names = dict(arrays), tensors(self.network)
         if self.network.node.around:
             inputs |= with_rooms_around(inputs, self.network.node.around)
@@ -92,8 +98,22 @@ class Learned:
         if "near_index" in names and "near_index" not in arrays:
             layout = door_layout(*(arrays[n] for n in ("edge_index", "pos", "edge_pos")))
             inputs |= dict(zip(("near_index", "near_attr"), layout, strict=True))
-        return self.run({name: inputs[name] for name in names})
+        if CROP_PART in names and CROP_PART not in inputs:
+            inputs[CROP_PART] = crops(inputs)
+        if "edge_way" in names:
+            inputs["edge_way"] = edge_ways(inputs)
+        read = {name: inputs[name] for name in names}
+        if turns == 1:
+            return self.run(read)
+        rows, bins = zip(*(self.run(quarter_turned(read, k)) for k in range(turns)), strict=True)
+        return TurnedRows(np.stack(rows, axis=1), along_walls(arrays)), np.mean(bins, axis=0)
+
+    @property
+    def needs_points(self) -> bool:
+        """Does the network read the points of rooms, or what is reckoned from them?"""
+        return bool(set(self.network.geometry.parts) - {"scalars", CROP_PART})
 
     def arrays(self, map: TopometricMap) -> dict[str, Array]:
         """What `graph` takes, of a map."""
-        return graph_arrays(map, POINTS_PER_ROOM if set(self.network.geometry.parts) != {"scalars"} else 1)
+        arrays = graph_arrays(map, POINTS_PER_ROOM if self.needs_points else 1)
+        return arrays if self.network.turns == 1 else arrays | sheet_arrays(map)

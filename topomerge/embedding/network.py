@@ -10,12 +10,15 @@ from topomerge.errors import InputError
 
 TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> table of the graph that it reads
 POINT_PARTS = ("pointnet", "pointnet_local", "voxelcnn")  # these read the points
-GEOMETRY_PARTS = (*TABLE_PARTS, *POINT_PARTS)
+CROP_PART = "surroundings"  # reads the crops about the rooms
+GEOMETRY_PARTS = (*TABLE_PARTS, *POINT_PARTS, CROP_PART)
+CROP_CHANNELS = (16, 32, 64, 128)  # of the convolutions of crops, each of which halves the sides
 GRAPH = ("edge_index", "edge_attr")
 LARGEST_WIDTH = 4096  # more is a mistake, or a file that was made to take all memory
 FARTHEST_AROUND = 100.0  # m
 DOOR_KNOTS, DOOR_KNOT_STEP = 24, 0.5  # bumps of the distance between two doors, and m between them
 ROOM_KNOTS = 11  # of that between two rooms, 1 m apart
+WAY_UNIT, WAY_LIMIT = 5.0, 3.0  # m that ways to neighbours are divided by, and how far they tell then
 SCORE_BOUND = 30.0  # of attention
 NODES = ("none", "sage", "gat")
 JUMPS = ("last", "cat", "max")
@@ -52,6 +55,7 @@ class Node:
         doors: layers over pairs of doors; needs `edges`.
         near: pairs are all doors within 12 m (`embedding.door_layout`), not only those of one room.
         around: m; rooms at most that far away are neighbours, too (`embedding.rooms_around`); 0: by doors only.
+        ways: edges tell in which direction of the building their neighbour and its door are; needs `edges`.
         skip: add what goes into a layer to what comes out.
         jump: what the last layer says, or all of them joined or their maximum (jumping knowledge: Xu et al. 2018).
         width: of edges.
@@ -65,6 +69,7 @@ class Node:
     doors: int = 0
     near: bool = False
     around: float = 0.0
+    ways: bool = False
     skip: bool = True
     jump: str = "cat"
     width: int = 32
@@ -79,10 +84,15 @@ class Network:
     size: int = 64
     dropout: float = 0.1
 
+    @property
+    def turns(self) -> int:
+        """1, or 4 where what a room gets depends on how the map is turned: it gets a row for each quarter turn then."""
+        return 4 if CROP_PART in self.geometry.parts or (self.node.ways and self.node.kind != "none") else 1
+
 
 def needed(part: str) -> str:
     """The tensor of the graph that a part of the geometry reads."""
-    return TABLE_PARTS.get(part, "room_points")
+    return CROP_PART if part == CROP_PART else TABLE_PARTS.get(part, "room_points")
 
 
 def pair_tensors(node: Node) -> tuple[str, ...]:
@@ -94,7 +104,8 @@ def pair_tensors(node: Node) -> tuple[str, ...]:
 
 def tensors(network: Network) -> tuple[str, ...]:
     """Names of the tensors that a network reads."""
-    return (*dict.fromkeys(needed(part) for part in network.geometry.parts), *GRAPH, *pair_tensors(network.node))
+    ways = ("edge_way",) if network.node.ways and network.node.kind != "none" else ()
+    return (*dict.fromkeys(needed(part) for part in network.geometry.parts), *GRAPH, *pair_tensors(network.node), *ways)
 
 
 def check(network: Network) -> None:
@@ -115,6 +126,8 @@ def check(network: Network) -> None:
         raise InputError(f"node.jump: unknown {node.jump!r}; {', '.join(JUMPS)} are possible")
     if node.kind != "none" and not 1 <= node.layers <= 4:
         raise InputError(f"node.layers must be 1 to 4, not {node.layers}")
+    if node.ways and not node.edges:
+        raise InputError("node.ways are features of edges: set node.edges=true")
     if node.doors and not node.edges:
         raise InputError("node.doors are features of edges: set node.edges=true")
     if node.doors and node.around:

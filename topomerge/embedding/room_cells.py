@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from topomerge.embedding.turns import Rows
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap
 
-Descriptor = Callable[[TopometricMap], Array]  # -> (R, D) float64, a row for each room
+Descriptor = Callable[[TopometricMap], Rows]  # -> (R, D) float64, a row for each room; or one for each quarter turn of it
 
 
 def rows_of(labels: Array, count: int) -> list[Array]:

@@ -48,6 +48,12 @@ LAYOUT_FEATURES = (
     "angle_cos",
     "same",  # 1: both lead out of one room
 )
+WAY_FEATURES = (  # in the direction of the walls, in which crops are turned, too
+    "room_x",  # m, from the middle of the first room to that of the second
+    "room_y",
+    "door_x",  # m, to the door between them
+    "door_y",
+)
 THESIS_FEATURES = (
     "points",  # log of 1 + m2: occupied cells times the area of a cell's face
     "planarity",  # (s2 - s3) / s1 of the singular values s
@@ -69,6 +75,7 @@ TABLES = {  # tensor of the graph -> its columns
     "edge_attr": EDGE_FEATURES,
     "door_attr": DOOR_FEATURES,
     "near_attr": LAYOUT_FEATURES,
+    "edge_way": WAY_FEATURES,
     "engineered": THESIS_FEATURES,
     "shapedna": SPECTRUM_FEATURES,
 }

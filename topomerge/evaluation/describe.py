@@ -17,6 +17,7 @@ from topomerge.code_digest import code_digest
 from topomerge.embedding.embedders import EMBEDDERS, embedder
 from topomerge.embedding.learned import POINT_TABLES
 from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.turns import Rows, aligned, numbers
 from topomerge.evaluation.settings import Evaluation, Variant
 from topomerge.io import archive
 from topomerge.io.listing import plain
@@ -35,12 +36,12 @@ class Inputs:
     """What networks read of the maps of a pair: made once, as several read the same; the seconds count for each that reads it."""
 
     def __init__(self) -> None:
-        self.arrays: dict[tuple[int, bool], dict[str, Array]] = {}
-        self.seconds: dict[tuple[int, bool, str], float] = {}
+        self.arrays: dict[tuple[int, bool, bool], dict[str, Array]] = {}
+        self.seconds: dict[tuple[int, bool, bool, str], float] = {}
 
-    def rows(self, learned: Any, side: int, m: TopometricMap) -> tuple[Array, float]:
+    def rows(self, learned: Any, side: int, m: TopometricMap) -> tuple[Rows, float]:
         """Descriptors of a map by a network, and the seconds."""
-        key = (side, set(learned.network.geometry.parts) == {"scalars"})  # which needs no points
+        key = (side, learned.needs_points, learned.network.turns > 1)
         if key not in self.arrays:
             began = time.process_time()
             self.arrays[key] = learned.arrays(m)
@@ -53,7 +54,7 @@ class Inputs:
                 arrays[name] = POINT_TABLES[name](arrays["room_points"])
                 self.seconds[*key, name] = time.process_time() - began
         began = time.process_time()
-        rows = np.asarray(learned.graph(arrays)[0])
+        rows: Rows = learned.graph(arrays)[0]
         spent = sum(self.seconds.get((*key, name), 0.0) for name in ("", *extras))
         return rows, time.process_time() - began + spent
 
@@ -61,11 +62,12 @@ class Inputs:
 def described(
     variant: Variant, maps: Maps, path: Path, settings: Evaluation, inputs: Inputs
 ) -> tuple[tuple[Array, Array], float]:
-    """Descriptors (R, D) of both maps of the pair `path`, and the seconds that making them took."""
+    """Descriptors (R, D) of both maps of the pair `path`, turned as they stand to each other, and the seconds that making them
+    took."""
     if variant.run:
         learned = trained(variant.run)
         (a, first), (b, second) = (inputs.rows(learned, side, m) for side, m in enumerate(maps))
-        return (a, b), first + second
+        return aligned(a, b), first + second
     options = settings.descriptors[variant.descriptor]
     top = max(settings.k) if variant.k and variant.context == "join" else 0
     descriptors, seconds = [], 0.0
@@ -73,7 +75,7 @@ def described(
         shelf = Shelf(Path(settings.cache) / "descriptors", path.with_name(f"{path.stem}{side}.tmap"))
         rows, took = shelf.rows(m, options, top)
         if variant.context == "mean" and variant.k:
-            rows = embedder(_gives(rows), variant.k, "mean")(m)
+            rows = np.asarray(embedder(_gives(rows), variant.k, "mean")(m))
         descriptors.append(rows[:, : rows.shape[1] // (top + 1) * (variant.k + 1)] if top else rows)
         seconds += took
     return (descriptors[0], descriptors[1]), seconds
@@ -111,6 +113,6 @@ class Shelf:
                 rows = describe(m)
             else:
                 rows = embedder(lambda other: lone_rows if other is m else describe(other), steps, "join")(m)
-            archive.write({"rows": rows, "seconds": np.array(took + time.process_time() - began)}, file)
+            archive.write({"rows": numbers(rows), "seconds": np.array(took + time.process_time() - began)}, file)
         data = archive.read(file, "cached descriptors")
         return data["rows"], float(data["seconds"])

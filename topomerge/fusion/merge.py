@@ -13,6 +13,7 @@ import numpy as np
 from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.turns import Rows
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, solve
@@ -30,7 +31,7 @@ from topomerge.fusion.thesis.room_poses import room_poses
 from topomerge.matching.match import match
 from topomerge.matching.odds import match_probability
 from topomerge.matching.result import Matching
-from topomerge.types import Array, Sim3, TopometricMap
+from topomerge.types import Sim3, TopometricMap
 
 
 def merge(
@@ -220,7 +221,7 @@ def _surface_hypotheses(a: TopometricMap, b: TopometricMap, matching: Matching) 
 def _timed(embedder: str | Descriptor, clock: _Clock) -> Descriptor:
     describe = make_embedder(embedder)
 
-    def timed(m: TopometricMap) -> Array:
+    def timed(m: TopometricMap) -> Rows:
         with clock("embed"):
             return describe(m)
 

@@ -5,16 +5,19 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from topomerge.embedding.turns import Rows, aligned
 from topomerge.types import Array
 
 
-def descriptor_costs(a: Array, b: Array, standardise: bool = False) -> Array:
-    """(R_a, R_b) Euclidean distances of the rows of a (R_a, D) and b (R_b, D), over the root of D.
+def descriptor_costs(a: Rows, b: Rows, standardise: bool = False) -> Array:
+    """(R_a, R_b) Euclidean distances of the rows of a (R_a, D) and b (R_b, D), over the root of D; where rooms have a row for
+    each quarter turn, at that which both maps have to each other (`embedding.turns`).
 
     Args:
         standardise: scale each column by its standard deviation over the rooms of both maps first. Rooms that only one map has
             then change the costs of all, so it is not for descriptors that are scaled already.
     """
+    a, b = aligned(a, b)
     if standardise and len(a) + len(b):
         spread = np.concatenate([a, b]).std(axis=0)
         scale = np.where(spread > 1e-9, spread, 1.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.turns import Rows, TurnedRows
 from topomerge.errors import InputError
 from topomerge.matching.assignment import assign
 from topomerge.matching.consistency import hypotheses
@@ -102,16 +103,18 @@ def check(a: TopometricMap, b: TopometricMap) -> None:
         raise InputError(f"{b.source or 'the second map'}: is the same map as {a.source or 'the first'}; give two different maps")
 
 
-def checked(describe: Descriptor, map: TopometricMap) -> Array:
-    """What an embedder gives, if it is a finite row for each room.
+def checked(describe: Descriptor, map: TopometricMap) -> Rows:
+    """What an embedder gives, if it is a finite row for each room, or one for each quarter turn of it.
 
     Raises:
         InputError: it is not.
     """
-    rows = np.asarray(describe(map), np.float64)
-    if rows.ndim != 2 or len(rows) != len(map.rooms) or not np.isfinite(rows).all():
+    given = describe(map)
+    turned = isinstance(given, TurnedRows)
+    rows = np.asarray(given.rows if isinstance(given, TurnedRows) else given, np.float64)
+    if rows.ndim != 2 + turned or len(rows) != len(map.rooms) or not np.isfinite(rows).all():
         raise InputError(f"the embedder must give a finite row for each of {len(map.rooms)} rooms, not {rows.shape}")
-    return rows
+    return replace(given, rows=rows) if isinstance(given, TurnedRows) else rows
 
 
 def marginal(a: TopometricMap, b: TopometricMap, ranked: tuple[PoseHypothesis, ...]) -> tuple[Array, Array]:

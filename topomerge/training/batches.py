@@ -11,13 +11,17 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torch_geometric.data import Batch, Data
 
+from topomerge.embedding.network import CROP_PART
 from topomerge.embedding.schema import column, columns_of_power
+from topomerge.models.embedder import quarter_turned
 from topomerge.models.losses import Truth
 from topomerge.models.yaw import turn
 from topomerge.training.packed import INDICES, Graph, GraphPair
 from topomerge.training.settings import Augment
+from topomerge.training.turned_views import changed_sheet, mirrored, quarters_between, with_views
 
 METRES_PER_MILLIMETRE = 0.001
+ORIENTED = {CROP_PART, "edge_way"}  # tensors that depend on how a map is turned
 DOOR_NOISE = 0.05  # m, of the distance between two doors
 ALIKE_AREAS = 1.5  # areas of two views of a room that both saw most of it differ by less than this factor
 
@@ -105,9 +109,10 @@ def make_batch(
 def map_pair(
     pair: GraphPair, names: Sequence[str], augment: Augment | None = None, generator: torch.Generator | None = None
 ) -> MapPair:
-    """A pair as one graph; see `make_batch`."""
+    """A pair as one graph; see `make_batch`. While training, maps whose turn matters stand alike, and b comes once more, turned
+    wrongly: none of its rooms there is one of a."""
     graphs, rows = [], []
-    for graph, true in zip((pair.a, pair.b), pair.true, strict=True):
+    for graph, true in zip(_viewed(pair, names, augment, generator), pair.true, strict=True):
         tensors = {name: graph[name] for name in {*names, "edge_index"}}
         present = torch.arange(len(true))
         if augment is not None:
@@ -117,24 +122,52 @@ def map_pair(
             tensors["room_points"] = tensors["room_points"].float() * METRES_PER_MILLIMETRE
         graphs.append(tensors)
         rows.append(present)
+    if augment is not None and generator is not None and ORIENTED & set(names):
+        graphs.append(quarter_turned(graphs[1], int(torch.randint(1, 4, (1,), generator=generator))))
     links = torch.zeros((len(pair.true[0]), len(pair.true[1])), dtype=torch.bool)
     links[pair.matches[:, 0], pair.matches[:, 1]] = True
     links = links[rows[0]][:, rows[1]]
     counts = torch.tensor([len(present) for present in rows])
-    edges = graphs[0]["edge_index"].shape[1]
-    offsets = {"edge_index": int(counts[0]), "door_index": edges, "near_index": edges}
-    a, b = graphs
-    tensors = {name: torch.cat([a[name], b[name] + offsets[name]], dim=1) for name in names if name in INDICES}
-    tensors |= {name: torch.cat([a[name], b[name]]) for name in names if name not in INDICES}
+    again = int(counts[1]) * (len(graphs) - len(rows))
+    sides = [torch.repeat_interleave(torch.arange(2), counts), torch.ones(again, dtype=torch.long)]
+    true_rooms = [numbers[present] for numbers, present in zip(pair.true, rows, strict=True)]
+    clear = seen_well(links, pair.a["x"][rows[0]], pair.b["x"][rows[1]])
     return MapPair(
-        **tensors,
-        side=torch.repeat_interleave(torch.arange(2), counts),
-        true=torch.cat([true[present] for true, present in zip(pair.true, rows, strict=True)]),
-        clear=torch.cat(seen_well(links, pair.a["x"][rows[0]], pair.b["x"][rows[1]])),
+        **_joined(graphs, [*counts.tolist(), again], names),
+        side=torch.cat(sides),
+        true=torch.cat([*true_rooms, torch.full((again,), -1)]),
+        clear=torch.cat([*clear, torch.zeros(again, dtype=torch.bool)]),
         match_index=torch.nonzero(links).T + torch.tensor([[0], [int(counts[0])]]),
         room_counts=counts,
-        num_nodes=int(counts.sum()),
+        num_nodes=int(counts.sum()) + again,
     )
+
+
+def _joined(graphs: Sequence[Graph], rooms: Sequence[int], names: Sequence[str]) -> Graph:
+    """Graphs of so many rooms as one of which no edge leads from one to another."""
+    edges = [graph["edge_index"].shape[1] for graph in graphs]
+    first = {"edge_index": rooms, "door_index": edges, "near_index": edges}
+    out = {name: torch.cat([graph[name] for graph in graphs]) for name in names if name not in INDICES}
+    for name in set(names) & set(INDICES):
+        starts = [sum(first[name][:k]) for k in range(len(graphs))]
+        out[name] = torch.cat([graph[name] + start for graph, start in zip(graphs, starts, strict=True)], dim=1)
+    return out
+
+
+def _viewed(
+    pair: GraphPair, names: Sequence[str], augment: Augment | None, generator: torch.Generator | None
+) -> tuple[Graph, Graph]:
+    """Both maps with the tensors that depend on how they are turned, if any are read: as they are, or, while training, changed,
+    turned alike, and both turned and mirrored at random."""
+    if not ORIENTED & set(names):
+        return pair.a, pair.b
+    if augment is None or generator is None:
+        return with_views(pair.a, names), with_views(pair.b, names)
+    a, b = (with_views(changed_sheet(graph, augment.shift, generator), names) for graph in (pair.a, pair.b))
+    more, quarters = torch.randint(0, 4, (2,), generator=generator).tolist()
+    true = quarters_between(pair)
+    a, b = quarter_turned(a, more), quarter_turned(b, more + (quarters if true is None else true))
+    return (mirrored(a), mirrored(b)) if torch.rand((), generator=generator) < 0.5 else (a, b)
 
 
 def seen_well(links: Tensor, a: Tensor, b: Tensor) -> list[Tensor]:
@@ -171,7 +204,7 @@ def changed(graph: Graph, rooms: int, augment: Augment, generator: torch.Generat
     doors = (uniform(half) >= augment.edges * uniform(1)).repeat(2)
     edges = keep[index[0]] & keep[index[1]] & doors
     number, edge_number = keep.cumsum(0) - 1, edges.cumsum(0) - 1
-    rows = {"edge_attr": edges}
+    rows = {"edge_attr": edges, "edge_way": edges}
     out = {"edge_index": number[index[:, edges]]}
     for name in ("door", "near"):
         if f"{name}_index" in graph:

@@ -174,6 +174,7 @@ def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], l
     """Pairs to train on, and to watch; a set is packed by one process while the others wait."""
     extras = [part for part in settings.network.geometry.parts if part in EXTRAS]
     extras += ["near"] if settings.network.node.near else []
+    extras += ["sheet"] if settings.network.turns > 1 else []
     with fabric.rank_zero_first():
         around = settings.network.node.around
         train = load_pairs(_manifest(settings, settings.data), extras, say, settings.limit, around)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array
 
-PACKED_FORMAT = 4
+PACKED_FORMAT = 5
 PAIRS_PER_CHUNK = 100  # pairs; descriptors that take long are stored chunk by chunk
 PACKED_TABLES = ("x", "edge_attr", "door_attr", "pos", "edge_pos")  # no network reads positions: they depend on the frame
 INDICES = ("edge_index", "door_index", "near_index")
@@ -38,6 +38,7 @@ ROWS_OF = {
     "door_index": "doors",
 }  # of the others: rooms
 EXTRAS = ("engineered", "shapedna")
+SHEET = ("sheet", "sheet_room", "anchor", "turn")
 Graph = dict[str, Tensor]
 
 
@@ -73,7 +74,7 @@ def load_pairs(
 
     Args:
         manifest: or a packed file itself.
-        extras: what is wanted, too: of `EXTRAS`, or `near`, the layout of doors.
+        extras: what is wanted, too: of `EXTRAS`, `near`, the layout of doors, or `sheet`, the storeys from above.
         limit: of the first pairs only; 0: all.
         around: m within which rooms are neighbours, too (`embedding.rooms_around`); 0: by doors only.
 
@@ -81,6 +82,8 @@ def load_pairs(
         InputError: no such manifest, or a file is damaged.
     """
     path = Path(manifest)
+    if path.suffix == ".npz" and "sheet" in extras:
+        raise InputError(f"{path}: a packed set holds no storeys from above; give its manifest")
     if path.suffix == ".npz":
         arrays = archive.read(path, "packed set")
         if "transform" not in arrays:
@@ -93,11 +96,49 @@ def load_pairs(
     folder.mkdir(exist_ok=True)
     packed_file = folder / f"{path.stem}-{digest}.npz"
     if not packed_file.exists():
-        say(f"packing {len(names)} pairs")
-        archive.write(_packed([archive.read(path.parent / "pairs" / name, "cached pair") for name in names], rows), packed_file)
+        say(f"packing {len(names)} files")
+        files = [archive.read(path.parent / "pairs" / name, "cached pair") for name in names]
+        archive.write(_packed([p for file, row in zip(files, rows, strict=True) for p in pairs_of(file, row)]), packed_file)
     arrays = archive.read(packed_file, "packed set")
     tables = {name: _extra(name, arrays, packed_file, say, limit) for name in extras if name in EXTRAS}
-    return _with_layout(_unpacked(arrays, tables)[: limit or None], extras, around)
+    pairs = _with_layout(_unpacked(arrays, tables)[: limit or None], extras, around)
+    if "sheet" in extras:
+        _add_sheets(pairs, [path.parent / "pairs" / name for name in names], packed_file, say)
+    return pairs
+
+
+def pairs_of(file: Mapping[str, Array], row: Mapping[str, Any]) -> list[tuple[dict[str, Array], dict[str, Any]]]:
+    """The pairs of a cached file of two or more maps of a building, each with its arrays ("a.…", "b.…", matches, transform) and
+    its row; those of a file of several that share no room are left out."""
+    sides, out = str(row.get("sides", "ab")), []
+    for s, t in itertools.combinations(sides, 2):
+        ending = "" if (s, t) == ("a", "b") else f".{s}{t}"
+        pair = {f"{to}.{n[2:]}": v for side, to in ((s, "a"), (t, "b")) for n, v in file.items() if n.startswith(f"{side}.")}
+        pair |= {name: file[f"{name}{ending}"] for name in ("matches", "transform")}
+        if len(sides) == 2 or len(pair["matches"]):
+            about = {"sensors": [row["sensors"][sides.index(side)] for side in (s, t)]} if len(sides) > 2 else {}
+            out.append((pair, {**row, **about, "sides": s + t}))
+    return out
+
+
+def _add_sheets(pairs: Sequence[GraphPair], files: Sequence[Path], packed_file: Path, say: Callable[[str], None]) -> None:
+    """The storeys of all maps from above (`embedding.surroundings`), packed in chunks, too."""
+    of_file: dict[str, list[GraphPair]] = {}
+    for pair in pairs:
+        of_file.setdefault(str(pair.about["file"]), []).append(pair)
+    for k, first in enumerate(range(0, len(files), PAIRS_PER_CHUNK)):
+        chunk = [file for file in files[first : first + PAIRS_PER_CHUNK] if file.name in of_file]
+        path = packed_file.with_name(f"{packed_file.stem}-sheets-{k}.npz")
+        if chunk and not path.exists():
+            say(f"packing storeys of files {first} to {first + len(chunk)}")
+            read = {file.stem: archive.read(file, "cached pair") for file in chunk}
+            named = {f"{stem}.{n}": v for stem, one in read.items() for n, v in one.items() if n.partition(".")[2] in SHEET}
+            archive.write(named, path)
+        arrays = archive.read(path, "storeys") if chunk else {}
+        for file in chunk:
+            for pair in of_file[file.name]:
+                for side, graph in zip(pair.about["sides"], (pair.a, pair.b), strict=True):
+                    graph.update({name: torch.from_numpy(arrays[f"{file.stem}.{side}.{name}"]) for name in SHEET})
 
 
 def _with_layout(pairs: list[GraphPair], extras: Sequence[str], around: float) -> list[GraphPair]:
@@ -124,8 +165,9 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _packed(pairs: list[dict[str, Array]], rows: list[dict[str, Any]]) -> dict[str, Array]:
+def _packed(pairs_and_rows: list[tuple[dict[str, Array], dict[str, Any]]]) -> dict[str, Array]:
     """All maps behind each other, a0 b0 a1 b1 ..., with how many rooms, edges and pairs of doors each has."""
+    pairs, rows = zip(*pairs_and_rows, strict=True)
     sides = [{n[2:]: v for n, v in pair.items() if n.startswith(f"{s}.")} for pair in pairs for s in "ab"]
     out = {name: np.concatenate([side[name] for side in sides]).astype(np.float32) for name in PACKED_TABLES}
     out |= {name: np.concatenate([side[name] for side in sides], axis=1).astype(np.int32) for name in PACKED_INDICES}
@@ -143,7 +185,7 @@ def _packed(pairs: list[dict[str, Array]], rows: list[dict[str, Any]]) -> dict[s
 
 
 def _short(row: dict[str, Any]) -> dict[str, Any]:
-    columns = ("file", "building", "source", "kind", "sensors", "overlap", "hard", "storeys")
+    columns = ("file", "sides", "building", "source", "kind", "sensors", "overlap", "hard", "storeys")
     return {key: row[key] for key in columns if key in row}
 
 

@@ -28,6 +28,7 @@ class Augment:
         scale: standard deviation of a map's scale, as a logarithm.
         points: of each room that are taken; 0: all.
         noise: m, standard deviation of points.
+        shift: pixels, standard deviation of the middles of rooms on their storeys.
     """
 
     rooms: float = 0.15
@@ -36,6 +37,7 @@ class Augment:
     scale: float = 0.0
     points: int = 256
     noise: float = 0.02
+    shift: float = 2.0
 
 
 @dataclass

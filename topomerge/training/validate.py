@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from topomerge.embedding.rooms_around import through_doors
+from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls
 from topomerge.matching.scores import assign_certain, certainty, has_twin, pair_counts, partner_ranks
 from topomerge.models.embedder import Embedder, match_scores
 from topomerge.training.batches import make_batch, seen_well
@@ -24,17 +25,26 @@ LEAST_CERTAINTIES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)  # certainty of 
 
 @torch.no_grad()
 def embed(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> list[tuple[Tensor, Tensor]]:
-    """(embedding, dustbin) of each map, a0 b0 a1 b1 ..., on the CPU."""
+    """(embedding, dustbin) of each map, a0 b0 a1 b1 ..., on the CPU; where turns matter, b is turned as its rooms tell."""
     training = network.training
     network.eval()
     out: list[tuple[Tensor, Tensor]] = []
     for start in range(0, len(pairs), PAIRS_AT_ONCE):
         batch = make_batch(pairs[start : start + PAIRS_AT_ONCE], network.tensors).to(device)
-        embedding, dustbin = network(batch.tensors)
-        sides = (part.float().cpu().split(batch.rooms) for part in (embedding, dustbin))
-        out += list(zip(*sides, strict=True))
+        embedding, dustbin = network.turned(batch.tensors)
+        rows, bins = (part.float().cpu().split(batch.rooms) for part in (embedding, dustbin))
+        for k, pair in zip(range(0, len(rows), 2), pairs[start : start + PAIRS_AT_ONCE], strict=True):
+            sides = aligned(*(_rows(of.numpy(), graph) for of, graph in zip(rows[k : k + 2], (pair.a, pair.b), strict=True)))
+            out += [(torch.from_numpy(of), bins[k + i]) for i, of in enumerate(sides)]
     network.train(training)
     return out
+
+
+def _rows(rows: Array, graph: Mapping[str, Tensor]) -> Rows:
+    """Of a map, with where its rooms are if they tell turns apart."""
+    if rows.ndim == 2:
+        return rows
+    return TurnedRows(rows, along_walls({name: graph[name].numpy() for name in ("pos", "turn")}))
 
 
 def validate(network: Embedder, pairs: Sequence[GraphPair], device: Any = "cpu") -> dict[str, float]:

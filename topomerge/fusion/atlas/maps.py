@@ -14,10 +14,12 @@ import numpy as np
 from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.turns import Rows
 from topomerge.fusion.prepared import Prepared, prepare
 from topomerge.fusion.refine import Surface, surface
 from topomerge.io.maps import load_map
-from topomerge.types import Array, TopometricMap
+from topomerge.matching.match import checked
+from topomerge.types import TopometricMap
 
 LOADED_AT_ONCE = 3  # maps in memory, of those that are files
 SURFACES_AT_ONCE = 8  # surfaces in memory, for the fine registration
@@ -38,7 +40,7 @@ class Maps:
         self._describe = make_embedder(embedder or DEFAULT)
         self._loaded: OrderedDict[int, TopometricMap] = OrderedDict()
         self._surfaces: OrderedDict[int, Surface] = OrderedDict()
-        self._rows: dict[int, Array] = {}
+        self._rows: dict[int, Rows] = {}
         self._prepared: dict[int, Prepared] = {}
 
     def __len__(self) -> int:
@@ -64,10 +66,10 @@ class Maps:
         """Floor area, m2, of what is known from above."""
         return float(sum(v.plan.explored.sum() * v.plan.edge**2 for v in self.prepared(k).storeys))
 
-    def rows(self, k: int) -> Array:
-        """(R, D) descriptors of the rooms."""
+    def rows(self, k: int) -> Rows:
+        """Descriptors of the rooms."""
         if k not in self._rows:
-            self._rows[k] = np.asarray(self._describe(self[k]), np.float64)
+            self._rows[k] = checked(self._describe, self[k])
         return self._rows[k]
 
 

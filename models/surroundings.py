@@ -1,0 +1,53 @@
+"""Crops about rooms -> a vector each: convolutions that halve the sides until four by four pixels are left.
+
+The vector depends on how a crop is turned. That of a room is reckoned for all four quarter turns (`Embedder.turned`), so that it
+is equivariant to them by construction: a map that was turned by one has the same rows, one place further.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from topomerge.embedding.network import CROP_CHANNELS
+from topomerge.embedding.surroundings import CROP, CROP_PLANES
+
+FULL_VALUE = 255.0  # of a pixel
+
+
+class BatchNorm(nn.Module):
+    """As `torch.nn.BatchNorm2d`, without its count of batches: files of weights hold float32 only, and nothing reads it."""
+
+    running_mean: Tensor
+    running_var: Tensor
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.weight, self.bias = nn.Parameter(torch.ones(channels)), nn.Parameter(torch.zeros(channels))
+        self.register_buffer("running_mean", torch.zeros(channels))
+        self.register_buffer("running_var", torch.ones(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return nn.functional.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, self.training)
+
+
+class SurroundingsEncoder(nn.Module):
+    """Crops (R, CROP, CROP, len(CROP_PLANES)) uint8 -> (R, width)."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        channels = list(pairwise((len(CROP_PLANES), *CROP_CHANNELS)))
+        self.convolutions = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1, bias=False) for a, b in channels)
+        self.norms = nn.ModuleList(BatchNorm(b) for _, b in channels)
+        self.drop = nn.Dropout(dropout)
+        left = CROP >> len(channels)
+        self.out = nn.Linear(left * left * CROP_CHANNELS[-1], width)
+
+    def forward(self, crops: Tensor) -> Tensor:
+        x = crops.permute(0, 3, 1, 2).float() / FULL_VALUE
+        for convolution, norm in zip(self.convolutions, self.norms, strict=True):
+            x = norm(convolution(x)).relu()
+        out: Tensor = self.out(self.drop(x.flatten(1)))
+        return out

@@ -1,0 +1,118 @@
+"""Storeys from above and crops about rooms: where things stand, that turned maps give turned crops, and what is left empty."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from tests.matching.turned_maps import turned
+from tests.scenes_map import building
+from topomerge.embedding.surroundings import (
+    CEILING_UNIT,
+    CROP,
+    CROP_PLANES,
+    SHEET_PIXEL,
+    SHEET_PLANES,
+    crops,
+    sheet,
+    sheet_arrays,
+    wall_direction,
+)
+from topomerge.types import TopometricMap
+
+PLANE = {name: k for k, name in enumerate(CROP_PLANES)}
+
+
+def views(map: TopometricMap) -> np.ndarray:
+    return crops(sheet_arrays(map)).astype(float) / 255
+
+
+def test_a_crop_shows_the_room_in_its_middle_its_walls_and_what_lies_beyond():
+    map = building(2)
+    room = views(map)[0]  # 4 by 5 m, its walls 0.1 m wide about it
+    middle = CROP // 2
+    assert room[middle - 4 : middle + 4, middle - 4 : middle + 4, PLANE["room"]].all()
+    assert room[..., PLANE["room"]].sum() * SHEET_PIXEL**2 == pytest.approx(20.0, rel=0.1)
+    assert room[middle - 8 : middle + 8, :, PLANE["wall"]].sum() > 20
+    floor = room[..., PLANE["floor"]].sum() * SHEET_PIXEL**2
+    assert floor > 2 * 20.0  # of the corridor and the rooms beside it as well
+    assert not room[middle, middle, PLANE["wall"]] and not room[..., PLANE["low"]].any()
+
+
+def test_doors_stand_where_the_edges_are():
+    map = building(1)
+    drawn = sheet(map)
+    planes = drawn.planes[..., SHEET_PLANES.index("door")] > 0
+    middle = np.argwhere(planes).mean(axis=0) + 0.5
+    expected = map.edges["centre"][:, :2].mean(axis=0) - map.rooms["centroid"][0, :2]
+    assert middle - drawn.anchor[0] == pytest.approx(expected / SHEET_PIXEL, abs=0.6)
+
+
+def alike(one: np.ndarray, other: np.ndarray) -> float:
+    """Correlation of two stacks of crops, a little blurred: what lies on the border of two pixels falls into either."""
+    a, b = (ndimage.uniform_filter(x, (1, 3, 3, 1)).ravel() for x in (one, other))
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+@pytest.mark.parametrize("pairs", [1, 2, 3])
+def test_a_map_that_was_turned_has_crops_that_are_turned(pairs):
+    map = building(pairs)
+    other, _ = turned(map, (30.0, -7.0, 2.0))
+    right = [alike(views(other), np.rot90(views(map), k, (1, 2))) for k in range(4)]
+    assert right[1] > 0.97 and right[1] == max(right)
+    assert right[3] < 0.9
+
+
+def test_a_map_that_was_moved_has_the_same_crops():
+    assert alike(views(building(2)), views(building(2, origin=(-31.0, 12.0, 4.5)))) > 0.999
+
+
+def test_no_crop_shows_another_storey():
+    one, two = building(2), building(2, storeys=2)
+    half = len(two.rooms) // 2
+    same = [PLANE[name] for name in ("wall", "floor", "low", "high")]
+    assert alike(views(two)[:half][..., same], views(one)[..., same]) > 0.99
+    upper, lower = views(two)[half:], views(two)[:half]
+    assert alike(upper[..., [PLANE["wall"]]], lower[..., [PLANE["wall"]]]) > 0.99
+
+
+def test_ceilings_tell_their_height():
+    ceiling = views(building(1))[..., PLANE["ceiling"]]
+    heights = ceiling[ceiling > 0] * 255 * CEILING_UNIT
+    assert np.median(heights) == pytest.approx(3.0, abs=0.1)
+    middle = CROP // 2
+    assert (ceiling[:2, middle - 4 : middle + 4, middle - 4 : middle + 4] > 0).all()
+
+
+def test_beyond_the_edge_of_a_map_nothing_is_seen():
+    room = views(building(1))[0]
+    assert not room[: CROP // 2 - 12].any()
+
+
+def test_a_storey_without_walls_stands_as_its_map_does():
+    map = building(1)
+    floor = map.grid.cells[:, 2] == 0
+    flat = replace(map, grid=map.grid.with_cells(map.grid.cells[floor]), room=map.room[floor])
+    drawn = sheet(flat)
+    assert drawn.turn.tolist() == [0.0] and not drawn.planes[..., 0].any()
+    assert crops(sheet_arrays(flat)).shape == (len(map.rooms), CROP, CROP, len(CROP_PLANES))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 0.3, 17.0, 44.9, 45.2, 89.6])
+def test_the_direction_of_walls_is_that_of_most_of_them(degrees):
+    rng = np.random.default_rng(0)
+    along = np.column_stack([rng.uniform(0, 30, 900), np.repeat([0.0, 4.0, 9.0], 300)])
+    across = np.column_stack([np.repeat([2.0, 11.0], 150), rng.uniform(0, 9, 300)])
+    slanted = np.column_stack([rng.uniform(0, 9, 150)] * 2)
+    angle = np.radians(degrees)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    walls = (np.concatenate([along, across, slanted]) + rng.normal(0, 0.02, (1350, 2))) @ turn
+    off = np.degrees(wall_direction(walls)) - degrees
+    assert abs((off + 45) % 90 - 45) < 0.35
+
+
+def test_no_walls_have_no_direction():
+    assert wall_direction(np.zeros((0, 2))) == 0.0

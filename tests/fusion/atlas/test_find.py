@@ -1,0 +1,99 @@
+"""Finding a place in an atlas: the right map and rooms come first, shares sum to one, and what is kept beside it is checked."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import topomerge
+from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
+from topomerge.cli.main import main as cli
+from topomerge.embedding.turns import TurnedRows
+from topomerge.errors import InputError
+from topomerge.fusion.atlas.find import ROOMS_FILE, find, ranked
+from topomerge.fusion.atlas.store import add, remove
+from topomerge.io import archive
+from topomerge.viz.atlas_report import atlas_html
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> Path:
+    add(tmp_path / "house", [(NAMES[0], office_map(0)), ("stranger", stranger())], atlas_html)
+    return tmp_path / "house"
+
+
+def unit_rows(rooms: int, seed: int) -> TurnedRows:
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(rooms, 4, 8))
+    return TurnedRows(rows / np.linalg.norm(rows, axis=2, keepdims=True), rng.uniform(0, 20, (rooms, 2)))
+
+
+def test_rooms_seen_again_and_turned_lead_to_their_map() -> None:
+    maps = [unit_rows(6, k) for k in range(5)]
+    new = TurnedRows(np.roll(maps[3].rows[[4, 1, 5]], 2, axis=1), 3 - maps[3].places[[4, 1, 5]])
+    sightings = ranked(["a", "b", "c", "d", "e"], maps, new, 3)
+    assert sightings[0].name == "d" and len(sightings) == 3
+    assert {(i, j) for i, j, _ in sightings[0].rooms} == {(0, 4), (1, 1), (2, 5)}
+    assert sum(s.share for s in ranked(list("abcde"), maps, new, 5)) == pytest.approx(1.0)
+
+
+def test_plain_rows_and_maps_without_rooms() -> None:
+    rows = [np.eye(4)[:2], np.zeros((0, 4)), np.eye(4)[2:]]
+    sightings = ranked(["a", "none", "b"], rows, np.eye(4)[[3]], 3)
+    assert sightings[0].name == "b" and sightings[0].rooms[0][:2] == (0, 1)
+    assert {s.name: s.share for s in sightings}["none"] == 0.0
+
+
+def test_a_map_of_the_atlas_finds_itself_and_rows_are_kept(house: Path) -> None:
+    first = find(house, office_map(0))
+    assert first[0].name == NAMES[0] and first[0].share > 0.5
+    assert all(i == j for i, j, share in first[0].rooms if share > 0.5)
+    written = (house / ROOMS_FILE).read_bytes()
+    assert find(house, office_map(0)) == first and (house / ROOMS_FILE).read_bytes() == written
+    (house / ROOMS_FILE).unlink()
+    assert find(house, office_map(0)) == first
+
+
+def test_what_the_atlas_loses_is_found_no_more(house: Path) -> None:
+    find(house, office_map(0))
+    remove(house, [NAMES[0]], atlas_html)
+    assert [s.name for s in find(house, office_map(0))] == ["stranger"]
+
+
+def test_a_file_of_rooms_that_is_damaged_or_another_s_is_refused(house: Path, tmp_path: Path) -> None:
+    find(house, office_map(0))
+    path = house / ROOMS_FILE
+    good, arrays = path.read_bytes(), archive.read(path)
+    path.write_bytes(good[:-40])
+    with pytest.raises(InputError, match="rooms.npz: damaged"):
+        find(house, office_map(0))
+    archive.write({**arrays, "embedder": arrays["embedder"][::-1]}, path)
+    with pytest.raises(InputError, match="of another embedder; delete it"):
+        find(house, office_map(0))
+    archive.write({"embedder": arrays["embedder"], "0" * 16: np.zeros((1, 4), np.float32)}, path)
+    with pytest.raises(InputError, match="of another atlas; delete it"):
+        find(house, office_map(0))
+    short = {name: array if name == "embedder" else array[:1] for name, array in arrays.items()}
+    archive.write(short, path)
+    with pytest.raises(InputError, match="does not fit the map"):
+        find(house, office_map(0))
+
+
+def test_empty_atlases_and_maps_without_rooms(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        find(tmp_path / "nowhere", office_map(0))
+
+
+def test_the_command(house: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    topomerge.save_map(office_map(0), tmp_path / "new.tmap")
+    assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("map") and lines[1].startswith(NAMES[0]) and "0 = 0" in lines[1]
+    assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap"), "--json", "--first", "1"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert len(listed) == 1 and listed[0]["name"] == NAMES[0]
+    assert cli(["atlas", "find", str(house)]) == 1
+    assert "name the one map" in capsys.readouterr().err
