@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from topomerge.embedding.network import CROP_PART, GRAPH, TABLE_PARTS, Network, check, needed, pair_tensors, tensors
 from topomerge.embedding.schema import width
 
+QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # cosine and sine of 0 to 3 quarter turns
 POINT_ENCODERS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}
 
 
@@ -120,8 +121,9 @@ def quarter_turned(tensors: Mapping[str, Tensor], turns: int) -> dict[str, Tenso
     if CROP_PART in out:
         out[CROP_PART] = out[CROP_PART].rot90(turns, (1, 2))
     if "edge_way" in out:
-        ways = torch.view_as_complex(out["edge_way"].reshape(len(out["edge_way"]), 2, 2).contiguous())
-        out["edge_way"] = torch.view_as_real(ways * 1j**turns).flatten(1)
+        c, s = QUARTERS[turns % 4]
+        x, y = out["edge_way"].reshape(-1, 2, 2).unbind(dim=2)
+        out["edge_way"] = torch.stack([c * x - s * y, s * x + c * y], dim=2).flatten(1)
     return out
 
 

@@ -25,7 +25,7 @@ from topomerge.datasets.pairs.recipe import SIDES
 from topomerge.datasets.pairs.truth import room_truth, true_matches
 
 from topomerge.embedding.graph import from_arrays, graph_arrays
-from topomerge.embedding.surroundings import sheet_arrays
+from topomerge.embedding.sheets import sheet_arrays
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.io import archive

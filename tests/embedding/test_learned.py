@@ -18,7 +18,7 @@ from topomerge.embedding.graph import graph_arrays
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.embedding.room_cells import joined
-from topomerge.embedding.surroundings import sheet_arrays
+from topomerge.embedding.sheets import sheet_arrays
 from topomerge.embedding.turns import TurnedRows
 from topomerge.embedding.weights import SETTINGS_FILE, WEIGHTS_FILE, embedder_folder, read_weights, unpacked
 from topomerge.errors import InputError
@@ -121,7 +121,7 @@ def test_networks_that_read_points_go_through_torch(torch, tmp_path, monkeypatch
     monkeypatch.setitem(sys.modules, "torch", None)  # as if it were not installed
     with pytest.raises(InputError, match=r"reads points, for which it needs torch: pip install topomerge\[learn\]"):
         load_embedder(tmp_path)
-    assert embedder("learned")(building(1)).shape == (3, 64)
+    assert embedder("learned")(building(1)).shape == (3, 4, 64)
 
 
 def test_torch_is_never_imported():
@@ -202,6 +202,6 @@ def test_what_is_no_safetensors_file_is_refused(data):
 def test_folders_of_an_embedder(tmp_path):
     assert embedder_folder(PRETRAINED / WEIGHTS_FILE) == PRETRAINED == embedder_folder(PRETRAINED)
     network, weights, about = read_weights(PRETRAINED)
-    assert network.geometry.parts == ["scalars"] and len(weights) > 40 and "data" in about
+    assert network.geometry.parts == ["scalars", "surroundings"] and len(weights) > 40 and "data" in about
     with pytest.raises(InputError, match="give a run's folder"):
         load_embedder(tmp_path)

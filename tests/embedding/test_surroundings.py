@@ -10,17 +10,8 @@ from scipy import ndimage
 
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
-from topomerge.embedding.surroundings import (
-    CEILING_UNIT,
-    CROP,
-    CROP_PLANES,
-    SHEET_PIXEL,
-    SHEET_PLANES,
-    crops,
-    sheet,
-    sheet_arrays,
-    wall_direction,
-)
+from topomerge.embedding.sheets import sheet, sheet_arrays, wall_direction
+from topomerge.embedding.surroundings import CEILING_UNIT, CROP, CROP_PLANES, SHEET_PIXEL, SHEET_PLANES, crops
 from topomerge.types import TopometricMap
 
 PLANE = {name: k for k, name in enumerate(CROP_PLANES)}

@@ -9,7 +9,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import torch
-from topomerge.models.embedder import Embedder, match_scores
+from topomerge.models.embedder import Embedder, match_scores, quarter_turned
 from topomerge.models.layers import Standardise
 from topomerge.models.learned import learned
 from topomerge.models.nodes import bumps
@@ -23,8 +23,9 @@ from tests.scenes_map import building
 from topomerge.embedding.door_layout import LAYOUT_REACH, door_layout
 from topomerge.embedding.graph import graph_arrays
 from topomerge.embedding.learned import load_embedder
-from topomerge.embedding.network import GEOMETRY_PARTS, TABLE_PARTS, Geometry, Network, Node, check, network_from
+from topomerge.embedding.network import CROP_PART, GEOMETRY_PARTS, TABLE_PARTS, Geometry, Network, Node, check, network_from
 from topomerge.embedding.rooms_around import through_doors, with_rooms_around
+from topomerge.embedding.turns import quarter_turned as numpy_quarter_turned
 from topomerge.errors import InputError
 
 NODES = [
@@ -40,11 +41,12 @@ NODES += [
     Node("gat", 2, edges=False, edge_values=False),
 ]
 NODES += [Node("gat", 2, doors=2, near=True), Node("gat", 4, skip=False)]
+NODES += [Node("gat", 2, around=10.0, ways=True), Node("sage", 1, ways=True)]
 
 
 def node_name(node: Node) -> str:
     """Of a test: the options by which the nodes above differ."""
-    return f"{node.kind}{node.layers}{node.jump}{node.edges}{node.edge_values}{node.doors}{node.near}{node.around}"
+    return f"{node.kind}{node.layers}{node.jump}{node.edges}{node.edge_values}{node.doors}{node.near}{node.around}{node.ways}"
 
 
 def network(*parts: str, node: Node | None = None, **geometry) -> Embedder:
@@ -62,7 +64,26 @@ def test_the_order_of_rooms_does_not_matter(node):
     assert torch.allclose(a.norm(dim=1), torch.ones(len(a)))
 
 
-@pytest.mark.parametrize("part", GEOMETRY_PARTS)
+def test_a_turned_map_has_the_same_rows_one_place_further():
+    net = network("scalars", "surroundings", node=Node("gat", 2, around=10.0, ways=True))
+    one = graph()
+    with torch.no_grad():
+        (rows, bins), (other, other_bins) = net.turned(one), net.turned(quarter_turned(one, 1))
+        assert torch.allclose(rows.roll(-1, dims=1), other, atol=1e-5) and torch.allclose(bins, other_bins, atol=1e-5)
+        assert (rows[:, 0] - rows[:, 1]).abs().max() > 1e-3
+        assert network().turned(one)[0].ndim == 2
+
+
+def test_four_quarter_turns_are_none_and_numpy_turns_alike():
+    one = {name: tensor for name, tensor in graph().items() if name in ("surroundings", "edge_way")}
+    arrays = {name: tensor.numpy() for name, tensor in one.items()}
+    for turns in range(5):
+        ours, theirs = quarter_turned(one, turns), numpy_quarter_turned(arrays, turns)
+        assert all(np.allclose(ours[name].numpy(), theirs[name], atol=1e-5) for name in one)
+    assert all(torch.equal(quarter_turned(one, 4)[name], one[name]) for name in one)
+
+
+@pytest.mark.parametrize("part", [part for part in GEOMETRY_PARTS if part != CROP_PART])
 def test_yaw(part):
     """Numbers: exactly; points about their longest axis: to 1e-3; points as they are: at the turns that are averaged."""
     one = graph(points=200)
@@ -99,7 +120,7 @@ def test_gradients_reach_every_weight(parts, node):
 
 def test_rooms_without_doors_and_maps_without_rooms():
     one = graph(3)
-    bare = {**one, "edge_index": one["edge_index"][:, :0], "edge_attr": one["edge_attr"][:0]}
+    bare = {**one, "edge_index": one["edge_index"][:, :0], "edge_attr": one["edge_attr"][:0], "edge_way": one["edge_way"][:0]}
     for name in ("door", "near"):
         bare |= {f"{name}_index": one[f"{name}_index"][:, :0], f"{name}_attr": one[f"{name}_attr"][:0]}
     for node in NODES:
@@ -131,6 +152,7 @@ def test_grouping_and_crop_by_hand():
         ({"node": {"layers": 5}}, "node.layers"),
         ({"node": {"doors": 1, "edges": False}}, "node.edges"),
         ({"node": {"doors": 1, "around": 10.0}}, "node.around=0"),
+        ({"node": {"ways": True, "edges": False}}, "node.edges"),
         ({"node": {"around": 1000.0}}, "node.around must be"),
         ({"node": {"heads": 7}}, "geometry.width"),
         ({"node": {"layer": 2}}, "node.layer"),
@@ -270,19 +292,26 @@ def test_check_takes_the_defaults():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("parts", [("scalars",), ("scalars", "pointnet")])
-def test_onnx_agrees(parts, tmp_path):
+@pytest.mark.parametrize(
+    ("parts", "node"),
+    [
+        (("scalars",), Node("gat", doors=1, near=True)),
+        (("scalars", "pointnet"), Node("gat", doors=1, near=True)),
+        (("scalars", "surroundings"), Node("gat", around=10.0, ways=True)),
+    ],
+)
+def test_onnx_agrees(parts, node, tmp_path):
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
     from topomerge.models.onnx import sample, save_onnx
 
-    net = network(*parts, node=Node("gat", doors=1, near=True))
+    net = network(*parts, node=node)
     save_onnx(net, tmp_path / "a.onnx")
     session = runtime.InferenceSession(tmp_path / "a.onnx", providers=["CPUExecutionProvider"])
     for rooms, edges, doors in ((6, 10, 12), (23, 50, 140), (1, 0, 0)):
         tensors = sample(net, rooms, edges, doors, seed=rooms)
         with torch.no_grad():
-            wanted = net(tensors)
+            wanted = net.turned(tensors)
         outputs = session.run(None, {name: tensor.numpy() for name, tensor in tensors.items()})
         for one, other in zip(outputs, wanted, strict=True):
             assert np.abs(one - other.numpy()).max() < 1e-5

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 from topomerge.models.embedder import Embedder
@@ -10,8 +13,12 @@ from torch_geometric.loader import DataLoader
 
 from tests.graphs import pair
 from topomerge.embedding.network import Geometry, Network, Node
+from topomerge.embedding.schema import column
+from topomerge.training import turned_views
 from topomerge.training.batches import ChangedPairs, MapPair, make_batch, map_pair
+from topomerge.training.packed import GraphPair
 from topomerge.training.settings import Augment
+from topomerge.training.turned_views import changed_sheet, mirrored, with_views
 
 
 @pytest.mark.parametrize(
@@ -63,3 +70,57 @@ def test_changes_of_a_pair_depend_on_its_seed_only():
     alone = Batch.from_data_list([again[3], again[1]])
     assert len(first) == 4 and torch.equal(together.x, alone.x) and torch.equal(together.edge_index, alone.edge_index)
     assert not torch.equal(first[0].x[:2], later[0].x[:2])
+
+
+ORIENTED_NAMES = ("x", "edge_index", "edge_attr", "surroundings", "edge_way")
+
+
+def turned_pair(seed: int, quarters: int) -> GraphPair:
+    """A map, and the same rooms in a frame that is turned back by so many quarter turns."""
+    one = pair(seed)
+    a = {**one.a, "anchor": one.a["anchor"].round()}
+    b, side = {**a, "sheet": a["sheet"].rot90(-quarters), "sheet_room": a["sheet_room"].rot90(-quarters)}, len(a["sheet"])
+    for _ in range(-quarters % 4):
+        b["anchor"] = torch.stack([side - b["anchor"][:, 1], b["anchor"][:, 0]], dim=1)
+    turn, angle = torch.eye(4, dtype=torch.float64), quarters * math.pi / 2
+    turn[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    rooms = torch.arange(len(a["x"]))
+    return replace(one, a=a, b=b, matches=torch.stack([rooms, rooms], dim=1), true=(rooms, rooms), transform=turn)
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_maps_are_trained_on_as_they_truly_stand(quarters, monkeypatch):
+    """Both maps have the same crops, turned alike; b comes once more, turned otherwise, with no partner."""
+    monkeypatch.setattr(turned_views, "SEEN_AS", (((), 1.0),))
+    monkeypatch.setattr(turned_views, "PATCHES", 0)
+    nothing = Augment(rooms=0.0, edges=0.0, jitter=0.0, noise=0.0, shift=0.0)
+    one = turned_pair(3, quarters)
+    assert turned_views.quarters_between(one) == quarters
+    batch = map_pair(one, ORIENTED_NAMES, nothing, torch.Generator().manual_seed(1))
+    count = len(one.a["x"])
+    first, second, wrong = batch.surroundings.split(count)
+    assert torch.equal(first, second) and not torch.equal(first, wrong)
+    assert batch.room_counts.tolist() == [count, count] and batch.side.tolist() == [0] * count + [1] * 2 * count
+    assert (batch.true[2 * count :] == -1).all() and not batch["clear"][2 * count :].any()
+    assert (batch.match_index < 2 * count).all() and batch.edge_index.max() >= 2 * count
+
+
+def test_a_mirrored_map_has_mirrored_crops_ways_and_turns():
+    seen = with_views(pair(1).a, ORIENTED_NAMES)
+    other = mirrored(seen)
+    assert torch.equal(other["surroundings"], seen["surroundings"].flip(2))
+    assert torch.equal(other["edge_way"], seen["edge_way"] * torch.tensor([1.0, -1.0, 1.0, -1.0]))
+    sine, cosine = column("edge_attr", "turn_sin"), column("edge_attr", "turn_cos")
+    assert torch.equal(other["edge_attr"][:, sine], -seen["edge_attr"][:, sine])
+    assert torch.equal(other["edge_attr"][:, cosine], seen["edge_attr"][:, cosine])
+    assert all(torch.equal(mirrored(other)[name], seen[name]) for name in ORIENTED_NAMES)
+
+
+def test_what_another_sensor_saw_has_the_same_walls_but_in_patches():
+    one = pair(2).a
+    seen = changed_sheet(one, 2.0, torch.Generator().manual_seed(0))
+    assert seen["sheet"].shape == one["sheet"].shape and not torch.equal(seen["anchor"], one["anchor"])
+    lost = (seen["sheet"][..., 0] != one["sheet"][..., 0]).float().mean()
+    assert lost < 0.35 and (seen["sheet"][..., 0][seen["sheet_room"] == -1] == 0).all()
+    same = changed_sheet(one, 2.0, torch.Generator().manual_seed(0))
+    assert torch.equal(same["sheet"], seen["sheet"])

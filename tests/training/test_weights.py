@@ -37,6 +37,6 @@ def test_each_step_is_a_task_with_its_words(tmp_path: Path, monkeypatch: pytest.
     for task in TASKS:
         weights.make_task(task, tmp_path, ["jobs=2", f"cache={tmp_path}", "export="])
     sets, settings = [a.data.name for a in asked if not hasattr(a, "task")], [a for a in asked if hasattr(a, "task")]  # type: ignore[attr-defined]
-    assert sets == ["train_small", "val_small"] and [s.task for s in settings] == list(TASKS)
-    assert settings[-1].epochs == 14 and settings[-1].network.node.around == 10 and settings[0].jobs == 2
+    assert sets == ["train_walks", "val_small"] and [s.task for s in settings] == list(TASKS)
+    assert settings[-1].epochs == 22 and settings[-1].network.node.around == 10 and settings[0].jobs == 2
     assert all(s.cache == str(tmp_path) and s.export == "" and s.name == s.task for s in settings)

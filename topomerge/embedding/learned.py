@@ -20,7 +20,8 @@ from topomerge.embedding.graph import POINTS_PER_ROOM, graph_arrays
 from topomerge.embedding.network import CROP_PART, TABLE_PARTS, Network, tensors
 from topomerge.embedding.point_features import point_features, point_spectra
 from topomerge.embedding.rooms_around import with_rooms_around
-from topomerge.embedding.surroundings import crops, sheet_arrays
+from topomerge.embedding.sheets import sheet_arrays
+from topomerge.embedding.surroundings import crops
 from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls, edge_ways, quarter_turned
 from topomerge.embedding.weights import does_not_fit, read_weights
 from topomerge.errors import InputError

@@ -1,247 +1,33 @@
 """What stands around a room: its storey seen from above, turned into the direction of the walls, and crops about each room.
 
-All storeys of a map lie on one *sheet* of pixels with an empty strip between them, so that no crop shows two. A crop has a room's
-middle in its own, reaches past the room's borders, and is empty where the map saw nothing. Walls without right angles are turned
-like others, by the direction in which most of them line up; two maps of such a place may be turned by different ones, and
-their crops are hardly alike then.
+All storeys of a map lie on one *sheet* of pixels (`embedding.sheets`) with an empty strip between them, so that no crop shows
+two. A crop has a room's middle in its own, reaches past the room's borders, and is empty where the map saw nothing. Walls without
+right angles are turned like others, by the direction in which most of them line up; two maps of such a place may be turned by
+different ones, and their crops are hardly alike then.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.extraction.plans.storey_plan import (
-    BODY_HEIGHTS,
-    HEIGHT_BANDS,
-    UPRIGHT,
-    USUAL_HEIGHT,
-    WALL_HEIGHTS,
-    WALL_RULE,
-    band_stack,
-    observed_bands,
-    wall_columns,
-)
-from topomerge.kernels.plan import column_bits
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array
 
 SHEET_PIXEL = 0.25  # m
 CROP = 64  # pixels, side of a crop
 GAP = 48  # pixels between two storeys: more than half a crop, that may be shifted
 SHEET_PLANES = ("wall", "floor", "low", "high", "explored", "ceiling", "door")
 CROP_PLANES = (*SHEET_PLANES, "room")  # the room in the middle
-FURNITURE_STEP = 1.0  # m above the floor, between low and high things
-FULL_SHARE = 0.5  # of a pixel's area, from which on it is full: walls are thinner than pixels
 CEILING_UNIT = 0.02  # m over the floor for each step of a pixel's value
-HIGHEST = 5.0  # m over the floor
-BELOW_FLOOR = 0.3  # m
-DOOR_RADIUS = 0.5  # m about a door's middle that is marked
-TURN_STEPS = (np.radians(1.0), np.radians(0.1))  # in which the direction of walls is sought
-MOST_WALLS = 6000  # columns whose direction is taken
 TIE = 1e-3  # pixels: what lies on a border falls to the same side wherever a map's origin is
-BIN = 0.1  # m, into which walls are projected; columns are laid no farther apart
-
-
-@dataclass(frozen=True, eq=False)
-class Sheet:
-    """A map's storeys from above.
-
-    Args:
-        planes: (H, W, len(SHEET_PLANES)) uint8, how much of a pixel is of each kind; "ceiling": its height (`CEILING_UNIT`),
-            0 where none was seen.
-        room: (H, W) int16 room whose floor it is, -1 none.
-        anchor: (R, 2) float32 pixels, middle of each room.
-        turn: (S,) float64 rad, direction of each storey's walls in the map's frame: that of the lowest in [0, pi/2), those of the
-            others no more than pi/4 away from it.
-    """
-
-    planes: Array
-    room: Array
-    anchor: Array
-    turn: Array
-
-
-def sheet(map: TopometricMap) -> Sheet:
-    """The sheet of a map; the same map gives the same one."""
-    storeys: list[Sheet] = []
-    for s in range(len(map.storeys)):
-        storeys.append(_storey(map, s, storeys[0].turn[0] if storeys else np.pi / 4))
-    height = sum(len(s.room) + GAP for s in storeys)
-    width = max((s.room.shape[1] for s in storeys), default=0)
-    planes, room = np.zeros((height, width, len(SHEET_PLANES)), np.uint8), np.full((height, width), -1, np.int16)
-    anchor, row = np.zeros((len(map.rooms), 2), np.float32), 0
-    for s, storey in enumerate(storeys):
-        nx, ny = storey.room.shape
-        planes[row : row + nx, :ny], room[row : row + nx, :ny] = storey.planes, storey.room
-        of = map.rooms["storey"] == s
-        anchor[of] = storey.anchor[of] + (row, 0)
-        row += nx + GAP
-    return Sheet(planes, room, anchor, np.array([s.turn[0] for s in storeys]))
-
-
-def sheet_arrays(map: TopometricMap) -> dict[str, Array]:
-    """The sheet of a map by the names that it has among the tensors of a graph."""
-    drawn = sheet(map)
-    return {"sheet": drawn.planes, "sheet_room": drawn.room, "anchor": drawn.anchor, "turn": drawn.turn}
-
-
-def _storey(map: TopometricMap, storey: int, near: float) -> Sheet:
-    """One storey by itself, turned by the direction of its walls that is no more than pi/4 from another, rad; anchors of other
-    storeys' rooms mean nothing."""
-    grid, nav = map.grid, map.navigable
-    floor, limit = _levels(map, storey)
-    ix, iy = np.ascontiguousarray(grid.cells[:, :2].T.astype(np.int64))
-    z = grid.origin[2] + (grid.cells[:, 2] + 0.5) * grid.edge - floor
-    z = np.where((z > -BELOW_FLOOR) & (z < limit), z, np.nan)
-    shape = grid.shape[:2]
-    profile = column_bits(ix, iy, z, np.zeros(shape), -HEIGHT_BANDS.below * HEIGHT_BANDS.step, HEIGHT_BANDS.step)
-    filled = band_stack(profile, HEIGHT_BANDS, WALL_HEIGHTS)
-    wall = wall_columns(filled[observed_bands(filled)], WALL_RULE)
-    low, high = (_between(profile, *h) & ~wall for h in ((BODY_HEIGHTS[0], FURNITURE_STEP), (FURNITURE_STEP, BODY_HEIGHTS[1])))
-    above = np.full(shape, -np.inf)
-    roof = z >= UPRIGHT
-    np.maximum.at(above, (ix[roof], iy[roof]), z[roof])
-    turn = wall_direction(_middles(grid.origin, np.argwhere(wall), grid.edge))
-    turn = near + (turn - near + np.pi / 4) % (np.pi / 2) - np.pi / 4
-    kinds = [_points(grid.origin, np.argwhere(mask), grid.edge, turn) for mask in (wall, low, high, profile > 0)]
-    ceilings = np.argwhere(np.isfinite(above) & ~wall)
-    inside = np.flatnonzero((map.navigable_room >= 0) & (map.rooms["storey"][np.maximum(map.navigable_room, 0)] == storey))
-    ground = _points(nav.origin, nav.cells[inside, :2], nav.edge, turn)
-    label = np.repeat(map.navigable_room[inside], len(ground) // max(len(inside), 1))
-    every = np.concatenate([kinds[3], ground]) if len(kinds[3]) + len(ground) else np.zeros((1, 2))
-    size = tuple((np.floor(np.ptp(every, axis=0) / SHEET_PIXEL) + 1).astype(int).tolist())
-    middle = (every.min(axis=0) + every.max(axis=0)) / 2  # so a turned map has the same pixels, turned
-    corner = middle - np.array(size) * SHEET_PIXEL / 2
-    raster = _Raster(corner, size)
-    share = [raster.share(points, _spacing(grid.edge)) for points in kinds]
-    out = [share[0], raster.share(ground, _spacing(nav.edge)), *share[1:]]
-    roofs = _points(grid.origin, ceilings, grid.edge, turn)
-    heights = np.repeat(above[tuple(ceilings.T)], len(roofs) // max(len(ceilings), 1))
-    out.append(np.minimum(raster.mean(roofs, heights) / CEILING_UNIT, 255).round())
-    out.append(255 * raster.near(_turned(_doors(map, storey), turn), DOOR_RADIUS))
-    anchor = (_turned(map.rooms["centroid"][:, :2], turn) - corner) / SHEET_PIXEL
-    planes = np.stack(out, axis=-1).astype(np.uint8)
-    return Sheet(planes, raster.label(ground, label), anchor.astype(np.float32), np.array([turn]))
-
-
-def _levels(map: TopometricMap, storey: int) -> tuple[float, float]:
-    """Height of a storey's floor, m, and how far above it the storey ends."""
-    row = map.storeys[storey]
-    floor = float(row["floor"]) if np.isfinite(row["floor"]) else float(row["ceiling"]) - USUAL_HEIGHT
-    above = map.storeys["floor"][map.storeys["floor"] > floor + UPRIGHT]
-    return floor, min(float(above.min()) - floor - map.grid.edge, HIGHEST) if len(above) else HIGHEST
-
-
-def _between(profile: Array, low: float, high: float) -> Array:
-    out: Array = (profile & profile.dtype.type(HEIGHT_BANDS.mask(low, high))) != 0
-    return out
-
-
-def _doors(map: TopometricMap, storey: int) -> Array:
-    """(n, 2) m, middles of the doors of a storey's rooms."""
-    centres: Array = map.edges["centre"][(map.rooms["storey"][map.edges["rooms"]] == storey).any(axis=1), :2]
-    return centres
-
-
-def wall_direction(walls: Array) -> float:
-    """The direction in [0, pi/2), rad, along which walls (n, 2), m, line up: that in which they fall into the fewest, fullest
-    bins of both axes; 0 without any."""
-    if not len(walls):
-        return 0.0
-    walls = walls[np.linspace(0, len(walls) - 1, min(len(walls), MOST_WALLS)).astype(int)]
-    walls = walls - walls.mean(axis=0)
-    best, around = 0.0, np.pi / 4
-    for step in TURN_STEPS:
-        turns = best + np.arange(-round(around / step), round(around / step)) * step
-        best = float(turns[int(np.argmax([_sharpness(walls, float(turn)) for turn in turns]))])
-        around = step
-    return best % (np.pi / 2)
-
-
-def _sharpness(walls: Array, turn: float) -> float:
-    """Sum of squares of how many walls fall into each bin of both axes; bins are blurred, so that none is cut in two."""
-    total = 0.0
-    for values in _turned(walls, turn).T:
-        counts = np.bincount(np.floor((values - values.min()) / BIN).astype(np.int64)).astype(float)
-        total += float((counts**2).sum() + (counts[1:] * counts[:-1]).sum())
-    return total
-
-
-def _turned(points: Array, turn: float) -> Array:
-    """Points (n, 2) of the map's frame in that of its walls."""
-    c, s = np.cos(turn), np.sin(turn)
-    out: Array = points @ np.array([[c, -s], [s, c]])
-    return out
-
-
-def _middles(origin: Array, columns: Array, edge: float) -> Array:
-    out: Array = origin[:2] + (columns + 0.5) * edge
-    return out
-
-
-def _spacing(edge: float) -> float:
-    return edge / max(int(np.ceil(edge / BIN - 1e-6)), 1)
-
-
-def _points(origin: Array, columns: Array, edge: float, turn: float) -> Array:
-    """Points of columns (n, 2), no farther apart than `BIN`, in the frame of the walls: those of a column behind each other."""
-    spacing = _spacing(edge)
-    steps = (np.arange(round(edge / spacing)) + 0.5) * spacing - edge / 2
-    grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    return _turned((_middles(origin, columns, edge)[:, None] + grid[None]).reshape(-1, 2), turn)
-
-
-@dataclass(frozen=True, eq=False)
-class _Raster:
-    """Pixels from a corner (2,), m, on."""
-
-    corner: Array
-    size: tuple[int, int]
-
-    def pixel(self, points: Array) -> Array:
-        """(n,) number of the pixel of each point."""
-        x, y = np.floor((points - self.corner) / SHEET_PIXEL + TIE).astype(np.int64).T
-        return np.asarray(np.clip(x, 0, self.size[0] - 1) * self.size[1] + np.clip(y, 0, self.size[1] - 1))
-
-    def count(self, points: Array, weight: Array | None = None) -> Array:
-        """Points in each pixel, or the sum of their weights."""
-        return np.bincount(self.pixel(points), weight, self.size[0] * self.size[1]).reshape(self.size)
-
-    def share(self, points: Array, spacing: float) -> Array:
-        """0 to 255: how much of a pixel points cover that stand so far apart."""
-        return np.minimum(self.count(points) * (spacing / SHEET_PIXEL) ** 2 / FULL_SHARE, 1.0) * 255
-
-    def mean(self, points: Array, values: Array) -> Array:
-        """Mean of the values of its points; 0 where there is none."""
-        return np.asarray(self.count(points, values) / np.maximum(self.count(points), 1))
-
-    def near(self, points: Array, radius: float) -> Array:
-        """(size) bool: which pixels' middles are no farther from any of a few points."""
-        out = np.zeros(self.size, bool)
-        middles = [self.corner[k] + (np.arange(n) + 0.5) * SHEET_PIXEL for k, n in enumerate(self.size)]
-        for x, y in points:
-            out |= (middles[0][:, None] - x) ** 2 + (middles[1][None] - y) ** 2 <= radius**2
-        return out
-
-    def label(self, points: Array, labels: Array) -> Array:
-        """(size) int16 label that most points of a pixel have; -1 where there is none."""
-        out = np.full(self.size[0] * self.size[1], -1, np.int16)
-        if len(points):
-            count = int(labels.max()) + 1
-            pair, votes = np.unique(self.pixel(points) * count + labels, return_counts=True)
-            order = np.argsort(votes, kind="stable")  # the last one written has most votes
-            pixel, label = np.divmod(pair[order], count)
-            out[pixel] = label
-        return out.reshape(self.size)
 
 
 def crops(map_sheet: Mapping[str, Array]) -> Array:
     """(R, CROP, CROP, len(CROP_PLANES)) uint8: the surroundings of each room.
 
     Args:
-        map_sheet: what `sheet_arrays` gave.
+        map_sheet: what `sheets.sheet_arrays` gave.
     """
     planes, room, anchor = (map_sheet[name] for name in ("sheet", "sheet_room", "anchor"))
     half = CROP // 2

@@ -26,7 +26,7 @@ class TurnedRows:
 
     Args:
         rows: (R, 4, D) of length 1 each.
-        places: (R, 2) m, middles of the rooms; both in the direction of the map's walls (`surroundings.Sheet.turn`).
+        places: (R, 2) m, middles of the rooms; both in the direction of the map's walls (`sheets.Sheet.turn`).
     """
 
     rows: Array

@@ -19,8 +19,8 @@ from topomerge.io.atomic import replacing
 from topomerge.training.tasks import TASKS, settings_of, train
 
 RUNS = Path("runs/weights")
-SHIPPED = {"embedding": ["experiment=gat_around", "data.pairs=400", "epochs=14", "batch=8"]}  # words beside the defaults
-SETS = {"embedding": ("train_small data.pairs=400", "val_small")}  # that are built before
+SHIPPED = {"embedding": ["experiment=surroundings"]}  # words beside the defaults
+SETS = {"embedding": ("train_walks", "val_small")}  # that are built before
 
 
 def main(words: Sequence[str]) -> int:
