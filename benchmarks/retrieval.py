@@ -63,9 +63,7 @@ def searches(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]])
         sightings = ranked(names, [a for a, _ in rows], rows[k][1], len(pairs))
         seconds = time.process_time() - began
         rank = next(n for n, s in enumerate(sightings, 1) if of[int(s.name)] == of[k])
-        best: dict[int, int] = {}
-        for new, room, _ in next(s for s in sightings if s.name == str(k)).rooms:
-            best.setdefault(new, room)
+        best = {new: room for new, room, _ in next(s for s in sightings if s.name == str(k)).rooms}
         true = {(int(i), int(j)) for i, j in pair.matches}
         with_partner = sorted({j for _, j in true})
         right = [(best.get(j), j) in true for j in with_partner]

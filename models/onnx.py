@@ -17,7 +17,7 @@ from topomerge.embedding.surroundings import CROP, CROP_PLANES
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 
-SHAPES = {name: (len(columns),) for name, columns in TABLES.items()}  # of each row
+SHAPES: dict[str, tuple[int, ...]] = {name: (len(columns),) for name, columns in TABLES.items()}  # of each row
 SHAPES |= {"room_points": (POINTS_PER_ROOM, 3), CROP_PART: (CROP, CROP, len(CROP_PLANES))}
 ONNX_OPSET = 18
 

@@ -28,7 +28,6 @@ from topomerge.types import Array, TopometricMap
 
 ROOMS_FILE = "rooms.npz"
 SHARPNESS = 25.0  # that a cosine is multiplied with: a room that is more alike by .1 gets twelve times the vote
-LIKELY_SHARE = 0.2  # of a room's vote, from which on a room of the atlas is named
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,8 @@ class Sighting:
     Args:
         name: of the map in the atlas.
         share: of the votes of the new map's rooms; over all maps of the atlas they sum to 1.
-        rooms: (room of the new map, room of this one, share of the first one's vote), most alike first.
+        rooms: (room of the new map, room of this one, cosine of their rows), most alike first: rooms that are each other's most
+            alike one in the other map.
     """
 
     name: str
@@ -71,17 +71,23 @@ def ranked(names: Sequence[str], rows: Sequence[Rows], new: Rows, number: int) -
     weight = [np.exp(SHARPNESS * (cosine - 1)) for cosine in alike]
     total = np.maximum(np.sum([w.sum(axis=1) for w in weight], axis=0), 1e-300)
     sightings = []
-    for name, w in zip(names, weight, strict=True):
-        votes = w / total[:, None]
-        order = np.argsort(-votes, axis=None, kind="stable")
-        pairs = [(*divmod(int(k), votes.shape[1]), float(votes.flat[k])) for k in order if votes.flat[k] >= LIKELY_SHARE]
-        sightings.append(Sighting(name, float(votes.sum() / len(new)), tuple(pairs)))
+    for name, w, cosine in zip(names, weight, alike, strict=True):
+        sightings.append(Sighting(name, float((w / total[:, None]).sum() / len(new)), _mutual(cosine)))
     return tuple(sorted(sightings, key=lambda s: -s.share)[:number])
+
+
+def _mutual(cosine: Array) -> tuple[tuple[int, int, float], ...]:
+    """Rooms (R_new, R) that are each other's most alike one, and how alike; most alike first."""
+    if not cosine.size:
+        return ()
+    best, back = cosine.argmax(axis=1), cosine.argmax(axis=0)
+    pairs = [(i, j, float(cosine[i, j])) for i, j in enumerate(best.tolist()) if back[j] == i]
+    return tuple(sorted(pairs, key=lambda pair: -pair[2]))
 
 
 def _cosines(new: Rows, rows: Rows) -> Array:
     """(R_new, R) how alike rooms are."""
-    a, b = aligned(new, rows)
+    a, b = (side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12) for side in aligned(new, rows))
     out: Array = a @ b.T
     return out
 
