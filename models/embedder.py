@@ -14,8 +14,9 @@ from topomerge.models.voxelcnn import VoxelCNN
 from topomerge.models.yaw import Turned
 from torch import Tensor, nn
 
-from topomerge.embedding.network import CROP_PART, GRAPH, TABLE_PARTS, Network, check, needed, pair_tensors, tensors
+from topomerge.embedding.network import GRAPH, TABLE_PARTS, Network, check, needed, pair_tensors, tensors
 from topomerge.embedding.schema import width
+from topomerge.embedding.surroundings import CROP_PART
 
 QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # cosine and sine of 0 to 3 quarter turns
 POINT_ENCODERS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}

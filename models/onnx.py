@@ -11,9 +11,8 @@ from topomerge.models.embedder import Embedder
 from torch import Tensor, nn
 
 from topomerge.embedding.graph import POINTS_PER_ROOM
-from topomerge.embedding.network import CROP_PART
 from topomerge.embedding.schema import TABLES
-from topomerge.embedding.surroundings import CROP, CROP_PLANES
+from topomerge.embedding.surroundings import CROP, CROP_PART, CROP_PLANES
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 

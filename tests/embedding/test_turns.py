@@ -9,8 +9,8 @@ from tests.matching.turned_maps import turned
 from tests.scenes_map import building
 from topomerge.embedding.context import with_context
 from topomerge.embedding.graph import graph_arrays
-from topomerge.embedding.network import CROP_PART as CROP
 from topomerge.embedding.sheets import sheet_arrays
+from topomerge.embedding.surroundings import CROP_PART as CROP
 from topomerge.embedding.surroundings import crops
 from topomerge.embedding.turns import TurnedRows, aligned, edge_ways, quarter_turned, quarters_between
 from topomerge.errors import InputError

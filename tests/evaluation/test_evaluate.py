@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,11 +98,11 @@ def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
 
 
 def test_runs_are_called_by_what_they_are_made_of() -> None:
-    run = "topomerge/embedding/pretrained"
-    assert run_title(run) == "scalars, gat around, infonce"
+    run, title = "topomerge/embedding/pretrained", "scalars + surroundings, gat around ways, infonce"
+    assert run_title(run) == title
     settings = Evaluation(SMALL, run=[run], titles=True, mergers=[])
-    assert [v.name for v in variants(settings)] == ["scalars, gat around, infonce"] == list(prediction_settings(settings)["run"])
-    with pytest.raises(InputError, match="two are called 'scalars, gat around, infonce'"):
+    assert [v.name for v in variants(settings)] == [title] == list(prediction_settings(settings)["run"])
+    with pytest.raises(InputError, match=re.escape(f"two are called '{title}'")):
         check(replace(settings, run=[run, f"{run}/embedder.json"]))
 
 

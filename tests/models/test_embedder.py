@@ -23,8 +23,9 @@ from tests.scenes_map import building
 from topomerge.embedding.door_layout import LAYOUT_REACH, door_layout
 from topomerge.embedding.graph import graph_arrays
 from topomerge.embedding.learned import load_embedder
-from topomerge.embedding.network import CROP_PART, GEOMETRY_PARTS, TABLE_PARTS, Geometry, Network, Node, check, network_from
+from topomerge.embedding.network import GEOMETRY_PARTS, TABLE_PARTS, Geometry, Network, Node, check, network_from
 from topomerge.embedding.rooms_around import through_doors, with_rooms_around
+from topomerge.embedding.surroundings import CROP_PART
 from topomerge.embedding.turns import quarter_turned as numpy_quarter_turned
 from topomerge.errors import InputError
 

@@ -12,7 +12,6 @@ import numpy as np
 from topomerge import numpy_nn as nn
 from topomerge.embedding.network import (
     CROP_CHANNELS,
-    CROP_PART,
     DOOR_KNOT_STEP,
     DOOR_KNOTS,
     ROOM_KNOTS,
@@ -25,7 +24,7 @@ from topomerge.embedding.network import (
     tensors,
 )
 from topomerge.embedding.schema import TABLES, column, width
-from topomerge.embedding.surroundings import CROP, CROP_PLANES
+from topomerge.embedding.surroundings import CROP, CROP_PART, CROP_PLANES
 from topomerge.types import Array
 
 SCALED_LIMIT = 5.0  # standard deviations beyond which inputs are cut off (`models.layers.Standardise`)

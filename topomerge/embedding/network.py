@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
+from topomerge.embedding.surroundings import CROP_PART
 from topomerge.errors import InputError
 
 TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> table of the graph that it reads
 POINT_PARTS = ("pointnet", "pointnet_local", "voxelcnn")  # these read the points
-CROP_PART = "surroundings"  # reads the crops about the rooms
 GEOMETRY_PARTS = (*TABLE_PARTS, *POINT_PARTS, CROP_PART)
 CROP_CHANNELS = (16, 32, 64, 128)  # of the convolutions of crops, each of which halves the sides
 GRAPH = ("edge_index", "edge_attr")

@@ -14,6 +14,7 @@ import numpy as np
 
 from topomerge.types import Array
 
+CROP_PART = "surroundings"  # part of a geometry that reads crops, and the name of the crops among the tensors of a graph
 SHEET_PIXEL = 0.25  # m
 CROP = 64  # pixels, side of a crop
 GAP = 48  # pixels between two storeys: more than half a crop, that may be shifted

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.embedding.network import CROP_PART
+from topomerge.embedding.surroundings import CROP_PART
 from topomerge.types import Array
 
 QUARTERS = 4

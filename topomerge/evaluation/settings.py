@@ -158,14 +158,20 @@ def run_title(run: str) -> str:
     """What a run is made of: geometry, node encoder, loss, and the seed if it is not 0.
 
     Node encoders: `bare` has no features of edges, `paper` has them in the attention only, `doors` pairs of doors, `around` the
-    rooms nearby.
+    rooms nearby, `ways` in which direction they are.
 
     Raises:
         InputError: no trained embedder there.
     """
     network, _, about = read_weights(run)
     node = network.node
-    features = {"bare": not node.edges, "paper": not node.edge_values, "doors": node.doors, "around": node.around}
+    features = {
+        "bare": not node.edges,
+        "paper": not node.edge_values,
+        "doors": node.doors,
+        "around": node.around,
+        "ways": node.ways,
+    }
     words = [node.kind, *(word for word, so in features.items() if so and node.kind != "none")]
     seed = f", seed {about['seed']}" if about.get("seed") else ""
     return f"{' + '.join(network.geometry.parts)}, {' '.join(words)}, {about.get('loss', 'infonce')}{seed}"

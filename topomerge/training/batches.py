@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torch_geometric.data import Batch, Data
 
-from topomerge.embedding.network import CROP_PART
 from topomerge.embedding.schema import column, columns_of_power
+from topomerge.embedding.surroundings import CROP_PART
 from topomerge.models.embedder import quarter_turned
 from topomerge.models.losses import Truth
 from topomerge.models.yaw import turn

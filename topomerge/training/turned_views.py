@@ -8,9 +8,8 @@ from collections.abc import Sequence
 
 import torch
 
-from topomerge.embedding.network import CROP_PART
 from topomerge.embedding.schema import column
-from topomerge.embedding.surroundings import SHEET_PLANES, crops
+from topomerge.embedding.surroundings import CROP_PART, SHEET_PLANES, crops
 from topomerge.embedding.turns import edge_ways
 from topomerge.training.packed import Graph, GraphPair
 
