@@ -87,6 +87,14 @@ def test_empty_atlases_and_maps_without_rooms(tmp_path: Path) -> None:
         find(tmp_path / "nowhere", office_map(0))
 
 
+def test_an_atlas_that_may_only_be_read_is_looked_through(house: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(arrays: object, path: Path) -> None:
+        raise InputError(f"{path}: can't be written")
+
+    monkeypatch.setattr(archive, "write", refused)
+    assert find(house, office_map(0))[0].name == NAMES[0] and not (house / ROOMS_FILE).exists()
+
+
 def test_the_command(house: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     topomerge.save_map(office_map(0), tmp_path / "new.tmap")
     assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap")]) == 0
@@ -95,5 +103,7 @@ def test_the_command(house: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap"), "--json", "--first", "1"]) == 0
     listed = json.loads(capsys.readouterr().out)
     assert len(listed) == 1 and listed[0]["name"] == NAMES[0]
+    assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap"), "--first", "0"]) == 1
+    assert "must be 1 or more" in capsys.readouterr().err
     assert cli(["atlas", "find", str(house)]) == 1
     assert "name the one map" in capsys.readouterr().err

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,8 +54,11 @@ def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sight
         number: of maps, at most.
 
     Raises:
-        InputError: no atlas, one without maps or whose `rooms.npz` is damaged or of another embedder, or a map without rooms.
+        InputError: no atlas, one without maps or whose `rooms.npz` is damaged or of another embedder, a map without rooms, or a
+            number below 1.
     """
+    if number < 1:
+        raise InputError(f"the number of maps to name must be 1 or more, not {number}")
     stored = read_atlas(folder)
     if not stored.entries:
         raise InputError(f"{folder}: holds no maps yet; add some with `topomerge atlas add {folder} MAP ...`")
@@ -120,7 +124,8 @@ def _rows(stored: Stored, name: str) -> list[Rows]:
         if not fits or len(rows[entry.key]) != entry.rooms or not all(np.isfinite(of).all() for of in rows.values()):
             raise InputError(f"{path}: does not fit the map {entry.name}; {advice}")
     if set(rows) != set(written):
-        archive.write({"embedder": signature, **rows}, path)
+        with suppress(InputError):  # an atlas that may only be read is looked through all the same
+            archive.write({"embedder": signature, **rows}, path)
     return [_read(rows, e.key) for e in stored.entries]
 
 
