@@ -78,7 +78,30 @@ def _storey(map: TopometricMap, storey: int, near: float) -> Sheet:
     """One storey by itself, turned by the direction of its walls that is no more than pi/4 from another, rad; anchors of other
     storeys' rooms mean nothing."""
     grid, nav = map.grid, map.navigable
-    floor, limit = _levels(map, storey)
+    masks, ceiling = _columns(map, storey)
+    turn = wall_direction(_middles(grid.origin, np.argwhere(masks[0]), grid.edge))
+    turn = near + (turn - near + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    wall, low, high, explored = (_points(grid.origin, np.argwhere(mask), grid.edge, turn) for mask in masks)
+    inside = np.flatnonzero((map.navigable_room >= 0) & (map.rooms["storey"][np.maximum(map.navigable_room, 0)] == storey))
+    ground = _points(nav.origin, nav.cells[inside, :2], nav.edge, turn)
+    label = np.repeat(map.navigable_room[inside], len(ground) // max(len(inside), 1))
+    raster = _raster(np.concatenate([explored, ground]))
+    shares = [raster.share(points, _spacing(grid.edge)) for points in (wall, low, high, explored)]
+    columns = np.argwhere(np.isfinite(ceiling))
+    roofs = _points(grid.origin, columns, grid.edge, turn)
+    heights = np.repeat(ceiling[tuple(columns.T)], len(roofs) // max(len(columns), 1))
+    ceilings = np.minimum(raster.mean(roofs, heights) / CEILING_UNIT, 255).round()
+    doors = 255 * raster.near(_turned(_doors(map, storey), turn), DOOR_RADIUS)
+    planes = np.stack([shares[0], raster.share(ground, _spacing(nav.edge)), *shares[1:], ceilings, doors], axis=-1)
+    anchor = (_turned(map.rooms["centroid"][:, :2], turn) - raster.corner) / SHEET_PIXEL
+    rooms = raster.label(ground, label, np.column_stack([map.rooms["centroid"], map.rooms["area"]]))
+    return Sheet(planes.astype(np.uint8), rooms, anchor.astype(np.float32), np.array([turn]))
+
+
+def _columns(map: TopometricMap, storey: int) -> tuple[tuple[Array, ...], Array]:
+    """Which columns (nx, ny) of a storey's cells are walls, low things, high things, and seen at all; and how high above the
+    floor, m, the highest cell of each stands that may be a ceiling, -inf where none does."""
+    grid, (floor, limit) = map.grid, _levels(map, storey)
     ix, iy = np.ascontiguousarray(grid.cells[:, :2].T.astype(np.int64))
     z = grid.origin[2] + (grid.cells[:, 2] + 0.5) * grid.edge - floor
     z = np.where((z > -BELOW_FLOOR) & (z < limit), z, np.nan)
@@ -87,30 +110,9 @@ def _storey(map: TopometricMap, storey: int, near: float) -> Sheet:
     filled = band_stack(profile, HEIGHT_BANDS, WALL_HEIGHTS)
     wall = wall_columns(filled[observed_bands(filled)], WALL_RULE)
     low, high = (_between(profile, *h) & ~wall for h in ((BODY_HEIGHTS[0], FURNITURE_STEP), (FURNITURE_STEP, BODY_HEIGHTS[1])))
-    above = np.full(shape, -np.inf)
-    roof = z >= UPRIGHT
-    np.maximum.at(above, (ix[roof], iy[roof]), z[roof])
-    turn = wall_direction(_middles(grid.origin, np.argwhere(wall), grid.edge))
-    turn = near + (turn - near + np.pi / 4) % (np.pi / 2) - np.pi / 4
-    kinds = [_points(grid.origin, np.argwhere(mask), grid.edge, turn) for mask in (wall, low, high, profile > 0)]
-    ceilings = np.argwhere(np.isfinite(above) & ~wall)
-    inside = np.flatnonzero((map.navigable_room >= 0) & (map.rooms["storey"][np.maximum(map.navigable_room, 0)] == storey))
-    ground = _points(nav.origin, nav.cells[inside, :2], nav.edge, turn)
-    label = np.repeat(map.navigable_room[inside], len(ground) // max(len(inside), 1))
-    every = np.concatenate([kinds[3], ground]) if len(kinds[3]) + len(ground) else np.zeros((1, 2))
-    size = tuple((np.floor(np.ptp(every, axis=0) / SHEET_PIXEL) + 1).astype(int).tolist())
-    middle = (every.min(axis=0) + every.max(axis=0)) / 2  # so a turned map has the same pixels, turned
-    corner = middle - np.array(size) * SHEET_PIXEL / 2
-    raster = _Raster(corner, size)
-    share = [raster.share(points, _spacing(grid.edge)) for points in kinds]
-    out = [share[0], raster.share(ground, _spacing(nav.edge)), *share[1:]]
-    roofs = _points(grid.origin, ceilings, grid.edge, turn)
-    heights = np.repeat(above[tuple(ceilings.T)], len(roofs) // max(len(ceilings), 1))
-    out.append(np.minimum(raster.mean(roofs, heights) / CEILING_UNIT, 255).round())
-    out.append(255 * raster.near(_turned(_doors(map, storey), turn), DOOR_RADIUS))
-    anchor = (_turned(map.rooms["centroid"][:, :2], turn) - corner) / SHEET_PIXEL
-    rooms = raster.label(ground, label, np.column_stack([map.rooms["centroid"], map.rooms["area"]]))
-    return Sheet(np.stack(out, axis=-1).astype(np.uint8), rooms, anchor.astype(np.float32), np.array([turn]))
+    ceiling, above = np.full(shape, -np.inf), z >= UPRIGHT
+    np.maximum.at(ceiling, (ix[above], iy[above]), z[above])
+    return (wall, low, high, profile > 0), np.where(wall, -np.inf, ceiling)
 
 
 def _levels(map: TopometricMap, storey: int) -> tuple[float, float]:
@@ -223,3 +225,11 @@ class _Raster:
             pixel, label = np.divmod(pair[order], count)
             out[pixel] = label
         return out.reshape(self.size)
+
+
+def _raster(points: Array) -> _Raster:
+    """Pixels that hold points (n, 2), m, with their middle in their own, so that a turned map has the same pixels, turned."""
+    points = points if len(points) else np.zeros((1, 2))
+    size = np.floor(np.ptp(points, axis=0) / SHEET_PIXEL).astype(int) + 1
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    return _Raster(middle - size * SHEET_PIXEL / 2, (int(size[0]), int(size[1])))
