@@ -60,37 +60,29 @@ def perceptron(x: Array, layers: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def convolution(x: Array, weight: Array, bias: Array, stride: int = 1) -> Array:
-    """(nx, ny, c) float32 -> (nx / stride, ny / stride, k) float32: 3 x 3, rectified, with zeros around.
+    """An image (nx, ny, c) float32 -> (nx / stride, ny / stride, k) float32, or several (n, nx, ny, c) at once: 3 x 3, rectified,
+    with zeros around.
 
     Args:
         weight: (9 c, k), by place in the window, then channel.
         bias: (k,).
         stride: divides both sides.
     """
-    nx, ny = x.shape[0] // stride, x.shape[1] // stride
-    x = np.pad(x, ((1, 1), (1, 1), (0, 0)))
-    out = np.empty((nx, ny, weight.shape[1]), np.float32)
-    for i in range(0, nx, CONVOLVED_ROWS):
-        n = min(CONVOLVED_ROWS, nx - i)
-        at = stride * i
-        taps = [x[at + u : at + u + stride * n : stride, v : v + stride * ny : stride] for u in range(3) for v in range(3)]
-        columns = np.concatenate(taps, axis=-1).reshape(n * ny, -1)
-        out[i : i + n] = (columns @ weight + bias).reshape(n, ny, -1)
-    return np.maximum(out, 0.0, out=out)
-
-
-def convolutions(x: Array, weight: Array, bias: Array, stride: int = 1) -> Array:
-    """`convolution` of several images (n, nx, ny, c) at once -> (n, nx / stride, ny / stride, k)."""
-    n, nx, ny = x.shape[0], x.shape[1] // stride, x.shape[2] // stride
-    x = np.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    images = x[None] if x.ndim == 3 else x
+    n, nx, ny = len(images), images.shape[1] // stride, images.shape[2] // stride
+    images = np.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     out = np.empty((n, nx, ny, weight.shape[1]), np.float32)
-    step = max(CONVOLVED_PIXELS // (nx * ny), 1)
+    rows = min(CONVOLVED_ROWS, max(nx, 1))
+    step = max(CONVOLVED_PIXELS // max(rows * ny, 1), 1)
     for i in range(0, n, step):
-        some = x[i : i + step]
-        taps = [some[:, u : u + stride * nx : stride, v : v + stride * ny : stride] for u in range(3) for v in range(3)]
-        columns = np.concatenate(taps, axis=-1).reshape(-1, weight.shape[0])
-        out[i : i + step] = (columns @ weight + bias).reshape(len(some), nx, ny, -1)
-    return np.maximum(out, 0.0, out=out)
+        for row in range(0, nx, rows):
+            some = images[i : i + step, stride * row : stride * (row + rows) + 2]
+            count = min(rows, nx - row)
+            taps = [some[:, u : u + stride * count : stride, v : v + stride * ny : stride] for u in range(3) for v in range(3)]
+            columns = np.concatenate(taps, axis=-1).reshape(-1, weight.shape[0])
+            out[i : i + step, row : row + count] = (columns @ weight + bias).reshape(len(some), count, ny, -1)
+    np.maximum(out, 0.0, out=out)
+    return out[0] if x.ndim == 3 else out
 
 
 def segment_sum(values: Array, index: Array, count: int) -> Array:

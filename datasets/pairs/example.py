@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from topomerge.datasets.buildings.erect import erect
@@ -20,7 +20,7 @@ from topomerge.datasets.pairs.degrade import UNCHANGED, degraded
 from topomerge.datasets.pairs.drawing import with_plan
 from topomerge.datasets.pairs.evaluation_pair import evaluation_arrays, pair_statistics, save_maps
 from topomerge.datasets.pairs.items import Item, difficulty_of
-from topomerge.datasets.pairs.pairs import Pair, make_pair
+from topomerge.datasets.pairs.pairs import Atlas, Pair, make_pair
 from topomerge.datasets.pairs.recipe import SIDES
 from topomerge.datasets.pairs.truth import room_truth, true_matches
 
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from torch_geometric.data import Data
 
 FEWEST_ROOMS = 2  # rooms that must come out of each map
+Made = TypeVar("Made")
 LONGEST_PAIR = 600.0  # s a pair: a hundred times what is usual, so that no slow machine makes another set
 
 
@@ -88,14 +89,11 @@ def several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array
         InputError: no candidate has such walks, or a map has hardly a room.
     """
     sensors, sides = (*item.sensors, *item.more), SIDES[: 2 + len(item.more)]
-    for k in range(len(item.buildings)):
-        try:
-            rng = np.random.default_rng([item.seed, k])
-            atlas = make_atlas(candidate(item, k, plans)[0], sensors, rng, item.rooms, False, difficulty_of(item), item.source)
-            break
-        except InputError:
-            if k + 1 == len(item.buildings):
-                raise
+
+    def make(k: int, rng: np.random.Generator) -> Atlas:
+        return make_atlas(candidate(item, k, plans)[0], sensors, rng, item.rooms, False, difficulty_of(item), item.source)
+
+    atlas = _first(item, make)
     maps = extracted(atlas.maps, item)
     truths = [room_truth(m, cloud) for m, cloud in zip(maps, atlas.maps, strict=True)]
     arrays = _map_arrays(sides, maps, truths, item.points_per_room)
@@ -177,13 +175,21 @@ def pair_arrays(pair: Pair, maps: Sequence[TopometricMap], item_entries: Mapping
 
 def _first_pair(item: Item, plans: Sequence[Sequence[Plan]]) -> Pair:
     """The pair of the first candidate that has one."""
+
+    def make(k: int, rng: np.random.Generator) -> Pair:
+        building, other = candidate(item, k, plans)
+        pair = make_pair(building, item.pair_settings, rng, other, difficulty_of(item), item.source)
+        return with_plan(pair, building) if item.change[0] == "plan" else pair
+
+    return _first(item, make)
+
+
+def _first(item: Item, make: Callable[[int, np.random.Generator], Made]) -> Made:
+    """What is made of the first of an item's candidates that has it, from its number and a generator of its own."""
     refused: InputError | None = None
     for k in range(len(item.buildings)):
         try:
-            building, other = candidate(item, k, plans)
-            rng = np.random.default_rng([item.seed, k])
-            pair = make_pair(building, item.pair_settings, rng, other, difficulty_of(item), item.source)
-            return with_plan(pair, building) if item.change[0] == "plan" else pair
+            return make(k, np.random.default_rng([item.seed, k]))
         except InputError as error:
             refused = error
     raise refused or InputError("an item without buildings")

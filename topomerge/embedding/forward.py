@@ -93,7 +93,7 @@ class Forward:
             factor = weight / np.sqrt(np.maximum(variance, 0) + NORM_EPSILON)
             kernel = self._get(f"{name}.convolutions.{k}.weight", (wide, x.shape[-1], 3, 3)) * factor[:, None, None, None]
             rows = kernel.transpose(2, 3, 1, 0).reshape(-1, wide).astype(np.float32)
-            x = nn.convolutions(x, rows, (bias - factor * mean).astype(np.float32), stride=2)
+            x = nn.convolution(x, rows, (bias - factor * mean).astype(np.float32), stride=2)
         flat = x.transpose(0, 3, 1, 2).reshape(len(x), -1).astype(np.float64)
         return self._linear(f"{name}.out", flat)
 

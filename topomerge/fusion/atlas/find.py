@@ -19,6 +19,7 @@ import numpy as np
 
 from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.embedders import embedder as make_embedder
+from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.turns import Rows, TurnedRows, aligned, numbers
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.store import Stored, read_atlas
@@ -64,8 +65,9 @@ def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sight
         raise InputError(f"{folder}: holds no maps yet; add some with `topomerge atlas add {folder} MAP ...`")
     if not len(map.rooms):
         raise InputError(f"{map.source or 'the map'}: no rooms in it, nothing can be looked for")
-    describe = make_embedder(str(stored.settings.get("embedder") or DEFAULT))
-    rows = _rows(stored, str(stored.settings.get("embedder") or DEFAULT))
+    embedder = str(stored.settings.get("embedder") or DEFAULT)
+    describe = make_embedder(embedder)
+    rows = _rows(stored, describe, _signature(embedder))
     return ranked([e.name for e in stored.entries], rows, checked(describe, map), number)
 
 
@@ -96,7 +98,7 @@ def _cosines(new: Rows, rows: Rows) -> Array:
     return out
 
 
-def _rows(stored: Stored, name: str) -> list[Rows]:
+def _rows(stored: Stored, describe: Descriptor, embedder: str) -> list[Rows]:
     """Rows of all maps of an atlas, from its file of rooms; what is missing there is reckoned and added.
 
     Raises:
@@ -105,13 +107,12 @@ def _rows(stored: Stored, name: str) -> list[Rows]:
     path = stored.folder / ROOMS_FILE
     advice = "delete it, it is made again"
     written = archive.read(path, "file of rooms") if path.exists() else {}
-    signature = np.frombuffer(_signature(name).encode(), np.uint8)
+    signature = np.frombuffer(embedder.encode(), np.uint8)
     if written and not np.array_equal(written.pop("embedder", np.zeros(0)), signature):
         raise InputError(f"{path}: holds rows of another embedder; {advice}")
     if written and not any(e.key in written for e in stored.entries):
         raise InputError(f"{path}: is of another atlas; {advice}")
     rows: dict[str, Array] = {}
-    describe = make_embedder(name)
     for entry in stored.entries:
         places = f"{entry.key}.places"
         if entry.key in written:
