@@ -15,7 +15,7 @@ from topomerge.types import Array, PointCloud, VoxelGrid
 
 FINEST_CELL = 0.02  # m
 MOST_RAYS = 400_000  # of a portion of two million points
-MOST_RAYS_HELD = 8_000_000  # of all portions: 0.4 GB
+MOST_RAYS_HELD = 4_000_000  # of all portions: 0.2 GB
 
 
 @dataclass(frozen=True, eq=False)

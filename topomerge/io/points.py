@@ -53,6 +53,7 @@ FORMATS = (
     Format("a glTF mesh", "mesh", (".glb", ".gltf"), up="y"),
     Format("an OctoMap", "octomap", (".bt",)),
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc"),
+    Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic")),
     Format("a floor plan", "grid", (".yaml", ".yml", ".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"), fixed=True),
 )
 SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
@@ -118,7 +119,7 @@ def format_of(path: Path) -> Format:
         InputError: it can't, or its suffix is that of no format.
     """
     if path.is_dir():
-        return SCAN_FOLDER
+        return _folder_format(path)
     for file_format in FORMATS:
         if path.suffix.lower() in file_format.suffixes:
             break
@@ -139,6 +140,13 @@ def format_of(path: Path) -> Format:
     if not first:
         raise InputError(f"{path}: is empty; copy or export it again")
     return file_format
+
+
+def _folder_format(path: Path) -> Format:
+    """What a folder holds: a ROS 2 bag, parts of a bag, or scans."""
+    bag = next(f for f in FORMATS if f.module == "bag")
+    names = [p.name for p in path.iterdir()]
+    return bag if "metadata.yaml" in names or any(n.endswith(bag.suffixes) for n in names) else SCAN_FOLDER
 
 
 def _pieces(path: Path, file_format: Format, options: ReadOptions) -> Iterator[Piece]:
