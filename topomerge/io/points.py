@@ -51,7 +51,7 @@ FORMATS = (
     Format("an E57 file", "e57", (".e57",), extra="e57"),
     Format("a mesh", "mesh", (".obj", ".stl")),
     Format("a glTF mesh", "mesh", (".glb", ".gltf"), up="y"),
-    Format("an OctoMap", "octomap", (".bt",)),
+    Format("an OctoMap", "octomap", (".bt", ".ot")),
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc"),
     Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic")),
     Format("a floor plan", "grid", (".yaml", ".yml", ".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"), fixed=True),
