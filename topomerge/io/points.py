@@ -57,6 +57,7 @@ FORMATS = (
     Format("a floor plan", "grid", (".yaml", ".yml", ".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"), fixed=True),
 )
 SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
+RGBD_FOLDER = Format("a folder of RGB-D images", "rgbd", (), takes=("poses",))
 
 
 def suffixes() -> tuple[str, ...]:
@@ -101,7 +102,7 @@ def read_chunks(
         raise InputError(f"{path}: a chunk of {chunk} points can't be read; give 1 or more")
     for name in ("poses", "topic"):
         if getattr(reading, name) is not None and name not in file_format.takes:
-            able = ", ".join(f.name for f in (*FORMATS, SCAN_FOLDER) if name in f.takes)
+            able = ", ".join(f.name for f in (*FORMATS, SCAN_FOLDER, RGBD_FOLDER) if name in f.takes)
             raise InputError(f"{path}: --{name} is of no use to {file_format.name}, only to {able}; leave it out")
     warnings: list[str] = []
     if file_format.fixed and (reading.unit not in (None, "m") or reading.up not in (None, "z")):
@@ -143,10 +144,12 @@ def format_of(path: Path) -> Format:
 
 
 def _folder_format(path: Path) -> Format:
-    """What a folder holds: a ROS 2 bag, parts of a bag, or scans."""
+    """What a folder holds: a ROS 2 bag or parts of a bag, RGB-D images, or scans."""
     bag = next(f for f in FORMATS if f.module == "bag")
     names = [p.name for p in path.iterdir()]
-    return bag if "metadata.yaml" in names or any(n.endswith(bag.suffixes) for n in names) else SCAN_FOLDER
+    if "metadata.yaml" in names or any(n.endswith(bag.suffixes) for n in names):
+        return bag
+    return RGBD_FOLDER if "depth.txt" in names else SCAN_FOLDER
 
 
 def _pieces(path: Path, file_format: Format, options: ReadOptions) -> Iterator[Piece]:
