@@ -10,7 +10,7 @@ import pytest
 from PIL import EpsImagePlugin, Image
 from topomerge.datasets.plans import grid as plan_grid
 
-from tests.samples import octomap_node, write_octomap
+from tests.samples import FULL_OCTOMAP_HEADER, full_node, octomap_node, write_octomap
 from topomerge.errors import InputError
 from topomerge.io import grid, read_points
 
@@ -258,11 +258,6 @@ def test_octomaps_that_would_explode(tmp_path: Path) -> None:
     assert any("free space is left out" in w for w in cloud.warnings)
 
 
-def full_node(odds: float, children: int, more: bytes = b"") -> bytes:
-    """A node of a full tree: log-odds, perhaps a colour, and a bit for each child that follows."""
-    return struct.pack("<f", odds) + more + bytes([children])
-
-
 def as_full(data: bytes, at: list[int], rng: np.random.Generator, more: bytes) -> bytes:
     """The nodes of a binary tree from a place on, as those of a full tree."""
     bits = int.from_bytes(data[at[0] : at[0] + 2], "little")
@@ -284,7 +279,7 @@ def test_a_full_octomap_is_the_binary_one(tmp_path: Path, kind: str, more: bytes
     inner = (octomap_node(states) for states in ([3, 0, 1, 2, 0, 0, 3, 0], [3, 1, 0, 2, 0, 0, 0, 0]))
     data = down + b"".join(inner) + octomap_node([2, 1, 0, 0, 1, 0, 0, 2]) + octomap_node([0, 1, 2, 0, 0, 0, 0, 0])
     write_octomap(tmp_path / "a.bt", data, 30)
-    head = f"# Octomap OcTree file\n# a comment\nid {kind}\nsize 30\nres 0.1\ndata\n".encode()
+    head = FULL_OCTOMAP_HEADER.replace(b"id OcTree", f"id {kind}".encode())
     nodes = as_full(data, [0], np.random.default_rng(0), more)
     (tmp_path / "a.ot").write_bytes(head + nodes)
     binary, full = read_points(tmp_path / "a.bt"), read_points(tmp_path / "a.ot")
@@ -310,8 +305,7 @@ def test_a_full_octomap_is_the_binary_one(tmp_path: Path, kind: str, more: bytes
 
 def test_zero_log_odds_are_occupied(tmp_path: Path) -> None:
     """Octomap's threshold is a probability of 0.5; a child that is not there is unknown."""
-    head = b"# Octomap OcTree file\nid OcTree\nsize 18\nres 0.1\ndata\n"
     leaves = b"".join(full_node(odds, 0) for odds in (0.0, -0.0, -1e-6, 3.5))
-    (tmp_path / "a.ot").write_bytes(head + full_node(0, 1) * 15 + full_node(0, 0b10111) + leaves)
+    (tmp_path / "a.ot").write_bytes(FULL_OCTOMAP_HEADER + full_node(0, 1) * 15 + full_node(0, 0b10111) + leaves)
     cloud = read_points(tmp_path / "a.ot")
     assert len(cloud) == 3 and cloud.free is not None and len(cloud.free) == 1

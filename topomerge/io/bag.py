@@ -16,11 +16,11 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.bag_file import BAG_KIND, Bag, Message, Topic
-from topomerge.io.bag_messages import GRID, LASER_SCAN, POINT_CLOUD, cloud_points, laser_points, occupancy_plan, stamp
+from topomerge.io.bag_messages import LASER_SCAN, OCCUPANCY_GRID, POINT_CLOUD, cloud_points, laser_points, occupancy_plan, stamp
 from topomerge.io.bag_poses import SensorPoses, sensor_poses
 from topomerge.io.grid import classify, extrude
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece
+from topomerge.io.piece import Piece, damaged
 from topomerge.io.posed import PosedScan, pieces
 from topomerge.io.subprocess_reader import read_in_subprocess
 from topomerge.io.trajectory import BACKWARD
@@ -38,9 +38,16 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """The same in this process."""
+    try:
+        yield from _read(path, options)
+    except MemoryError as error:  # lengths in a damaged bag are believed by the library
+        raise damaged(path, BAG_KIND, "one of its parts claims more memory than there is") from error
+
+
+def _read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     with Bag(path) as bag:
         topic = _topic(bag, options.topic)
-        if topic.type == GRID:
+        if topic.type == OCCUPANCY_GRID:
             yield from _map(bag, topic, options)
             return
         poses = sensor_poses(bag, topic, options.poses, _first_frame(bag, topic))
@@ -55,12 +62,12 @@ def _topic(bag: Bag, name: str | None) -> Topic:
     """
     if name is not None:
         topic = bag.named(name)
-        if topic is None or topic.type not in (*DECODERS, GRID) or not topic.count:
+        if topic is None or topic.type not in (*DECODERS, OCCUPANCY_GRID) or not topic.count:
             wrong = "is not in the bag" if topic is None else f"holds {topic.count:,} {topic.kind}"
             able = "PointCloud2, LaserScan or OccupancyGrid"
             raise InputError(f"{bag.path}: the topic {name} {wrong}; give --topic with {able}: {bag.listing()}")
         return topic
-    for kind in (POINT_CLOUD, LASER_SCAN, GRID):
+    for kind in (POINT_CLOUD, LASER_SCAN, OCCUPANCY_GRID):
         topics = bag.of_type(kind)
         if len(topics) > 1:
             shown = ", ".join(f"{t.name} ({t.count:,} {t.kind})" for t in topics)

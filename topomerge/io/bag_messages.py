@@ -15,7 +15,7 @@ from topomerge.io.grid import PIXELS, Plan
 from topomerge.types import Array
 
 POINT_CLOUD, LASER_SCAN = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/LaserScan"
-GRID = "nav_msgs/msg/OccupancyGrid"
+OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 LONGEST_POINT = 1 << 16  # bytes of a point
 

@@ -126,9 +126,8 @@ def octree_leaves(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], 
 @njit(cache=True)
 def _full_octree(data, width, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Walk the nodes of `width` bytes, log-odds first and bits of the children last; returns as `_octree`."""
-    count, at = 0, 0
-    top = 1
-    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, 0, 0, 0
+    top, count, at = 1, 0, 0
+    stack[0, :] = 0
     while top > 0:
         top -= 1
         x, y, z, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
