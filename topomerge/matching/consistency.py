@@ -7,7 +7,7 @@ the other map, moved so that walls meet, and ranked by walls that agree less wal
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +37,7 @@ class ConsistencySettings:
     overlaid: columns of floor, laid over each other to tell the rooms in common.
     storey_gap: m by which floors of one storey may differ.
     same: poses closer than this are one.
+    least_voter: certainty of a match by attention, from which on it votes for a pose.
     shortlist: share of the best agreement, below which a hypothesis ranks after all others.
     """
 
@@ -48,6 +49,7 @@ class ConsistencySettings:
     overlaid: int = 20_000
     storey_gap: float = 0.7
     same: PoseTolerance = SAME_MATCHING
+    least_voter: float = 0.05
     shortlist: float = 0.6
 
 
@@ -99,6 +101,28 @@ def candidate_poses(
     if scale_free:
         return joined_poses(door_poses(a, b, plans, pairs, weight), scaled_poses(a, b, plans, pairs, weight))
     return joined_poses(door_poses(a, b, plans, pairs, weight), middle_poses(a, b, plans, pairs, 0.2 * weight))
+
+
+def voted_pose(a: TopometricMap, b: TopometricMap, certain: Array) -> Sim3 | None:
+    """The pose T_ab that most doors and middles of matched rooms vote for, with no look at walls; None where none match.
+
+    Args:
+        certain: (R_a, R_b) how sure each match is; each votes with that.
+    """
+    pairs = np.argwhere(certain > CONSISTENCY.least_voter)
+    if not len(pairs):
+        return None
+    plans = (room_plans(a), room_plans(b))
+    poses = candidate_poses(a, b, plans, pairs, certain[tuple(pairs.T)], False)
+    if not len(poses):
+        return None
+    best = int(votes(poses).argmax())
+    at = poses.places(plans[1].middle)
+    near = (np.linalg.norm(at - at[best], axis=1) < CONSISTENCY.same.metres) & (np.cos(poses.yaw - poses.yaw[best]) > 0.99)
+    off = np.average(at[near], axis=0, weights=poses.weight[near]) - at[best]
+    pose = poses.transform(best)
+    x, y, z = (off + pose.translation).tolist()
+    return replace(pose, translation=(x, y, z))
 
 
 def votes(poses: PoseArrays) -> Array:

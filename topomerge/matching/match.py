@@ -14,11 +14,10 @@ from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.turns import Rows, TurnedRows
 from topomerge.errors import InputError
 from topomerge.matching.assignment import assign
-from topomerge.matching.consistency import hypotheses
+from topomerge.matching.consistency import hypotheses, voted_pose
 from topomerge.matching.costs import descriptor_costs, similarities, usual_best
 from topomerge.matching.growing import align, grow
 from topomerge.matching.odds import match_probability
-from topomerge.matching.pose_of_matches import pose_of_matches, rooms_and_doors
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.result import Matching
 from topomerge.matching.room_matcher import RoomOdds, certainty_of_turns, room_odds
@@ -102,7 +101,7 @@ def match(
 
 
 def _by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], statistics: dict[str, float]) -> Matching:
-    """Matches of `room_matcher`, and the pose under which most of them agree.
+    """Matches of `room_matcher`, and the pose that most of their doors and middles vote for.
 
     Raises:
         InputError: the rows are of another embedder, or the scale is unknown.
@@ -111,7 +110,7 @@ def _by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], 
         raise InputError("method attention needs the embedder that ships, and maps of one scale; take method consistent")
     certain = max(odds, key=lambda turned: turned.sureness).certainty
     rooms = assign_certain(certain, LEAST_CERTAINTY)
-    pose = pose_of_matches(rooms_and_doors(a), rooms_and_doors(b), certain)
+    pose = voted_pose(a, b, certain)
     probability = certain[tuple(rooms.T)]
     ranked = () if pose is None else (PoseHypothesis(pose, float(len(rooms)), 1.0, {}, True, rooms, probability),)
     return Matching(rooms, probability, pose, ranked, statistics)
