@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -203,9 +204,8 @@ def test_a_graph_that_would_lead_the_library_astray_is_refused(indexed: Path) ->
     assert refused > 120  # of other bytes: links that lead to another room, or places that are not in use
 
 
-def test_without_the_package_or_a_folder_to_write_to_search_is_exact(
-    small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_package_or_a_folder_to_write_to_search_is_exact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(indexing, "INDEX_FROM", 100)
     maps = many_maps()
     folder = write_atlas(tmp_path / "town", {str(k): of for k, of in enumerate(maps)})
     with monkeypatch.context() as patch:
@@ -215,3 +215,9 @@ def test_without_the_package_or_a_folder_to_write_to_search_is_exact(
         patch.setattr(indexing, "find_spec", lambda name: None)
         assert look(folder, seen_again(maps, 3), 1, monkeypatch)[0].name == "3"
     assert not (folder / INDEX_FILE).exists() and read_atlas(folder).entries
+
+
+def test_an_index_without_the_package_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "usearch.index", None)
+    with pytest.raises(InputError, match=r"pip install 'topomerge\[index\]'"):
+        RoomsIndex(4)

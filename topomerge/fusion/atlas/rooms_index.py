@@ -25,7 +25,7 @@ from topomerge.io import archive
 from topomerge.types import Array
 
 INDEX_FILE = "rooms_index.npz"
-INDEX_FROM = 100_000  # rooms of an atlas, below which all are compared: that takes 2 ms a room and turn
+INDEX_FROM = 100_000  # rooms of an atlas, below which all are compared: that takes 1.5 ms a room and turn
 LINKS = 16  # of a room to others
 ADDING, SEARCHING = 64, 128  # rooms looked at on the way when one is added and when one is looked up
 
@@ -39,6 +39,9 @@ class RoomsIndex:
         keys: of the maps whose rooms are in it, in their order.
         counts: rooms of each.
         owner: (N,) number of each room's map in the atlas, -1 of a map that is gone.
+
+    Raises:
+        InputError: `usearch` is missing.
     """
 
     size: int
@@ -47,8 +50,10 @@ class RoomsIndex:
     owner: Array = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
-        from usearch.index import Index
-
+        try:
+            from usearch.index import Index
+        except ImportError as error:
+            raise InputError("an index of rooms needs usearch: pip install 'topomerge[index]'") from error
         self._graph: Any = Index(
             ndim=self.size, metric="ip", dtype="i8", connectivity=LINKS, expansion_add=ADDING, expansion_search=SEARCHING
         )
