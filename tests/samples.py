@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,14 @@ def write_ifc(path: Path, slab: bool = False) -> None:
 
 def write_octomap(path: Path, nodes: bytes, count: int) -> None:
     path.write_bytes(OCTOMAP_HEADER % count + nodes)
+
+
+FULL_OCTOMAP_HEADER = b"# Octomap OcTree file\n# a comment\nid OcTree\nsize 18\nres 0.1\ndata\n"
+
+
+def full_node(odds: float, children: int, more: bytes = b"") -> bytes:
+    """A node of a full OctoMap: log-odds, perhaps a colour, and a bit for each child that follows."""
+    return struct.pack("<f", odds) + more + bytes([children])
 
 
 def octomap_node(states: list[int]) -> bytes:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.docs_examples import ROOT, Example, commands, examples, pages
+from tests.io.walks import house_walk, write_kitti, write_scans
 from topomerge.cli.main import COMMANDS, EXIT_STATUSES
 from topomerge.cli.main import main as cli
 
@@ -23,13 +24,15 @@ QUICK = ("cli.md",)  # pages whose examples need no scans; those of all others a
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the examples find in their folder: two scans of an office."""
+    """What the examples find in their folder: two scans of an office, and a walk through a house as a SLAM system leaves it."""
     folder = tmp_path_factory.mktemp("workshop")
     small = ["--building", "office", "--seed", "5", "--rooms", "8", "--overlap", "0.7", "--quiet"]
     assert cli(["simulate", *small, "-o", str(folder / "pair")]) == 0
     for name, other in (("a.ply", "scan.ply"), ("b.ply", "other.ply")):
         shutil.move(folder / "pair" / name, folder / other)
     shutil.rmtree(folder / "pair")
+    write_scans(folder / "walk", house_walk())
+    write_kitti(folder / "walk" / "poses.txt", house_walk().poses)
     return folder
 
 

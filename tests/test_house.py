@@ -36,7 +36,7 @@ RANKS = {
     "__main__": 15,
 }
 HEAVY = ("torch", "torch_geometric", "lightning_fabric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell")
-HEAVY += ("trimesh",)
+HEAVY += ("trimesh", "rosbags")
 
 
 def sources() -> list[tuple[str, str, Path]]:

@@ -47,6 +47,14 @@ def read_las(path: Path) -> int:
     return found
 
 
+def read_bag(path: Path) -> int:
+    """Read points of a bag in this process: one of its own takes seconds."""
+    from topomerge.io import bag
+
+    bag.read_in_subprocess = lambda _module, _kind, path, options, **_: bag.read_in_process(path, options)
+    return read_cloud(path)
+
+
 def read_map(path: Path) -> int:
     """Read a map, what `topomerge info` prints of it, and how the maps that it was joined of were bent."""
     from topomerge.fusion.bend.placement import bends_of
@@ -100,6 +108,7 @@ READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others a
     ".las": read_las,
     ".laz": read_las,
     ".tmap": read_map,
+    **dict.fromkeys((".bag", ".db3", ".mcap"), read_bag),
 }
 
 
@@ -131,7 +140,20 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     save_map(with_bends(building(2, 2), [Placement(1, "b.ply", Sim3(0.3), turn)]), found["map.tmap"])
     found["plain.npz"] = folder / "plain.npz"
     np.savez(found["plain.npz"], points=samples.box_points(50), poses=np.eye(4)[None], pose_of=np.zeros(50, np.int32))
-    return found | write_plans(folder) | write_embedder(folder) | write_atlas(folder)
+    return found | write_walks(folder) | write_plans(folder) | write_embedder(folder) | write_atlas(folder)
+
+
+def write_walks(folder: Path) -> dict[str, Path]:
+    """Bags of either version of ROS, and a full OctoMap."""
+    from tests.io.bags import walk_messages, write_bag
+    from tests.io.walks import room_walk
+
+    found = {"full.ot": folder / "full.ot"}
+    nodes = [samples.full_node(0.4, 1)] * 15 + [samples.full_node(0.4, 7)] + [samples.full_node(odds, 0) for odds in (1, -1, 2)]
+    found["full.ot"].write_bytes(samples.FULL_OCTOMAP_HEADER + b"".join(nodes))
+    for kind in ("bag", "db3", "mcap") if find_spec("rosbags") else ():
+        found[f"walk.{kind}"] = write_bag(folder / kind, kind, walk_messages(room_walk())).rename(folder / f"walk.{kind}")
+    return found
 
 
 def write_plans(folder: Path) -> dict[str, Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from PIL import EpsImagePlugin, Image
 from topomerge.datasets.plans import grid as plan_grid
 
-from tests.samples import octomap_node, write_octomap
+from tests.samples import FULL_OCTOMAP_HEADER, full_node, octomap_node, write_octomap
 from topomerge.errors import InputError
 from topomerge.io import grid, read_points
 
@@ -255,3 +256,56 @@ def test_octomaps_that_would_explode(tmp_path: Path) -> None:
     cloud = read_points(tmp_path / "a.bt")
     assert cloud.free is None and len(cloud) == 8
     assert any("free space is left out" in w for w in cloud.warnings)
+
+
+def as_full(data: bytes, at: list[int], rng: np.random.Generator, more: bytes) -> bytes:
+    """The nodes of a binary tree from a place on, as those of a full tree."""
+    bits = int.from_bytes(data[at[0] : at[0] + 2], "little")
+    at[0] += 2
+    states = [(bits >> (2 * child)) & 3 for child in range(8)]
+    out = full_node(0.5, sum(1 << child for child, state in enumerate(states) if state), more)
+    inner = [as_full(data, at, rng, more) for state in states if state == 3]
+    for state in states:
+        sure = float(rng.uniform(0, 3))
+        leaf = full_node(-sure - 1e-3 if state == 1 else sure, 0, more)
+        out += inner.pop(0) if state == 3 else leaf if state else b""
+    return out
+
+
+@pytest.mark.parametrize(("kind", "more"), [("OcTree", b""), ("ColorOcTree", b"rgb")])
+def test_a_full_octomap_is_the_binary_one(tmp_path: Path, kind: str, more: bytes) -> None:
+    """The same cells and the same free space; damaged, it is refused."""
+    down = octomap_node([0, 0, 0, 0, 0, 0, 0, 3]) + octomap_node([3, 0, 0, 0, 0, 0, 0, 0]) * 12
+    inner = (octomap_node(states) for states in ([3, 0, 1, 2, 0, 0, 3, 0], [3, 1, 0, 2, 0, 0, 0, 0]))
+    data = down + b"".join(inner) + octomap_node([2, 1, 0, 0, 1, 0, 0, 2]) + octomap_node([0, 1, 2, 0, 0, 0, 0, 0])
+    write_octomap(tmp_path / "a.bt", data, 30)
+    head = FULL_OCTOMAP_HEADER.replace(b"id OcTree", f"id {kind}".encode())
+    nodes = as_full(data, [0], np.random.default_rng(0), more)
+    (tmp_path / "a.ot").write_bytes(head + nodes)
+    binary, full = read_points(tmp_path / "a.bt"), read_points(tmp_path / "a.ot")
+    np.testing.assert_array_equal(np.unique(full.points, axis=0), np.unique(binary.points, axis=0))
+    assert full.free is not None and binary.free is not None and len(full) == len(binary) > 0
+    np.testing.assert_array_equal(full.free.cells, binary.free.cells)
+    wrong = {
+        "cut": head + nodes[:-1],
+        "more": head + nodes + b"\0",
+        "nan": head + struct.pack("<f", np.nan) + nodes[4:],
+        "kind": head.replace(b"id " + kind.encode(), b"id CountingOcTree") + nodes,
+        "binary": (tmp_path / "a.bt").read_bytes(),
+    }
+    says = dict.fromkeys(("cut", "more", "nan"), "its tree does not end") | {
+        "kind": "only OcTree and ColorOcTree",
+        "binary": "not a full OctoMap",
+    }
+    for name, broken in wrong.items():
+        (tmp_path / "a.ot").write_bytes(broken)
+        with pytest.raises(InputError, match=says[name]):
+            read_points(tmp_path / "a.ot")
+
+
+def test_zero_log_odds_are_occupied(tmp_path: Path) -> None:
+    """Octomap's threshold is a probability of 0.5; a child that is not there is unknown."""
+    leaves = b"".join(full_node(odds, 0) for odds in (0.0, -0.0, -1e-6, 3.5))
+    (tmp_path / "a.ot").write_bytes(FULL_OCTOMAP_HEADER + full_node(0, 1) * 15 + full_node(0, 0b10111) + leaves)
+    cloud = read_points(tmp_path / "a.ot")
+    assert len(cloud) == 3 and cloud.free is not None and len(cloud.free) == 1

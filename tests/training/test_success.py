@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.training.success import merged_right, pose_of_matches
+from topomerge.matching.pose_of_matches import pose_of_matches
+from topomerge.training.success import merged_right
 from topomerge.types import Array, Sim3
 
 ROOMS = 8

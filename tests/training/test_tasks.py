@@ -23,7 +23,8 @@ from topomerge.fusion.evidence.network import weights as place_weights
 from topomerge.fusion.verify import model
 from topomerge.io.weight_files import VARIABLE, weights_file
 from topomerge.matching.odds import odds_weights
-from topomerge.training import door_classification, place_evidence, plan_segmentation
+from topomerge.matching.room_matcher import matcher_weights
+from topomerge.training import door_classification, place_evidence, plan_segmentation, room_matcher
 from topomerge.training.door_classification import door_scores
 from topomerge.training.judging import judge_task
 from topomerge.training.loop import State
@@ -35,6 +36,7 @@ NETWORKS = {
     "plan_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
     "door_classification": ["epochs=2", "batch=64", "hidden=4", "networks=2"],
     "place_evidence": ["epochs=2", "steps=2", "batch=8", "widths=[4,4,4]", "hold_out=2", "lookalikes=false"],
+    "room_matcher": ["epochs=2", "steps=2", "batch=2", "width=8", "layers=1"],
 }
 WITHOUT_MORE = {"merge_belief": ["lookalikes=none", "floor=0"]}  # data that takes minutes to make
 FITS = ("merge_belief", "match_odds", "feature_scale")
@@ -52,6 +54,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(door_classification, "door_examples", lambda *_: tiny.door_tables(320))
     places = tiny.place_files(tmp_path / "places")
     monkeypatch.setattr(place_evidence, "hypothesis_files", lambda *_: places)
+    monkeypatch.setattr(room_matcher, "read_examples", lambda *_: tiny.room_examples(4))
     for task, name, make in (
         ("merge_belief", "belief_rows", tiny.belief_rows),
         ("match_odds", "pair_evidence", tiny.evidence),
@@ -79,6 +82,7 @@ def read(task: str) -> Any:
         "plan_segmentation": lambda: column_probabilities(plan),
         "door_classification": lambda: door_probability(np.zeros((3, 17))),
         "place_evidence": lambda: place_weights()["a.w"],
+        "room_matcher": lambda: matcher_weights()["rows.w"],
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "match_odds": lambda: odds_weights("match"),
         "feature_scale": lambda: scaled(np.ones((2, 18)), "matched"),
@@ -109,7 +113,7 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
 @pytest.mark.parametrize("task", list(NETWORKS))
 def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
     jobs = {"plan_segmentation": plan_segmentation.PlanJob, "door_classification": door_classification.DoorJob}
-    kind = {**jobs, "place_evidence": place_evidence.PlaceJob}[task]
+    kind = {**jobs, "place_evidence": place_evidence.PlaceJob, "room_matcher": room_matcher.MatcherJob}[task]
     train(settings_of(words(task, "name=whole")), quiet)
     step, seen = kind.step, []
 

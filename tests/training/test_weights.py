@@ -24,7 +24,13 @@ def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert weights.main([f"runs={tmp_path}"]) == 130
     assert made == ["plan_segmentation", "door_classification", "feature_scale", "match_odds"]
     assert "in all about" in capsys.readouterr().err
-    assert weights.main([f"runs={tmp_path}"]) == 0 and made[4:] == ["match_odds", "place_evidence", "merge_belief", "embedding"]
+    assert weights.main([f"runs={tmp_path}"]) == 0 and made[4:] == [
+        "match_odds",
+        "place_evidence",
+        "merge_belief",
+        "embedding",
+        "room_matcher",
+    ]
     said = capsys.readouterr().err
     assert "plan_segmentation: is there" in said and set(TASKS) <= set(json.loads((tmp_path / "seconds.json").read_text()))
     assert weights.main([f"runs={tmp_path}", "only=nothing"]) == 1 and "only=nothing" in capsys.readouterr().err
@@ -38,5 +44,6 @@ def test_each_step_is_a_task_with_its_words(tmp_path: Path, monkeypatch: pytest.
         weights.make_task(task, tmp_path, ["jobs=2", f"cache={tmp_path}", "export="])
     sets, settings = [a.data.name for a in asked if not hasattr(a, "task")], [a for a in asked if hasattr(a, "task")]  # type: ignore[attr-defined]
     assert sets == ["train_walks", "val_small"] and [s.task for s in settings] == list(TASKS)
-    assert settings[-1].epochs == 22 and settings[-1].network.node.around == 10 and settings[0].jobs == 2
+    embedding = settings[list(TASKS).index("embedding")]
+    assert embedding.epochs == 22 and embedding.network.node.around == 10 and settings[0].jobs == 2
     assert all(s.cache == str(tmp_path) and s.export == "" and s.name == s.task for s in settings)

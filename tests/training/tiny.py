@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from topomerge.datasets.pairs.plan_examples import PlanExample, PlanItem, example_arrays
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 
 from topomerge.embedding.engineered import FEATURES
+from topomerge.embedding.turns import FACTS, TurnedRows
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.fusion.evidence.crops import LOOKED, SIDE
@@ -18,6 +20,8 @@ from topomerge.io import archive
 from topomerge.matching.odds import hypothesis_features
 from topomerge.training.feature_scale import PairFeatures
 from topomerge.training.match_odds import Evidence
+from topomerge.training.packed import GraphPair
+from topomerge.training.room_matcher import Example, View
 from topomerge.types import Sim3
 
 EDGE = 0.1  # m
@@ -129,3 +133,25 @@ def feature_pairs(*_: Any) -> list[PairFeatures]:
         rows = np.arange(9)
         pairs.append(PairFeatures(f"b{k}", a, b, rows == 0, rows == 1, np.column_stack([rows, rows]), rows > 1))
     return pairs
+
+
+def room_examples(count: int) -> list[Example]:
+    """Pairs of maps of five rooms, of which the second one lacks the last room; it stands a quarter turn away."""
+    rng = np.random.default_rng(0)
+    out = []
+    for _ in range(count):
+        rows, places = rng.normal(size=(5, 4, 64)).astype(np.float32), rng.uniform(0, 20, (5, 2))
+        rows /= np.linalg.norm(rows, axis=2, keepdims=True)
+        back = places @ np.array([1, 1j]) * -1j
+        away = np.column_stack([back.real, back.imag])
+        sides = [(rows, places, 5), (np.roll(rows, 1, axis=1), away, 4)]
+        views = [
+            [View(TurnedRows(r[:n], p[:n] * (1, 1 - 2 * (k % 2)), "", np.zeros((n, FACTS))), np.arange(n)) for k in range(2)]
+            for r, p, n in sides
+        ]
+        graphs = [{"x": torch.from_numpy(rng.uniform(5, 30, (n, 16)))} for _, _, n in sides]
+        matches = torch.arange(4).repeat(2, 1).T
+        truth = (torch.arange(5), torch.arange(4)), (torch.ones(5), torch.ones(4))
+        pair = GraphPair(graphs[0], graphs[1], matches, *truth, {"file": "", "sides": "ab"}, torch.eye(4))
+        out.append(Example(views[0], views[1], pair, 1))
+    return out

@@ -18,12 +18,12 @@ FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".ti
 def extract_command(args: argparse.Namespace) -> int:
     """`topomerge extract`: find the rooms, doors and storeys of a cloud; write the map and whatever else was asked for."""
     outputs = _outputs(args)
-    check_outputs([path for path, _ in outputs], [args.input])
+    check_outputs([path for path, _ in outputs], [args.input, *given(args, "poses").values()])
     with Bars(enabled=not args.quiet) as bars:
         from topomerge.extraction.extract import extract
         from topomerge.io.points import read_chunks
 
-        reading = given(args, "up", "unit", "scale", "resolution", "extrude", "ceiling", "spacing", "doors")
+        reading = given(args, "up", "unit", "scale", "resolution", "extrude", "ceiling", "spacing", "doors", "poses", "topic")
         chunks = read_chunks(args.input, **reading, progress=bars.task("read"))
         choices = given(args, "voxel_size", "preset")
         topomap = extract(chunks, **choices, name=args.input, progress=bars.task("extract"))
@@ -51,7 +51,7 @@ EXTRACT = Command(
     "find the rooms, doors and storeys of one partial map",
     "topomerge extract scan.ply -o a.tmap --json a.json --ply a_rooms.ply --figure a.png",
     (
-        option("input", metavar="SCAN", help="point cloud, mesh, building model, OctoMap or 2D map"),
+        option("input", metavar="SCAN", help="point cloud, folder of scans, ROS bag, mesh, building model, OctoMap or 2D map"),
         output("A.tmap", "the map to write"),
         option("--json", metavar="A.json", default=None, help="also write rooms, doors and storeys as JSON"),
         option("--ply", metavar="A.ply", default=None, help="also write the occupied cells with their room as PLY"),
@@ -67,8 +67,15 @@ EXTRACT = Command(
         option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
         option("--spacing", type=above_zero, metavar="D", help="m between points on surfaces of meshes, models and 2D maps"),
         option("--doors", action="store_true", help="keep the door leaves of building models: a leaf is modelled shut"),
+        option(
+            "--poses",
+            metavar="TRAJECTORY",
+            help="where scans were taken: a file in the format of KITTI or TUM, or a topic of the bag (default: what lies beside "
+            "them; of a bag tf, then odometry)",
+        ),
+        option("--topic", metavar="NAME", help="what to read of a bag that has points of several sensors, or maps beside them"),
         quiet("no table, no progress; only warnings"),
     ),
-    paths=("input", "output", "json", "ply", "figure", "report"),
+    paths=("input", "output", "json", "ply", "figure", "report", "poses"),
     description="Find the rooms, doors and storeys of one partial map, and print a table of them.",
 )

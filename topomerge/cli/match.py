@@ -37,7 +37,7 @@ MATCH = Command(
         json_option(),
         option(
             "--method",
-            choices=("consistent", "growing", "assignment", "thesis"),
+            choices=("consistent", "attention", "growing", "assignment", "thesis"),
             default="consistent",
             help="sets of matches that one transform explains (default), or simpler ways",
         ),

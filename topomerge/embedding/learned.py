@@ -22,8 +22,8 @@ from topomerge.embedding.point_features import point_features, point_spectra
 from topomerge.embedding.rooms_around import with_rooms_around
 from topomerge.embedding.sheets import sheet_arrays
 from topomerge.embedding.surroundings import CROP_PART, crops
-from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls, edge_ways, quarter_turned
-from topomerge.embedding.weights import does_not_fit, read_weights
+from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls, edge_ways, quarter_turned, room_facts
+from topomerge.embedding.weights import does_not_fit, embedder_hash, read_weights
 from topomerge.errors import InputError
 from topomerge.numpy_nn import softmax
 from topomerge.types import Array, TopometricMap
@@ -56,7 +56,7 @@ def load_embedder(path: str | Path | None = None) -> Learned:
         run.check_weights()
     except (KeyError, ValueError) as error:
         raise does_not_fit(path, error) from error
-    return Learned(run, network, run.temperature, about)
+    return Learned(run, network, run.temperature, about, embedder_hash(path))
 
 
 class Learned:
@@ -67,10 +67,14 @@ class Learned:
         network: what it is made of.
         temperature: that divides similarities.
         about: on what it was trained, how good it is.
+        embedder: hash of its weights, which its rows are marked with.
     """
 
-    def __init__(self, run: Run, network: Network, temperature: float, about: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, run: Run, network: Network, temperature: float, about: Mapping[str, Any] | None = None, embedder: str = ""
+    ) -> None:
         self.run, self.network, self.temperature, self.about = run, network, temperature, dict(about or {})
+        self.embedder = embedder
 
     def __call__(self, map: TopometricMap) -> Rows:
         return self.graph(self.arrays(map))[0]
@@ -91,7 +95,7 @@ class Learned:
         turns = self.network.turns
         if not len(arrays["x"]):
             none = np.zeros((0, turns, self.network.size))
-            return (none[:, 0] if turns == 1 else TurnedRows(none, np.zeros((0, 2)))), np.zeros(0)
+            return (none[:, 0] if turns == 1 else TurnedRows(none, np.zeros((0, 2)), self.embedder)), np.zeros(0)
         inputs, names = dict(arrays), tensors(self.network)
         if self.network.node.around:
             inputs |= with_rooms_around(inputs, self.network.node.around)
@@ -107,7 +111,9 @@ class Learned:
         if turns == 1:
             return self.run(read)
         rows, bins = zip(*(self.run(quarter_turned(read, k)) for k in range(turns)), strict=True)
-        return TurnedRows(np.stack(rows, axis=1), along_walls(arrays)), np.mean(bins, axis=0)
+        dustbin = np.mean(bins, axis=0)
+        facts = room_facts(arrays["x"], dustbin, arrays["pos"][:, 2])
+        return TurnedRows(np.stack(rows, axis=1), along_walls(arrays), self.embedder, facts), dustbin
 
     @property
     def needs_points(self) -> bool:

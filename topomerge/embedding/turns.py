@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from topomerge.embedding.schema import width
 from topomerge.embedding.surroundings import CROP_PART
 from topomerge.types import Array
 
 QUARTERS = 4
+FACTS = width("x") + 2
 SHARPNESS = 6.0  # that cosines are multiplied with before rooms choose partners; chosen, as those below, on validation pairs
 PARTNERS = 4  # pairs of rooms that vote, times the number of rooms
 WAYS_ALIKE = 0.5  # m, standard deviation of how far rooms that are one are moved
@@ -27,10 +29,14 @@ class TurnedRows:
     Args:
         rows: (R, 4, D) of length 1 each.
         places: (R, 2) m, middles of the rooms; both in the direction of the map's walls (`sheets.Sheet.turn`).
+        embedder: hash of the weights that made them, where there is one.
+        facts: (R, FACTS) what a matcher of two maps reads besides (`room_facts`), where there is one.
     """
 
     rows: Array
     places: Array
+    embedder: str = ""
+    facts: Array | None = None
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -48,6 +54,12 @@ class TurnedRows:
 
 
 Rows = Array | TurnedRows
+
+
+def room_facts(x: Array, dustbin: Array, heights: Array) -> Array:
+    """(R, FACTS) the numbers of rooms (`schema`) as logarithms, the logits of having no partner (R,), and heights (R,) m."""
+    out: Array = np.column_stack([np.sign(x) * np.log1p(np.abs(x)), dustbin, heights]).astype(np.float64)
+    return out
 
 
 def numbers(rows: Rows) -> Array:

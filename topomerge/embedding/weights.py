@@ -65,6 +65,15 @@ def read_weights(folder: str | Path) -> tuple[Network, Weights, dict[str, Any]]:
     return network, weights, dict(settings["about"])
 
 
+def embedder_hash(folder: str | Path) -> str:
+    """Hash of the weights of an embedder: what tells its rows from those of others.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    return str(_settings(embedder_folder(folder) / SETTINGS_FILE)["sha256"])
+
+
 def embedder_folder(folder: str | Path) -> Path:
     """The folder with both files: itself, that of one of the files, or the best embedder of a run."""
     folder = Path(folder)

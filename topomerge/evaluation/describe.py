@@ -17,7 +17,7 @@ from topomerge.code_digest import code_digest
 from topomerge.embedding.embedders import EMBEDDERS, embedder
 from topomerge.embedding.learned import POINT_TABLES
 from topomerge.embedding.room_cells import Descriptor
-from topomerge.embedding.turns import Rows, aligned, numbers
+from topomerge.embedding.turns import Rows, numbers
 from topomerge.evaluation.settings import Evaluation, Variant
 from topomerge.io import archive
 from topomerge.io.listing import plain
@@ -59,15 +59,12 @@ class Inputs:
         return rows, time.process_time() - began + spent
 
 
-def described(
-    variant: Variant, maps: Maps, path: Path, settings: Evaluation, inputs: Inputs
-) -> tuple[tuple[Array, Array], float]:
-    """Descriptors (R, D) of both maps of the pair `path`, turned as they stand to each other, and the seconds that making them
-    took."""
+def described(variant: Variant, maps: Maps, path: Path, settings: Evaluation, inputs: Inputs) -> tuple[tuple[Rows, Rows], float]:
+    """Descriptors of both maps of the pair `path`, and the seconds that making them took."""
     if variant.run:
         learned = trained(variant.run)
         (a, first), (b, second) = (inputs.rows(learned, side, m) for side, m in enumerate(maps))
-        return aligned(a, b), first + second
+        return (a, b), first + second
     options = settings.descriptors[variant.descriptor]
     top = max(settings.k) if variant.k and variant.context == "join" else 0
     descriptors, seconds = [], 0.0

@@ -17,6 +17,7 @@ import topomerge
 from topomerge.code_digest import code_digest
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair
 from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.turns import Rows, aligned
 from topomerge.errors import InputError
 from topomerge.evaluation.describe import Inputs, Maps, described, trained
 from topomerge.evaluation.settings import Evaluation, Variant, variants
@@ -49,13 +50,13 @@ def predict(path: Path, target: Path, settings: Evaluation) -> str:
     rows = {v.name: described(v, maps, path, settings, inputs) for v in evaluated_variants}
     record["seconds"] = {name: seconds for name, (_, seconds) in rows.items()}
     for v in evaluated_variants:
-        a, b = rows[v.name][0]
+        a, b = aligned(*rows[v.name][0])
         arrays[f"{v.name}/a"], arrays[f"{v.name}/b"] = a.astype(np.float32), b.astype(np.float32)
         arrays[f"{v.name}/cost"] = descriptor_costs(a, b).astype(np.float32)
         for method in v.methods:
             arrays |= {
                 f"{v.name}/{method}/{key}": value
-                for key, value in matched(v, method, maps, (a, b), pair.about["scale_free"]).items()
+                for key, value in matched(v, method, maps, rows[v.name][0], pair.about["scale_free"]).items()
             }
     record["merge"] = {WALLS_ALONE: by_walls_alone(maps, pair)} if settings.merge and settings.walls_alone else {}
     mergers = [v for v in evaluated_variants if merges(v, settings)]
@@ -70,11 +71,13 @@ def merges(variant: Variant, settings: Evaluation) -> bool:
     return settings.merge and (bool(variant.run) or (variant.descriptor in settings.mergers and variant.k == 0))
 
 
-def matched(variant: Variant, method: str, maps: Maps, rows: tuple[Array, Array], free: bool = False) -> dict[str, Array]:
+def matched(variant: Variant, method: str, maps: Maps, rows: tuple[Rows, Rows], free: bool = False) -> dict[str, Array]:
     """`rooms` (M, 2), `probability` (M,) and `seconds` of a method; `free`: the second map has a scale of its own."""
     began = time.process_time()
     if method == "mutual":
         rooms, probability = mutual(trained(variant.run), maps) if variant.run else (np.zeros((0, 2), int), np.zeros(0))
+    elif method == "attention" and free:
+        rooms, probability = np.zeros((0, 2), int), np.zeros(0)
     else:
         name, largest = ("assignment", np.inf) if method == "full" else (method, None)
         room_matches = match(*maps, given(maps, rows), name, scale_free=free, largest_cost=largest)
@@ -82,7 +85,7 @@ def matched(variant: Variant, method: str, maps: Maps, rows: tuple[Array, Array]
     return {"rooms": rooms.astype(np.int32), "probability": probability, "seconds": np.array(time.process_time() - began)}
 
 
-def given(maps: Maps, rows: tuple[Array, Array]) -> Descriptor:
+def given(maps: Maps, rows: tuple[Rows, Rows]) -> Descriptor:
     """The descriptor that gives rows that were made before."""
     rows_by_map = {id(m): r for m, r in zip(maps, rows, strict=True)}
     return lambda m: rows_by_map[id(m)]
@@ -105,7 +108,7 @@ def mutual(learned: Any, maps: Maps) -> tuple[Array, Array]:
     return np.stack([i, j], axis=1), np.sqrt(rows[i, j] * columns[j, i])
 
 
-def merged(maps: Maps, rows: tuple[Array, Array], pair: EvaluationPair, poses: str) -> dict[str, Any]:
+def merged(maps: Maps, rows: tuple[Rows, Rows], pair: EvaluationPair, poses: str) -> dict[str, Any]:
     """What the merge of both maps says: as plain values."""
     began = time.process_time()
     try:

@@ -17,7 +17,8 @@ from topomerge.errors import InputError
 from topomerge.fusion.inputs import POSE_SOURCES
 from topomerge.io.listing import plain
 
-EVALUATED_METHODS = ("full", "assignment", "growing", "consistent", "mutual")
+LEARNED_METHODS = ("mutual", "attention")  # of a trained embedder only
+EVALUATED_METHODS = ("full", "assignment", "growing", "consistent", *LEARNED_METHODS)
 TABLES = (
     *("ranking", "matching", "merging", "kinds", "decides", "sites", "independence", "reliability"),
     *("overlap", "area", "sensors", "modality", "source", "seen"),
@@ -53,7 +54,8 @@ class Evaluation:
         k: steps of context of these; context: how it is put together.
         methods: "full" (every room that can have a partner gets one: the thesis' assignment), "assignment" (dear pairs stay
             alone), "growing" (the thesis'), "consistent" (one transform must explain the matches), "mutual" (each other's
-            likeliest, by the probabilities of a trained embedder).
+            likeliest, by the probabilities of a trained embedder), "attention" (what rooms look like and how they lie to each
+            other, by a network, without walls; of the embedder that ships).
         slow_k: "consistent" is run for these k only.
         merge: merge the maps, too, with each of the `mergers` among the descriptors, at k = 0, and each run.
         walls_alone: and by registration of walls and free space alone, without descriptors of rooms.
@@ -140,7 +142,8 @@ def variants(settings: Evaluation) -> Iterator[Variant]:
     for name in settings.only:
         for k in settings.k:
             for how in settings.context if k else settings.context[:1]:
-                methods = tuple(m for m in settings.methods if m != "mutual" and (m != "consistent" or k in settings.slow_k))
+                methods = tuple(m for m in settings.methods if m not in LEARNED_METHODS)
+                methods = tuple(m for m in methods if m != "consistent" or k in settings.slow_k)
                 title = name if not k else f"{name} k={k} {how}"
                 yield Variant(title, name, k, how, methods)
     for run in settings.run:
@@ -193,7 +196,7 @@ def prediction_settings(settings: Evaluation) -> dict[str, Any]:
     if settings.poses != "search":
         options["poses"] = settings.poses
     if not settings.run:
-        options["methods"] = [m for m in settings.methods if m != "mutual"]
+        options["methods"] = [m for m in settings.methods if m not in LEARNED_METHODS]
     runs = {v.name: digest_of(Path(v.run)) for v in variants(settings) if v.run}
     plain_settings: dict[str, Any] = plain({"format": PREDICTIONS_FORMAT, **options, "run": runs})
     return plain_settings

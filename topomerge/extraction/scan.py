@@ -15,6 +15,7 @@ from topomerge.types import Array, PointCloud, VoxelGrid
 
 FINEST_CELL = 0.02  # m
 MOST_RAYS = 400_000  # of a portion of two million points
+MOST_RAYS_HELD = 4_000_000  # of all portions: 0.2 GB
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,7 @@ class _Chunks:
         self.free: VoxelGrid | None = None
         self.warnings: list[str] = []
         self._rays: list[tuple[Array, Array]] = []
+        self._step = 1  # of the rays, every one or every second, fourth ... is held
 
     def __iter__(self) -> Iterator[PointCloud]:
         for chunk in self.chunks:
@@ -93,8 +95,15 @@ class _Chunks:
             self.free = chunk.free or self.free
             self.warnings += [w for w in chunk.warnings if w not in self.warnings]
             if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
-                self._rays.append(_rays(chunk, chunk.poses, chunk.pose_of))
+                self._hold(*_rays(chunk, chunk.poses, chunk.pose_of))
             yield chunk
+
+    def _hold(self, starts: Array, ends: Array) -> None:
+        """Take rays in; where there are too many, every second one goes, so that a walk may be of any length."""
+        self._rays.append((np.ascontiguousarray(starts[:: self._step]), np.ascontiguousarray(ends[:: self._step])))
+        while sum(len(part) for part, _ in self._rays) > MOST_RAYS_HELD:
+            self._step *= 2
+            self._rays = [(a[::2].copy(), b[::2].copy()) for a, b in self._rays]
 
     @property
     def rays(self) -> tuple[Array, Array] | None:

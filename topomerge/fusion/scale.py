@@ -13,7 +13,7 @@ from scipy import fft, ndimage
 
 from topomerge.fusion.correlation import SEARCH, Correlator
 from topomerge.fusion.search import height_offsets, strongest
-from topomerge.fusion.yaw_candidates import yaw_candidates
+from topomerge.fusion.yaw_candidates import distinct_yaws, yaw_candidates
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.refinement import refine
@@ -25,6 +25,7 @@ HEAP_BIN = 0.1  # m
 HEAP_SIGMAS = (0.15, 1.0)  # m: heaps are sharper than the second and no sharper than the first
 SCALE_YAWS = 40  # of yaw and scale that are correlated in the plane
 PER_SCALE_YAW = 4
+SHARED_SCALES = 0.2  # of the logarithm: nearer scales share images that are large enough for all of them
 PROJECTED_WALLS = 4000  # wall columns that are projected
 
 
@@ -36,10 +37,14 @@ def search_scaled(
     pairs = [(v, w) for v in a for w in b if min(len(v.walls), len(w.walls)) >= SEARCH.least_walls]
     pairs.sort(key=lambda p: -min(len(p[0].walls), len(p[1].walls)))
     for v, w in pairs[:4]:
-        turns = [*yaw_candidates(v.profile, w.profile, 5), *yaws, *(pose.yaw for pose in proposed)]
+        turns = distinct_yaws([*yaw_candidates(v.profile, w.profile, 5), *yaws, *(pose.yaw for pose in proposed)])
+        correlators: dict[float, Correlator] = {}
         for _, yaw, scale in scale_candidates(v, w, turns)[:SCALE_YAWS]:
             offset = height_offsets([v.plan], [w.plan], scale)[0]
-            for score, x, y in Correlator(v, w, scale).translations(yaw, PER_SCALE_YAW, scale):
+            upper = float(np.exp(np.ceil(np.log(scale) / SHARED_SCALES) * SHARED_SCALES))
+            if upper not in correlators:  # half of the time is what concerns map a alone
+                correlators[upper] = Correlator(v, w, upper)
+            for score, x, y in correlators[upper].translations(yaw, PER_SCALE_YAW, scale):
                 share = score / max(np.sqrt(len(v.walls) * len(w.walls)) * scale, 1.0)  # larger maps meet more walls
                 hypotheses.append(PoseHypothesis(Sim3(yaw, (x, y, offset), scale), share))
     best = refine(a, b, strongest(hypotheses), True)

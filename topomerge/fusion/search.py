@@ -11,7 +11,7 @@ import numpy as np
 
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.fusion.correlation import SEARCH, Correlator
-from topomerge.fusion.yaw_candidates import yaw_candidates
+from topomerge.fusion.yaw_candidates import distinct_yaws, yaw_candidates
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.refinement import refine, storeys_at
@@ -48,7 +48,7 @@ def search(
             if min(len(v.walls), len(w.walls)) < SEARCH.least_walls:
                 continue
             correlator = Correlator(v, w)
-            for yaw in [*yaw_candidates(v.profile, w.profile), *yaws, *(pose.yaw for pose in proposed)]:
+            for yaw in distinct_yaws([*yaw_candidates(v.profile, w.profile), *yaws, *(pose.yaw for pose in proposed)]):
                 for score, x, y in correlator.translations(yaw):
                     hypotheses.append(PoseHypothesis(Sim3(yaw, (x, y, offset)), score))
     return refine(a, b, strongest(hypotheses))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from scipy import fft, ndimage
 
@@ -12,6 +14,7 @@ from topomerge.types import Array
 YAW_PEAKS = 10  # of the correlated direction profiles
 QUARTER_PEAKS = 3  # peaks that are tried in all quarters,
 QUARTER_GAP = np.radians(3.0)  # where no other peak is as near
+SAME_YAW = np.radians(0.5)  # of two yaws that are nearer one is tried
 
 
 def yaw_candidates(a: Array, b: Array, peaks: int = YAW_PEAKS) -> list[float]:
@@ -35,3 +38,12 @@ def yaw_candidates(a: Array, b: Array, peaks: int = YAW_PEAKS) -> list[float]:
         if all(abs(wrapped(aside - other)) > QUARTER_GAP for other in yaws):
             yaws.append(aside)
     return yaws
+
+
+def distinct_yaws(yaws: Iterable[float]) -> list[float]:
+    """Those (rad) that are not near one before them: matched rooms often propose what the walls did."""
+    out: list[float] = []
+    for yaw in yaws:
+        if all(abs(wrapped(yaw - other)) > SAME_YAW for other in out):
+            out.append(yaw)
+    return out

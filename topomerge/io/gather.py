@@ -105,7 +105,8 @@ class Gatherer:
         self.warnings += piece.warnings
         self.rooms += frame.place_rooms(piece.rooms, self.factor)
         if piece.poses is not None:
-            self.poses = frame.place_poses(piece.poses, self.rotation, self.factor)
+            placed = frame.place_poses(piece.poses, self.rotation, self.factor)
+            self.poses = placed if self.poses is None else np.concatenate([self.poses, placed])
         if piece.free is not None and len(piece.free):
             self.free = frame.place_grid(piece.free, self.rotation, self.factor)
 

@@ -61,7 +61,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     occupied, free = classify(read_image(plan.image), plan)
     yield Piece(np.empty((0, 3)), warnings=plan.warnings, done=0.1)
     # The grid is metric already; only a --scale is left to undo in the lengths that are given in metres.
-    yield from _extrude(path, occupied, free, plan, options)
+    yield from extrude(path, occupied, free, plan, options)
 
 
 def read_yaml(path: Path) -> Plan:
@@ -177,7 +177,7 @@ def classify(image: tuple[Array, Array], plan: Plan) -> tuple[Array, Array]:
     return (share > plan.occupied) & ~clear, (share < plan.free) & ~clear
 
 
-def _extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: ReadOptions) -> Iterator[Piece]:
+def extrude(path: Path, occupied: Array, free: Array, plan: Plan, options: ReadOptions) -> Iterator[Piece]:
     """Floor, walls and, if asked for, ceiling."""
     spacing = (options.spacing or plan.resolution * options.factor) / options.factor
     height = options.extrude / options.factor

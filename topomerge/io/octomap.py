@@ -1,4 +1,4 @@
-"""OctoMap .bt: a text header, then an octree of two-byte nodes, depth first.
+"""OctoMap: a text header, then an octree, depth first; of two-byte nodes (.bt), or with the log-odds of each node (.ot).
 
 Occupied leaves become points at the centres of their smallest cells, free leaves the cloud's free space.
 Source: Hornung et al., "OctoMap", Autonomous Robots 2013, and the format's own header.
@@ -16,10 +16,11 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import BLOCK_POINTS, Piece, damaged
-from topomerge.kernels.codecs import FREE_LEAF, LEAF_LEVEL, OCCUPIED_LEAF, octree_leaves
+from topomerge.kernels.codecs import FREE_LEAF, LEAF_LEVEL, OCCUPIED_LEAF, full_octree_leaves, octree_leaves
 from topomerge.types import Array, VoxelGrid
 
-MAGIC = b"# Octomap OcTree binary file"
+MAGICS = {".bt": b"# Octomap OcTree binary file", ".ot": b"# Octomap OcTree file"}
+NODE_BYTES = {b"OcTree": 5, b"ColorOcTree": 8}  # of a full tree: log-odds, a colour, which children there are
 CENTRE = 1 << (LEAF_LEVEL - 1)  # the cell whose lower corner is the origin of coordinates
 MOST_OCTOMAP_CELLS = 30_000_000  # smallest cells that leaves may be cut into
 TRUSTED_CELLS, CELLS_A_BYTE = 1 << 20, 100  # beyond so many cells, at most so many a byte: a real map has 7
@@ -29,8 +30,9 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Occupied cells as points, free cells as free space."""
     del options
     data = path.read_bytes()
-    resolution, body = _split(path, data)
-    leaves = octree_leaves(body)
+    binary = path.suffix.lower() == ".bt"
+    kind, resolution, body = _split(path, data, binary)
+    leaves = octree_leaves(body) if binary else full_octree_leaves(body, NODE_BYTES[kind])
     if leaves is None:
         raise damaged(path, "an OctoMap", f"its tree does not end where the file ends, after {len(data):,} bytes")
     keys, depths, states = leaves
@@ -47,10 +49,11 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         yield Piece((cells[start : start + BLOCK_POINTS] - CENTRE + 0.5) * resolution, done=0.9)
 
 
-def _split(path: Path, data: bytes) -> tuple[float, Array]:
-    """Resolution (m) and the bytes of the nodes."""
-    if not data.startswith(MAGIC):
-        raise InputError(f"{path}: is not a binary OctoMap (.bt); write it with octomap's writeBinary")
+def _split(path: Path, data: bytes, binary: bool) -> tuple[bytes, float, Array]:
+    """Kind of the tree, resolution (m) and the bytes of the nodes."""
+    if not data.startswith(MAGICS[".bt" if binary else ".ot"]):
+        what, writer = ("a binary OctoMap (.bt)", "writeBinary") if binary else ("a full OctoMap (.ot)", "write")
+        raise InputError(f"{path}: is not {what}; write it with octomap's {writer}")
     header = re.match(rb"(?s)(.{0,10000}?\n)data\r?\n", data)
     if header is None:
         raise damaged(path, "an OctoMap", "its header has no end")
@@ -59,11 +62,13 @@ def _split(path: Path, data: bytes) -> tuple[float, Array]:
         kind, resolution = values[b"id"].strip(), float(values[b"res"])
     except (KeyError, ValueError) as error:
         raise damaged(path, "an OctoMap", "its header has no id or no res") from error
-    if kind != b"OcTree":
-        raise InputError(f"{path}: holds a tree of the kind {kind[:40].decode('latin-1')}; only OcTree is read")
+    able = [b"OcTree"] if binary else list(NODE_BYTES)
+    if kind not in able:
+        names = " and ".join(name.decode() for name in able)
+        raise InputError(f"{path}: holds a tree of the kind {kind[:40].decode('latin-1')}; only {names} is read")
     if not (math.isfinite(resolution) and resolution > 0):
         raise damaged(path, "an OctoMap", f"res {resolution}")
-    return resolution, np.frombuffer(data, np.uint8, offset=header.end())
+    return kind, resolution, np.frombuffer(data, np.uint8, offset=header.end())
 
 
 def _smallest(keys: Array, depths: Array, most: int) -> Array | None:

@@ -28,6 +28,9 @@ class ReadOptions:
         spacing: distance between points sampled on meshes, building models and floor plans, m; None: 0.05 m for surfaces
             and the resolution for floor plans.
         doors: keep the door leaves of a building model; by default its doors stand open.
+        poses: file with the trajectory of a folder of scans, RGB-D images or a bag (KITTI or TUM format); of a bag also the name
+            of a topic with poses. None: what lies beside the scans, or what the bag holds.
+        topic: of a bag, where it has several with points or maps.
     """
 
     up: str | None = None
@@ -38,6 +41,8 @@ class ReadOptions:
     ceiling: bool = False
     spacing: float | None = None
     doors: bool = False
+    poses: str | None = None
+    topic: str | None = None
 
     @property
     def factor(self) -> float:
@@ -63,6 +68,9 @@ def read_options(path: Path, values: Mapping[str, Any]) -> ReadOptions:
         if values.get(name) is not None and values[name] not in allowed:
             wrong = "not an axis" if name == "up" else "not known"
             raise InputError(f"{path}: --{name} {values[name]} is {wrong}; give one of {', '.join(allowed)}")
+    for name in ("poses", "topic"):
+        if getattr(options, name) is not None and not str(getattr(options, name)).strip():
+            raise InputError(f"{path}: --{name} is empty; give a name")
     for name in LENGTH_NAMES:
         value = getattr(options, name)
         if value is not None and not (isinstance(value, Real) and math.isfinite(value) and float(value) > 0):

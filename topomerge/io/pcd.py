@@ -50,7 +50,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         done += len(rows)
         xyz = np.stack([rows[n] for n in "xyz"], axis=1)
         pose_of = None if pose is None else np.zeros(len(rows), np.int32)
-        yield Piece(xyz, _colors(rows), poses=pose, pose_of=pose_of, done=done / header.points)
+        first = pose if done == len(rows) else None
+        yield Piece(xyz, _colors(rows), poses=first, pose_of=pose_of, done=done / header.points)
     if done < header.points:
         raise cut_short(path, done, header.points)
 

@@ -21,7 +21,8 @@ MOST_POINTS = 100_000_000  # points that a sampled or extruded file may become; 
 
 @dataclass(frozen=True)
 class Piece:
-    """Some of the points of a file. `poses`, `free` and `rooms` describe the whole file and come with its first piece."""
+    """Some of the points of a file. `free` and `rooms` describe the whole file and come with its first piece; `poses` come with
+    the first piece whose points need them, and are counted by `pose_of` over all pieces."""
 
     points: Array  # (n, 3) float, in the file's frame and unit
     colors: Array | None = None  # (n, 3) uint8

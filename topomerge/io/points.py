@@ -28,7 +28,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Format:
-    """A family of files. `fixed`: the format states its own unit and up axis, so those given don't apply."""
+    """A family of files, or of folders (no suffixes).
+
+    `fixed`: the format states its own unit and up axis, so those given don't apply; `takes`: options that only it knows.
+    """
 
     name: str
     module: str
@@ -36,6 +39,7 @@ class Format:
     up: str = "z"
     fixed: bool = False
     extra: str = ""  # of the package, with the libraries that it needs
+    takes: tuple[str, ...] = ()
 
 
 FORMATS = (
@@ -47,10 +51,13 @@ FORMATS = (
     Format("an E57 file", "e57", (".e57",), extra="e57"),
     Format("a mesh", "mesh", (".obj", ".stl")),
     Format("a glTF mesh", "mesh", (".glb", ".gltf"), up="y"),
-    Format("an OctoMap", "octomap", (".bt",)),
+    Format("an OctoMap", "octomap", (".bt", ".ot")),
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc"),
+    Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic")),
     Format("a floor plan", "grid", (".yaml", ".yml", ".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"), fixed=True),
 )
+SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
+RGBD_FOLDER = Format("a folder of RGB-D images", "rgbd", (), takes=("poses",))
 
 
 def suffixes() -> tuple[str, ...]:
@@ -62,10 +69,11 @@ def read_points(path: str | Path, *, progress: Progress | None = None, **options
     """The points of a file as one cloud, in metres, z up: ``read_points("a.ply", up="y", unit="mm")``.
 
     Args:
-        path: the file; its suffix names the format.
+        path: the file, whose suffix names the format, or a folder of scans.
         progress: called now and then with the share done and a text.
         options: those of `topomerge.io.options.ReadOptions`: ``up``, ``unit``, ``scale`` of the coordinates; ``resolution``,
-            ``extrude``, ``ceiling`` of floor plans; ``spacing`` of points on surfaces; ``doors`` of building models.
+            ``extrude``, ``ceiling`` of floor plans; ``spacing`` of points on surfaces; ``doors`` of building models; ``poses``
+            and ``topic`` of scans.
 
     Raises:
         InputError: anything that keeps the file from being read, or a wrong option, in one line.
@@ -82,7 +90,7 @@ def read_chunks(
     last. Meshes, building models, OctoMaps and NumPy archives are read whole and then cut.
 
     Args:
-        path: of the file.
+        path: of the file or folder.
         chunk: points of a cloud, at most.
         progress: called now and then with the share done and a text.
         options: as of `read_points`, whose errors these are, too.
@@ -92,6 +100,10 @@ def read_chunks(
     reading = read_options(path, options)
     if chunk < 1:
         raise InputError(f"{path}: a chunk of {chunk} points can't be read; give 1 or more")
+    for name in ("poses", "topic"):
+        if getattr(reading, name) is not None and name not in file_format.takes:
+            able = ", ".join(f.name for f in (*FORMATS, SCAN_FOLDER, RGBD_FOLDER) if name in f.takes)
+            raise InputError(f"{path}: --{name} is of no use to {file_format.name}, only to {able}; leave it out")
     warnings: list[str] = []
     if file_format.fixed and (reading.unit not in (None, "m") or reading.up not in (None, "z")):
         warnings.append(f"{file_format.name} states its own unit and up axis: --unit and --up are not applied")
@@ -102,13 +114,13 @@ def read_chunks(
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file that exists and can be opened.
+    """The format of a file that exists and can be opened, or of a folder.
 
     Raises:
         InputError: it can't, or its suffix is that of no format.
     """
     if path.is_dir():
-        raise InputError(f"{path}: is a folder; give a file in it")
+        return _folder_format(path)
     for file_format in FORMATS:
         if path.suffix.lower() in file_format.suffixes:
             break
@@ -129,6 +141,15 @@ def format_of(path: Path) -> Format:
     if not first:
         raise InputError(f"{path}: is empty; copy or export it again")
     return file_format
+
+
+def _folder_format(path: Path) -> Format:
+    """What a folder holds: a ROS 2 bag or parts of a bag, RGB-D images, or scans."""
+    bag = next(f for f in FORMATS if f.module == "bag")
+    names = [p.name for p in path.iterdir()]
+    if "metadata.yaml" in names or any(n.endswith(bag.suffixes) for n in names):
+        return bag
+    return RGBD_FOLDER if "depth.txt" in names else SCAN_FOLDER
 
 
 def _pieces(path: Path, file_format: Format, options: ReadOptions) -> Iterator[Piece]:

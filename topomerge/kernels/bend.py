@@ -147,3 +147,40 @@ def interpolated(points, origin, step, nodes):  # type: ignore[no-untyped-def]  
             high = (1 - u) * nodes[i, j + 1, c] + u * nodes[i + 1, j + 1, c]
             out[k, c] = (1 - v) * low + v * high
     return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def wall_gain(level, table, lost, seen):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(Q, nx, ny) float32: the entry of a table (256,) at each level (Q, nx, ny) uint8, less what is lost there (nx, ny) float32;
+    0 where nothing was seen (nx, ny) and the entry is not above 0."""
+    out = np.zeros(level.shape, np.float32)
+    for q in range(level.shape[0]):
+        for i in range(level.shape[1]):
+            for j in range(level.shape[2]):
+                gain = table[level[q, i, j]]
+                if seen[i, j] or gain > 0:
+                    out[q, i, j] = gain - lost[i, j]
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def blended_moves(points, distance, nearest, anchors, moves, reach):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(n, 2) m: shifts of points (n, 2) by the moves (k, 4) of pieces about their anchors (k, 2).
+
+    Args:
+        distance, nearest: (n, q) m to the nearest pieces, ascending, and which these are.
+        reach: m, standard deviation of the weights.
+    """
+    out = np.zeros((len(points), 2))
+    c, s = np.exp(moves[:, 3]) * np.cos(moves[:, 2]) - 1.0, np.exp(moves[:, 3]) * np.sin(moves[:, 2])
+    for p in range(len(points)):
+        total, x, y = 0.0, 0.0, 0.0
+        for q in range(nearest.shape[1]):
+            k = nearest[p, q]
+            weight = np.exp((distance[p, 0] ** 2 - distance[p, q] ** 2) / (2 * reach**2))
+            dx, dy = points[p, 0] - anchors[k, 0], points[p, 1] - anchors[k, 1]
+            total += weight
+            x += weight * (moves[k, 0] + c[k] * dx - s[k] * dy)
+            y += weight * (moves[k, 1] + s[k] * dx + c[k] * dy)
+        out[p, 0], out[p, 1] = x / total, y / total
+    return out

@@ -121,3 +121,45 @@ def octree_leaves(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], 
     if count < 0 or read != len(data):
         return None
     return keys[:count], depths[:count], states[:count]
+
+
+@njit(cache=True)
+def _full_octree(data, width, keys, depths, states, stack):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Walk the nodes of `width` bytes, log-odds first and bits of the children last; returns as `_octree`."""
+    top, count, at = 1, 0, 0
+    stack[0, :] = 0
+    while top > 0:
+        top -= 1
+        x, y, z, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
+        if at + width > len(data):
+            return -1, at
+        high, bits = int(data[at + 3]), int(data[at + width - 1])
+        if (high & 0x7F) == 0x7F and int(data[at + 2]) & 0x80:
+            return -1, at  # not finite
+        if bits == 0:
+            free = (high & 0x80) != 0 and (high & 0x7F or data[at] or data[at + 1] or data[at + 2])  # below 0, and not -0
+            keys[count, 0], keys[count, 1], keys[count, 2] = x, y, z
+            depths[count] = depth
+            states[count] = FREE_LEAF if free else OCCUPIED_LEAF
+            count += 1
+        elif depth >= LEAF_LEVEL:
+            return -1, at
+        at += width
+        side = 1 << (LEAF_LEVEL - depth - 1) if depth < LEAF_LEVEL else 0
+        for child in range(7, -1, -1):
+            if (bits >> child) & 1:
+                stack[top, 0], stack[top, 1] = x + (child & 1) * side, y + ((child >> 1) & 1) * side
+                stack[top, 2], stack[top, 3] = z + ((child >> 2) & 1) * side, depth + 1
+                top += 1
+    return count, at
+
+
+def full_octree_leaves(data: NDArray[np.uint8], width: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
+    """As `octree_leaves`, of the nodes of a full OctoMap, each of `width` bytes; the root may be a leaf (of depth 0)."""
+    room = len(data) // width
+    keys, depths, states = np.empty((room, 3), np.int32), np.empty(room, np.int8), np.empty(room, np.int8)
+    stack = np.empty((8 * LEAF_LEVEL + 8, 4), np.int32)
+    count, read = _full_octree(data, width, keys, depths, states, stack)
+    if count < 0 or read != len(data):
+        return None
+    return keys[:count], depths[:count], states[:count]

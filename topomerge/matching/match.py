@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,13 +18,17 @@ from topomerge.matching.consistency import hypotheses
 from topomerge.matching.costs import descriptor_costs, similarities, usual_best
 from topomerge.matching.growing import align, grow
 from topomerge.matching.odds import match_probability
+from topomerge.matching.pose_of_matches import pose_of_matches, rooms_and_doors
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.result import Matching
+from topomerge.matching.room_matcher import RoomOdds, certainty_of_turns, room_odds
+from topomerge.matching.scores import assign_certain
 from topomerge.types import Array, TopometricMap
 
-METHODS = ("consistent", "growing", "assignment", "thesis")
+METHODS = ("consistent", "attention", "growing", "assignment", "thesis")
 THESIS: dict[str, Any] = {"laplacian": "graph", "values": 256, "normalise": "first", "k": 1}
 LIKELY_MATCH = 0.5  # probability of a match that the best hypothesis lacks
+LEAST_CERTAINTY = 0.25  # of a match by attention: the best F1 on validation pairs
 MOST_HYPOTHESES = 10
 
 
@@ -57,8 +62,10 @@ def match(
     Args:
         embedder: ``"learned"``, ``"engineered"``, ``"shapedna"``, ``"feather"``, the folder of a trained one, or a callable
             map -> (R, D).
-        method: ``"consistent"``: sets of matches that one transform explains; ``"growing"``: from each pair to its neighbours;
-            ``"assignment"``: by cost alone; ``"thesis"``: ShapeDNA with one step of context, and growing (embedder and k are the
+        method: ``"consistent"``: sets of matches that one transform explains, by walls and floor; ``"attention"``: what rooms
+            look like and how they lie to each other, by a network (`room_matcher`, with the embedder that ships);
+            ``"growing"``: from each pair to its neighbours; ``"assignment"``: by cost alone;
+            ``"thesis"``: ShapeDNA with one step of context, and growing (embedder and k are the
             thesis' then).
         k: steps of context.
         scale_free: the scale of b is unknown (only ``"consistent"`` allows for it).
@@ -73,20 +80,41 @@ def match(
         raise InputError(f"matching method {method!r}: {', '.join(METHODS)} are possible")
     check(a, b)
     describe = make_embedder("shapedna", **THESIS) if method == "thesis" else make_embedder(embedder, k, **options)
-    cost = descriptor_costs(checked(describe, a), checked(describe, b))
+    rows = checked(describe, a), checked(describe, b)
+    cost = descriptor_costs(*rows)
     similarity = similarities(cost)
     statistics = {"rooms_a": float(len(a.rooms)), "rooms_b": float(len(b.rooms)), "median_cost": float(np.median(cost))}
     statistics["usual_best_cost"] = usual_best(cost)
     if method == "assignment":
         pairs = assign(cost, 2 * usual_best(cost) if largest_cost is None else largest_cost)
         return Matching(pairs, similarity[tuple(pairs.T)], statistics=statistics)
+    odds = room_odds(*rows) if method in ("attention", "consistent") and not scale_free else ()
+    if method == "attention":
+        return _by_attention(a, b, odds, statistics)
     if method == "consistent":
-        ranked = hypotheses(a, b, cost, similarity, scale_free, MOST_HYPOTHESES)
+        likely = certainty_of_turns(odds) if odds else similarity
+        ranked = hypotheses(a, b, 1 - likely if odds else cost, likely, scale_free, MOST_HYPOTHESES)
         rooms, probability = marginal(a, b, ranked)
     else:  # one hypothesis wins as a whole, as in the thesis
         ranked = _from_growing(a, b, cost, similarity, growing)
         rooms, probability = (ranked[0].rooms, ranked[0].fit) if ranked else (np.zeros((0, 2), np.int64), np.zeros(0))
     return Matching(rooms, probability, ranked[0].transform if ranked else None, ranked, statistics)
+
+
+def _by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], statistics: dict[str, float]) -> Matching:
+    """Matches of `room_matcher`, and the pose under which most of them agree.
+
+    Raises:
+        InputError: the rows are of another embedder, or the scale is unknown.
+    """
+    if not odds:
+        raise InputError("method attention needs the embedder that ships, and maps of one scale; take method consistent")
+    certain = max(odds, key=lambda turned: turned.sureness).certainty
+    rooms = assign_certain(certain, LEAST_CERTAINTY)
+    pose = pose_of_matches(rooms_and_doors(a), rooms_and_doors(b), certain)
+    probability = certain[tuple(rooms.T)]
+    ranked = () if pose is None else (PoseHypothesis(pose, float(len(rooms)), 1.0, {}, True, rooms, probability),)
+    return Matching(rooms, probability, pose, ranked, statistics)
 
 
 def check(a: TopometricMap, b: TopometricMap) -> None:

@@ -9,7 +9,6 @@ from topomerge.datasets.pairs.grid_pairs import GridRecipe
 from topomerge.datasets.pairs.lookalikes import LookalikeRecipe
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.recipe import Recipe
-from topomerge.errors import InputError
 
 LOOKALIKES_TAKEN = ("none", "judged", "fitted")
 
@@ -219,6 +218,35 @@ class MergeBelief(TaskSettings):
 
 
 @dataclass
+class RoomMatching(NetworkTask):
+    """Args:
+    data: name of a set of pairs (`cache`/<name>.jsonl) or a manifest, and validation the one that is watched, as of `embedding`.
+    views: of each map that are changed, beside the one that is as it is.
+    width: numbers of a room within the network; layers: of attention.
+    wrong_turn: weight of pairs at a wrong turn; turn: of telling it from the right one.
+    steps: of an epoch; warmup: those in which the rate rises.
+    """
+
+    task: str = "room_matcher"
+    name: str = "room_matcher"
+    data: Recipe = field(default_factory=Recipe)
+    heldout: Recipe = field(default_factory=Recipe)
+    validation: str = "val_small"
+    views: int = 5
+    width: int = 96
+    layers: int = 3
+    dropout: float = 0.1
+    wrong_turn: float = 0.15
+    turn: float = 0.3
+    epochs: int = 10
+    batch: int = 16
+    warmup: int = 50
+    rate: float = 1e-3
+    steps: int = 50
+    watch: str = "f1"
+
+
+@dataclass
 class MatchOdds(TaskSettings):
     """Args:
     pull: to 0, of all weights but the constant.
@@ -246,40 +274,3 @@ class FeatureScale(TaskSettings):
     heldout: Recipe = field(default_factory=Recipe)
     shrink: float = 0.1
     watch: str = "recall@1"
-
-
-def check_task(settings: TaskSettings) -> None:
-    """Refuse what makes no sense.
-
-    Raises:
-        InputError: names the key.
-    """
-    keys = ("epochs", "batch", "steps", "hidden", "networks", "hypotheses", "inspected")
-    at_least = {**dict.fromkeys(keys, 1), "jobs": 1, "patience": 0, "seed": 0, "warmup": 0, "folds": 2, "hold_out": 2}
-    for key, least in at_least.items():
-        if getattr(settings, key, least) < least:
-            raise InputError(f"{key} must be {least} or more, not {getattr(settings, key)}")
-    for key in ("rate", "pose_strength", "winner_strength", "kinds_strength"):
-        if not getattr(settings, key, 1.0) > 0:
-            raise InputError(f"{key} must be above 0, not {getattr(settings, key)}")
-    if not 0 < getattr(settings, "risk", 20.0) <= 1000:
-        raise InputError(f"risk must be above 0 and at most 1000, not {settings.risk}")  # type: ignore[attr-defined]
-    if not 0 <= getattr(settings, "floor", 0.5) <= 10:
-        raise InputError(f"floor must be 0 to 10, not {settings.floor}")  # type: ignore[attr-defined]
-    if getattr(settings, "half", 0) not in (0, 1, 2):
-        raise InputError(f"half must be 0, 1 or 2, not {settings.half}")  # type: ignore[attr-defined]
-    if isinstance(settings, MergeBelief) and settings.lookalikes not in LOOKALIKES_TAKEN:
-        raise InputError(f"lookalikes must be {', '.join(LOOKALIKES_TAKEN)}, not {settings.lookalikes!r}")
-    if isinstance(settings, MergeBelief) and settings.refit not in ("all", "closely"):
-        raise InputError(f"refit must be all or closely, not {settings.refit!r}")
-    if len(getattr(settings, "halves", [])) not in (0, 2):
-        raise InputError(f"halves must name two runs, not {settings.halves}")  # type: ignore[attr-defined]
-    if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
-        raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
-    if isinstance(settings, PlanSegmentation):
-        if settings.crop < 16 or settings.crop % 16:
-            raise InputError(f"crop must be a multiple of 16, not {settings.crop}")
-        if len(settings.widths) != 8 or min(settings.widths) < 1:
-            raise InputError(f"widths must be 8 numbers of channels, not {settings.widths}")
-        if len(settings.loss.classes) != 5 or min(settings.loss.classes) <= 0:
-            raise InputError(f"loss.classes must be 5 weights above 0, not {settings.loss.classes}")

@@ -43,6 +43,7 @@ TASKS = {
     "place_evidence": Task("place_evidence", "PlaceEvidence", "topomerge.fusion.evidence", "place_network.npz", 4.0),
     "merge_belief": Task("merge_belief", "MergeBelief", "topomerge.fusion", "calibration.json", 4.0),
     "embedding": Task("embedding", "", "topomerge.embedding.pretrained", "embedder.safetensors", 0.6),
+    "room_matcher": Task("room_matcher", "RoomMatching", "topomerge.matching", "room_matcher.npz", 0.3),
 }
 
 
@@ -109,7 +110,7 @@ def _checked(settings: Any) -> Any:
         from topomerge.training.settings import composed
 
         return composed(settings)
-    from topomerge.training.task_settings import check_task
+    from topomerge.training.task_check import check_task
 
     check_task(settings)
     return settings

@@ -11,11 +11,12 @@ from torch import Tensor
 
 from topomerge.embedding.rooms_around import through_doors
 from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls
+from topomerge.matching.pose_of_matches import pose_of_matches
 from topomerge.matching.scores import assign_certain, certainty, has_twin, pair_counts, partner_ranks
 from topomerge.models.embedder import Embedder, match_scores
 from topomerge.training.batches import make_batch, seen_well
 from topomerge.training.packed import GraphPair
-from topomerge.training.success import merged_right, pose_of_matches
+from topomerge.training.success import merged_right
 from topomerge.types import Array
 
 SIZE_COLUMNS = (0, 3, 4)  # area, length, width: columns of x

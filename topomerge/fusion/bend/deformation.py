@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from topomerge.errors import InputError
 from topomerge.fusion.bend.shift_field import INVERSE_ROUNDS, INVERSE_STEP, ShiftField
+from topomerge.kernels.bend import blended_moves
 from topomerge.types import Array
 
 BLENDED_PIECES = 24  # nearest ones that have a say in the move of a place; the weight of others is nil
@@ -176,14 +177,5 @@ def blended(points: Array, anchors: Array, moves: Array, reach: float) -> Array:
     many = min(BLENDED_PIECES, len(anchors))
     distance, nearest = cKDTree(anchors).query(points, many)
     distance, nearest = distance.reshape(len(points), many), nearest.reshape(len(points), many)
-    weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * reach**2))
-    weight /= weight.sum(axis=1, keepdims=True)
-    shifts = np.zeros((len(points), 2))
-    for k in range(many):  # one neighbour at a time: n x 24 x 2 x 2 numbers would be large
-        row = nearest[:, k]
-        dx, dy = (points - anchors[row]).T
-        grown = np.exp(moves[row, 3])
-        c, s = grown * np.cos(moves[row, 2]) - 1, grown * np.sin(moves[row, 2])
-        moved = np.column_stack([moves[row, 0] + c * dx - s * dy, moves[row, 1] + s * dx + c * dy])
-        shifts += weight[:, k : k + 1] * moved
-    return shifts
+    out: Array = blended_moves(points, distance, nearest, anchors, moves, reach)
+    return out

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from topomerge.fusion.bend.pieces import Pieces
-from topomerge.kernels.bend import move_scores
+from topomerge.kernels.bend import move_scores, wall_gain
 from topomerge.matching.plan_fields import DISTANCE_CAP, PlanFields, distance_to
 from topomerge.types import Array, Sim3
 
@@ -51,10 +51,9 @@ class Target:
         """(5, nx, ny) float32 what a wall column that faces each sector, or none, gains there; the corner of the raster, m."""
         likelihood = np.log(MISSED + (1 - MISSED) * np.exp(-(DISTANCE_STEPS**2) / (2 * sigma**2))) - np.log(INDIFFERENT)
         level, origin, on_free, seen = self._rasters
-        gain = (EVIDENCE * likelihood).astype(np.float32)[level]
-        positive = gain > 0
-        gain -= on_free
-        return np.where(seen | positive, gain, np.float32(0)), origin
+        table = np.zeros(256, np.float32)
+        table[: len(likelihood)] = EVIDENCE * likelihood
+        return wall_gain(level, table, on_free, seen), origin
 
     def sectors(self, faces: Array) -> Array:
         """(n,) sector of the faces (n, 2), `SECTORS` where there is none."""

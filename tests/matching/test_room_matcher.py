@@ -1,0 +1,145 @@
+"""Matching by attention: what must not matter does not, NumPy and torch agree, files are trusted only as far as they can be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from topomerge.models.room_matcher import RoomMatcher, exported_matcher
+
+from topomerge.embedding.turns import FACTS, room_facts
+from topomerge.errors import InputError
+from topomerge.io import archive
+from topomerge.io.weight_files import VARIABLE
+from topomerge.matching import room_matcher
+from topomerge.matching.room_matcher import (
+    RoomsSeen,
+    agreement,
+    certainty_of_turns,
+    matcher_weights,
+    odds_of,
+    read_matcher,
+)
+
+ROWS = 24
+
+
+def rooms(count: int, seed: int) -> RoomsSeen:
+    """Rooms that look like nothing else, on two storeys."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(count, ROWS))
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    heights = np.where(np.arange(count) % 5 == 4, 3.0, 0.0)
+    return RoomsSeen(rows, rng.uniform(0, 30, (count, 2)), heights, rng.normal(size=(count, FACTS)))
+
+
+def some(of: RoomsSeen, index: np.ndarray) -> RoomsSeen:
+    """Rooms of an index."""
+    return RoomsSeen(of.rows[index], of.places[index], of.heights[index], of.facts[index])
+
+
+def network(seed: int = 0) -> dict[str, np.ndarray]:
+    """Weights of a small network that was not trained."""
+    torch.manual_seed(seed)
+    return exported_matcher(RoomMatcher(ROWS, width=16, layers=2), "embedder")
+
+
+def seen_again(of: RoomsSeen, strange: int) -> RoomsSeen:
+    """All rooms, moved together and a little changed, before so many others."""
+    rng, other = np.random.default_rng(5), rooms(strange, 9)
+    rows = of.rows + 0.05 * rng.normal(size=of.rows.shape)
+    rows = np.concatenate([rows / np.linalg.norm(rows, axis=1, keepdims=True), other.rows])
+    places = np.concatenate([of.places + (7.0, -3.0), other.places])
+    return RoomsSeen(rows, places, np.concatenate([of.heights, other.heights]), np.concatenate([of.facts, other.facts]))
+
+
+def test_numpy_and_torch_give_the_same() -> None:
+    torch.manual_seed(0)
+    net = RoomMatcher(ROWS, width=16, layers=2).eval()
+    a = rooms(6, 1)
+    b = seen_again(a, 4)
+    with torch.no_grad():
+        partners = net(a, b)[-1]
+    odds = odds_of(a, b, exported_matcher(net, ""))
+    assert odds.rows == pytest.approx(partners.rows.exp().numpy(), abs=1e-5)
+    assert odds.columns == pytest.approx(partners.columns.exp().numpy(), abs=1e-5)
+    assert odds.rows.sum(axis=1) == pytest.approx(1.0) and odds.columns.shape == (10, 7)
+
+
+def test_order_of_rooms_order_of_maps_and_places_of_frames_do_not_matter() -> None:
+    a, w = rooms(7, 1), network()
+    b = seen_again(a, 3)
+    odds, order = odds_of(a, b, w), np.random.default_rng(1).permutation(10)
+    shuffled = odds_of(a, some(b, order), w)
+    assert shuffled.certainty == pytest.approx(odds.certainty[:, order])
+    assert odds_of(b, a, w).certainty == pytest.approx(odds.certainty.T)
+    moved = odds_of(a, replace(b, places=b.places + (100.0, -40.0), heights=b.heights), w)
+    assert moved.certainty == pytest.approx(odds.certainty)
+
+
+def test_many_rooms_at_once_give_what_few_at_a_time_do(monkeypatch) -> None:
+    a, w = rooms(9, 1), network()
+    b = seen_again(a, 5)
+    whole = odds_of(a, b, w).certainty
+    monkeypatch.setattr(room_matcher, "ROWS_AT_ONCE", 2)
+    monkeypatch.setattr(room_matcher, "MOST_VOTED", 130)
+    assert odds_of(a, b, w).certainty == pytest.approx(whole)
+
+
+def test_pairs_that_are_moved_alike_agree_and_those_of_another_storey_do_not() -> None:
+    places = np.array([[0.0, 0], [5, 0], [5, 6], [12, 6]])
+    a = RoomsSeen(np.zeros((4, 1)), places, np.array([0.0, 0, 0, 3]), np.zeros((4, FACTS)))
+    b = replace(a, places=places + (2.0, 1.0), heights=np.zeros(4))
+    votes = agreement(np.eye(4), a, b)
+    assert votes[0, 0, 0] == pytest.approx(np.log1p(3 * 2)) and votes[3, 3, 0] == 0.0  # two others say the same way
+    assert votes[0, 1, 0] == 0.0 and votes[1, 0].max() == 0.0
+    off = agreement(np.eye(4), a, replace(b, places=b.places + np.array([[0.75, 0], [0, 0], [0, 0], [0, 0]])))
+    assert off[0, 0, 0] == pytest.approx(np.log1p(3 * 2 * 0.75**2)) and off[1, 1, 0] == pytest.approx(np.log1p(3 * (1 + 0.75**2)))
+
+
+def test_turns_are_as_likely_as_they_are_sure() -> None:
+    sure = room_matcher.RoomOdds(np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]), 2)
+    none = room_matcher.RoomOdds(np.array([[0.0, 1.0]]), np.array([[0.0, 1.0]]), 0)
+    assert sure.sureness == 1.0 and none.sureness == 0.0
+    assert certainty_of_turns([none, sure]) == pytest.approx(np.e / (1 + np.e))
+
+
+def test_the_network_that_ships_is_that_of_the_embedder_that_ships() -> None:
+    from topomerge.embedding.learned import load_embedder
+
+    weights = matcher_weights()
+    assert room_matcher.embedder_of(weights) == load_embedder().embedder
+    assert weights["rows.w"].shape[0] == 4 * load_embedder().network.size
+
+
+def test_facts_of_rooms_are_logarithms_their_dustbin_and_their_height() -> None:
+    facts = room_facts(np.array([[np.e - 1, -np.e + 1, 0.0]]), np.array([0.5]), np.array([3.0]))
+    assert facts == pytest.approx(np.array([[1, -1, 0, 0.5, 3]]))
+
+
+def test_files_that_are_no_network_are_refused(tmp_path, monkeypatch) -> None:
+    weights, path = network(), tmp_path / "room_matcher.npz"
+    for k, (name, change) in enumerate(
+        (
+            ("1.query.w", None),
+            ("0.head.w", None),
+            ("embedder", None),
+            ("facts.w", lambda w: w[:1]),
+            ("2.way_in.w", lambda w: w[:-1]),
+            ("2.norm_each.b", lambda w: w * np.nan),
+        )
+    ):
+        broken = {n: w for n, w in weights.items() if n != name} | ({name: change(weights[name])} if change else {})
+        if name == "1.query.w":
+            broken = {n: w for n, w in broken.items() if not n.startswith("1.join_across")}
+            broken["1.query.w"] = weights["1.query.w"]
+        archive.write(broken, tmp_path / f"{k}.npz")
+        with pytest.raises(InputError, match=f"{k}.npz: is no network that matches rooms"):
+            read_matcher(tmp_path / f"{k}.npz")
+    archive.write(weights, path)
+    path.write_bytes(path.read_bytes()[:-200])
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    with pytest.raises(InputError, match=r"room_matcher.npz: is no network"):
+        matcher_weights()

@@ -1,0 +1,197 @@
+"""Folders of scans with a trajectory, as LiDAR odometry and SLAM leave them behind.
+
+Scans are PLY, PCD or KITTI's BIN (float32 x y z intensity), each in the frame of its sensor, in the folder or in one below it;
+the trajectory is a file in the folder or beside the scans (`topomerge.io.trajectory`). Scans are matched with poses by the time
+in their names, by their number, or in their order. PCD files that state their viewpoints need no trajectory.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io import pcd, ply
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import BLOCK_POINTS, Piece, damaged
+from topomerge.io.posed import PosedScan, pieces
+from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
+from topomerge.types import Array
+
+SCAN_SUFFIXES = (".ply", ".pcd", ".bin")
+BIN_ROW = 16  # bytes: x, y, z and intensity
+# What GLIM, loop-closing systems, KISS-ICP and KISS-SLAM, FAST-LIO's followers and the KITTI benchmark call their trajectories;
+# the better one first: after loop closure, and with times.
+TRAJECTORY_NAMES = (
+    *("traj_lidar.txt", "optimized_poses_tum.txt", "slam_poses_tum.txt", "*_poses_tum.txt", "*_tum.txt", "*.tum"),
+    *("slam_poses_kitti.txt", "*_poses_kitti.txt", "poses.txt", "poses_tum.txt", "poses_kitti.txt", "*_kitti.txt"),
+    *("trajectory.txt", "odom_lidar.txt", "groundtruth.txt"),
+)
+# Seconds of the epoch and their fraction, or the last number of a name with the fraction that follows a point.
+NAME_TIME = re.compile(r"(?<!\d)(\d{9,10})[._](\d{1,9})\D*$|(\d+(?:\.\d+)?)\D*$")
+EPOCH_UNITS = {19: 1e-9, 16: 1e-6, 13: 1e-3}  # s, by how many digits a time of our decades has
+INDEX_DIGITS = 8  # at most, of the number of a scan
+
+
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
+    """The points of all scans in the frame of the trajectory, scan by scan."""
+    scans = scans_of(path)
+    trajectory_file = Path(options.poses) if options.poses else _trajectory_of(path, scans[0].parent)
+    if trajectory_file is None:
+        yield from pieces(_with_viewpoints(path, scans, options))
+        return
+    trajectory = read_trajectory(trajectory_file)
+    poses, said = match_poses(path, scans, trajectory, trajectory_file)
+    yield from pieces(_posed(scans, poses, options), said)
+
+
+def scans_of(path: Path) -> list[Path]:
+    """The scans in a folder, or in the only folder below it that has some, in the order of their numbers.
+
+    Raises:
+        InputError: there are none, or of several kinds.
+    """
+    scans = _scans_in(path)
+    if not scans:
+        below = {p.name: s for p in sorted(path.iterdir()) if p.is_dir() and (s := _scans_in(p))}
+        if len(below) > 1:
+            raise InputError(f"{path}: holds several folders of scans ({', '.join(below)[:200]}); give one of them and --poses")
+        scans = next(iter(below.values()), [])
+    if not scans:
+        raise InputError(
+            f"{path}: is a folder without scans (ply, pcd, bin), a ROS bag or RGB-D images; give one of these, or a file"
+        )
+    kinds = Counter(scan.suffix.lower() for scan in scans)
+    if len(kinds) > 1:
+        counts = ", ".join(f"{count} {kind[1:]}" for kind, count in kinds.most_common())
+        raise InputError(f"{path}: holds scans of several kinds ({counts}); give a folder with those of one sensor")
+    return scans
+
+
+def _scans_in(folder: Path) -> list[Path]:
+    scans = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".") and p.is_file()]
+    return sorted(scans, key=lambda p: ([int(n) for n in re.findall(r"\d+", p.stem)], p.name))
+
+
+def _trajectory_of(path: Path, beside: Path) -> Path | None:
+    """The trajectory that belongs to the scans: in the folder that was given, among the scans, or beside their folder."""
+    for folder in dict.fromkeys((path, beside, path.resolve().parent)):
+        names = [p for p in sorted(folder.iterdir()) if p.suffix in (".txt", ".tum") and p.is_file()]
+        for pattern in TRAJECTORY_NAMES:
+            fitting = [p for p in names if fnmatch(p.name, pattern)]
+            if len(fitting) > 1:
+                shown = ", ".join(p.name for p in fitting)[:200]
+                raise InputError(f"{path}: has several trajectories ({shown}); give --poses with one of them")
+            if fitting:
+                return fitting[0]
+    return None
+
+
+def name_time(stem: str) -> float | None:
+    """The time (s) or the number that stands in the name of a scan, the suffix left out; None: neither.
+
+    ``1570513628_110666000``, ``1570513628.110666`` and ``1570513628110666000`` are times, ``000017`` and ``scan_17`` numbers.
+    """
+    match = NAME_TIME.search(stem)
+    if match is None:
+        return None
+    if match[1]:
+        return float(f"{match[1]}.{match[2]}")
+    return int(match[3]) * EPOCH_UNITS.get(len(match[3]), 1.0) if match[3].isdigit() else float(match[3])
+
+
+def match_poses(folder: Path, scans: list[Path], trajectory: Trajectory, source: Path) -> tuple[list[Array | None], list[str]]:
+    """The pose (4, 4) of each scan, None where there is none, and what the user should know.
+
+    Raises:
+        InputError: no pose belongs to a scan, or it can't be said which.
+    """
+    names = [name_time(scan.stem) for scan in scans]
+    times = None if None in names else np.array(names, float)
+    numbered = all(map(_counted, scans))
+    if trajectory.times is not None and times is not None and not numbered:
+        return _by_time(folder, times, trajectory, source)
+    if len(scans) == len(trajectory):
+        return list(trajectory.poses), []
+    if numbered and times is not None:
+        whole = trajectory.times is None or bool((trajectory.times == np.rint(trajectory.times)).all())
+        order = np.arange(len(trajectory)) if trajectory.times is None else trajectory.times
+        rows = {int(number): row for row, number in enumerate(order.tolist())} if whole else {}
+        poses = [trajectory.poses[rows[int(t)]] if int(t) in rows else None for t in times.tolist()]
+        if len(scans) < len(trajectory) and all(p is not None for p in poses):
+            return poses, []
+    few = "fewer" if len(trajectory) < len(scans) else "more"
+    raise InputError(
+        f"{source}: has {len(trajectory):,} poses, {few} than the {len(scans):,} scans in {folder}, whose names have no times "
+        f"({scans[0].name}); give the trajectory of these scans, or one with times and scans named by theirs"
+    )
+
+
+def _counted(scan: Path) -> bool:
+    """Does the name end with a number that is no time?"""
+    match = NAME_TIME.search(scan.stem)
+    return match is not None and match[1] is None and match[3].isdigit() and len(match[3]) <= INDEX_DIGITS
+
+
+def _by_time(folder: Path, times: Array, trajectory: Trajectory, source: Path) -> tuple[list[Array | None], list[str]]:
+    assert trajectory.times is not None
+    near = trajectory.gap(times) <= LONGEST_GAP
+    if not near.any():
+        first, last = trajectory.times[[0, -1]]
+        raise InputError(
+            f"{source}: its times ({first:.3f} to {last:.3f} s) are not those in the names of the scans in {folder} "
+            f"({times.min():.3f} to {times.max():.3f} s); give the trajectory of these scans"
+        )
+    poses = [pose if ok else None for pose, ok in zip(trajectory.at(times), near.tolist(), strict=True)]
+    lost = int((~near).sum())
+    said = f"{lost:,} of {len(times):,} scans are more than {LONGEST_GAP:g} s from any pose of {source.name} and are left out"
+    return poses, [said] if lost else []
+
+
+def _posed(scans: list[Path], poses: list[Array | None], options: ReadOptions) -> Iterator[PosedScan]:
+    for number, (scan, pose) in enumerate(zip(scans, poses, strict=True), 1):
+        for piece in _read_scan(scan, options) if pose is not None else ():
+            yield PosedScan(piece.points, pose, piece.colors, done=number / len(scans))
+
+
+def _with_viewpoints(path: Path, scans: list[Path], options: ReadOptions) -> Iterator[PosedScan]:
+    """Scans in one frame, each with the place of the sensor in its own header."""
+    for number, scan in enumerate(scans, 1):
+        pose = None
+        for piece in _read_scan(scan, options):
+            pose = pose if piece.poses is None else piece.poses[0]
+            if pose is None:
+                raise InputError(
+                    f"{path}: has no trajectory (such as poses.txt or traj_lidar.txt); give one with --poses, in the format of "
+                    f"KITTI or TUM"
+                )
+            yield PosedScan(piece.points, pose, piece.colors, True, number / len(scans))
+
+
+def _read_scan(path: Path, options: ReadOptions) -> Iterator[Piece]:
+    """Blocks of one scan, whose file an error names."""
+    readers = {".ply": ply.read, ".pcd": pcd.read, ".bin": _read_bin}
+    try:
+        yield from readers[path.suffix.lower()](path, replace(options, poses=None))
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:
+        raise damaged(path, "a scan", error) from error
+
+
+def _read_bin(path: Path, options: ReadOptions) -> Iterator[Piece]:
+    del options
+    size = path.stat().st_size
+    if size % BIN_ROW:
+        raise InputError(
+            f"{path}: has {size:,} bytes, no multiple of {BIN_ROW} (float32 x y z intensity); it is cut short, copy it again"
+        )
+    for start in range(0, size // BIN_ROW, BLOCK_POINTS):
+        rows = np.fromfile(path, "<f4", 4 * BLOCK_POINTS, offset=start * BIN_ROW).reshape(-1, 4)
+        yield Piece(rows[:, :3])

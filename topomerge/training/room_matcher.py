@@ -1,0 +1,266 @@
+"""Task `room_matcher`: the network that says which rooms of two maps are one (`matching.room_matcher`), on rows of the embedder
+that ships.
+
+The embedder stays as it is. Each map is seen several times, as other sensors and walks might have left it, and mirrored; two
+views of one building are laid out at the quarter turn that is true, where rooms have their partners, and at a wrong one, where
+none has any. The turn is learned with it: matchings at the true turn are to be surer of themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from topomerge.embedding.turns import QUARTERS, TurnedRows, along_walls, room_facts
+from topomerge.embedding.weights import embedder_hash
+from topomerge.errors import InputError
+from topomerge.io import archive
+from topomerge.matching.room_matcher import RoomsSeen, every_turn, read_matcher, rooms_seen
+from topomerge.matching.scores import assign_certain, has_twin, pair_counts, partner_ranks
+from topomerge.models.embedder import Embedder
+from topomerge.models.losses import NEVER_LOGIT
+from topomerge.models.room_matcher import Partners, RoomMatcher, exported_matcher
+from topomerge.models.weights import read_embedder
+from topomerge.training.batches import changed
+from topomerge.training.loop import Say, State, mixed
+from topomerge.training.networks import NetworkJob, run_network
+from topomerge.training.packed import Graph, GraphPair, load_pairs
+from topomerge.training.settings import Augment
+from topomerge.training.task_settings import RoomMatching
+from topomerge.training.turned_views import changed_sheet, mirrored, quarters_between, with_views
+from topomerge.training.validate import LEAST_CERTAINTIES, SIZE_COLUMNS, scores
+from topomerge.types import Array
+
+WRONG_TURNS = (1, 2, 2, 3)  # quarter turns off the true one: half a turn is the one that is mistaken most
+MIRROR = np.array([1.0, -1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A map as the network sees it.
+
+    Args:
+        rows: of its rooms, with facts.
+        present: (R,) which rooms of the map they are.
+    """
+
+    rows: TurnedRows
+    present: Array
+
+    def seen(self, quarters: int) -> RoomsSeen:
+        """Turned by so many quarter turns."""
+        return rooms_seen(self.rows, quarters)
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """Two maps of a building, each in several views: the odd ones are mirrored, the first one is as it is.
+
+    Args:
+        pair: what is true about them.
+        quarters: by which b is to be turned to stand as a; None where no transform is true.
+    """
+
+    a: Sequence[View]
+    b: Sequence[View]
+    pair: GraphPair
+    quarters: int | None
+
+    def links(self, view_a: View, view_b: View) -> Tensor:
+        """(R_a, R_b) bool, which rooms of two views are one."""
+        out = torch.zeros((len(self.pair.true[0]), len(self.pair.true[1])), dtype=torch.bool)
+        if self.quarters is not None:
+            out[self.pair.matches[:, 0], self.pair.matches[:, 1]] = True
+        return out[view_a.present][:, view_b.present]
+
+
+def examples(pairs: Sequence[GraphPair], network: Embedder, number: int, say: Say = lambda text: None) -> list[Example]:
+    """Pairs with so many changed views of each of their maps beside the first one; a map of several pairs is seen once."""
+    made: dict[tuple[str, str], list[View]] = {}
+    out = []
+    for pair in pairs:
+        sides = [(str(pair.about["file"]), side) for side in pair.about["sides"]]
+        for key, graph in zip(sides, (pair.a, pair.b), strict=True):
+            if key not in made:
+                made[key] = [view(graph, network, k, mixed(len(made), k)) for k in range(number + 1)]
+                if not len(made) % 100:
+                    say(f"{len(made)} maps seen")
+        out.append(Example(made[sides[0]], made[sides[1]], pair, quarters_between(pair)))
+    return out
+
+
+@torch.no_grad()
+def view(graph: Graph, network: Embedder, number: int, seed: int) -> View:
+    """A map as it is (0), or changed; mirrored where the number is odd."""
+    generator, augment = torch.Generator().manual_seed(seed), Augment()
+    places = along_walls({name: graph[name].numpy() for name in ("pos", "turn")})
+    seen = with_views(changed_sheet(graph, augment.shift, generator) if number else graph, network.tensors)
+    if number % 2:
+        seen, places = mirrored(seen), places * MIRROR
+    tensors, present = {name: seen[name] for name in {*network.tensors, "edge_index"}}, torch.arange(len(places))
+    if number:
+        tensors, present = changed(tensors, len(places), augment, generator)
+    rows, dustbin = (part.numpy() for part in network.turned(tensors))
+    chosen = present.numpy()
+    facts = room_facts(graph["x"].numpy()[chosen], dustbin, graph["pos"].numpy()[chosen, 2])
+    return View(TurnedRows(rows.astype(np.float32), places[chosen], "", facts), chosen)
+
+
+class MatcherJob(NetworkJob):
+    """Pairs of maps, each at its true turn and at a wrong one.
+
+    Args:
+        embedder: hash of the embedder.
+    """
+
+    def __init__(self, settings: RoomMatching, learned: Sequence[Example], watched: Sequence[Example], embedder: str) -> None:
+        origin = {
+            "set": settings.data.name,
+            "split": settings.data.split,
+            "validation": settings.validation,
+            "embedder": embedder,
+            "pairs": len(learned),
+        }
+        rows = int(np.prod(learned[0].a[0].rows.shape[1:]))
+        super().__init__(settings, RoomMatcher(rows, settings.width, settings.layers, settings.dropout), origin)
+        self.network.fit_facts(np.concatenate([side[0].rows.facts for example in learned for side in (example.a, example.b)]))
+        self.options, self.learned, self.watched, self.embedder = settings, learned, watched, embedder
+
+    def batches(self, state: State) -> Generator[list[tuple[Example, Array]], None, None]:
+        """Pairs in the order of an epoch, each with random numbers of its own."""
+        self.network.train()
+        options = self.options
+        order = np.random.default_rng([options.seed, 1, state.epoch]).permutation(len(self.learned))
+        order = np.resize(order, (options.steps, options.batch))
+        for step, rows in enumerate(order[state.step :], state.step):
+            torch.manual_seed(mixed(options.seed, state.epoch, step))  # of the dropout
+            draws = np.random.default_rng([options.seed, 2, state.epoch, step]).integers(0, 1 << 16, (len(rows), 4))
+            yield [(self.learned[k], draw) for k, draw in zip(rows.tolist(), draws, strict=True)]
+
+    def step(self, batch: list[tuple[Example, Array]], state: State) -> dict[str, float]:
+        """One step of the optimizer."""
+        loss = torch.stack([self._loss(example, draw) for example, draw in batch]).mean()
+        return self.descend(loss, self.options, state)
+
+    def _loss(self, example: Example, draw: Array) -> Tensor:
+        views = list(range(int(draw[0]) % 2, len(example.a), 2))  # all mirrored, or none
+        of_a, of_b = example.a[views[draw[1] % len(views)]], example.b[views[draw[2] % len(views)]]
+        true = 0 if example.quarters is None else -example.quarters if views[0] % 2 else example.quarters
+        turn, wrong = int(draw[3]) % QUARTERS, WRONG_TURNS[int(draw[3]) // QUARTERS % len(WRONG_TURNS)]
+        a, links = of_a.seen(turn), example.links(of_a, of_b)
+        right = self.network(a, of_b.seen((turn + true) % QUARTERS))
+        other = self.network(a, of_b.seen((turn + true + wrong) % QUARTERS))
+        loss = deep_loss(right, links) + self.options.wrong_turn * deep_loss(other, torch.zeros_like(links))
+        if links.any():
+            lead = sureness(right[-1]) - sureness(other[-1])
+            loss = loss + self.options.turn * functional.softplus(-lead)
+        return loss
+
+    def size(self, batch: list[tuple[Example, Array]]) -> int:
+        """Rooms."""
+        return sum(len(example.a[0].present) + len(example.b[0].present) for example, _ in batch)
+
+    def weights(self) -> dict[str, Array]:
+        """As the package reads them: half precision."""
+        assert isinstance(self.network, RoomMatcher)
+        self.network.eval()
+        exported = exported_matcher(self.network, self.embedder)
+        return {name: values if name == "embedder" else values.astype(np.float16) for name, values in exported.items()}
+
+    def scores(self) -> dict[str, float]:
+        """Of the pairs that are watched."""
+        return matcher_scores(self.watched, {name: values.astype(float) for name, values in self.weights().items()})
+
+    def write_weights(self, path: Path) -> None:
+        """An archive of arrays."""
+        archive.write(self.weights(), path)
+
+
+def deep_loss(layers: Sequence[Partners], links: Tensor) -> Tensor:
+    """-log(probability of a room's partners, or of having none), mean over the rooms of both maps; after the last layer and,
+    with less weight, after each one before."""
+    total = torch.zeros(())
+    for k, layer in enumerate(layers):
+        weight = 1.0 if k == len(layers) - 1 else 0.3
+        for chance, true in ((layer.rows, links), (layer.columns, links.T)):
+            right = torch.cat([true, ~true.any(dim=1, keepdim=True)], dim=1)
+            total = total - weight * chance.masked_fill(~right, NEVER_LOGIT).logsumexp(dim=1).mean()
+    return total
+
+
+def sureness(partners: Partners) -> Tensor:
+    """How sure of itself a matching is: what the turn is chosen by (`RoomOdds.sureness`)."""
+    return (partners.rows[:, :-1] + partners.columns[:, :-1].T).exp().sum()
+
+
+def matcher_scores(watched: Sequence[Example], weights: Mapping[str, Array]) -> dict[str, float]:
+    """Scores as of `training.validate`, and the share of pairs with rooms in common whose turn is right (`turn`)."""
+    ranks, twins, turns, counts = [], [], [], np.zeros((len(LEAST_CERTAINTIES), 4), int)
+    for example in watched:
+        a, b, matches = example.a[0], example.b[0], example.pair.matches.numpy()
+        odds = max(every_turn(a.seen(0), [b.seen(k) for k in range(QUARTERS)], weights), key=lambda turned: turned.sureness)
+        counts += [pair_counts(assign_certain(odds.certainty, least), matches) for least in LEAST_CERTAINTIES]
+        if len(matches) and example.quarters is not None:
+            turns.append(odds.quarters == example.quarters)
+        for chance, truth, other in ((odds.rows, matches, example.pair.b), (odds.columns, matches[:, ::-1], example.pair.a)):
+            rooms, rank = partner_ranks(chance[:, :-1], truth)
+            ranks.append(rank)
+            twins.append(has_twin(other["x"][:, SIZE_COLUMNS].numpy(), truth, rooms))
+    every = np.concatenate(ranks)
+    out = scores(every, np.concatenate(twins), np.ones(len(every), bool), counts)
+    return {k: v for k, v in out.items() if "clear" not in k} | {"turn": float(np.mean(turns)) if turns else 0.0}
+
+
+def fit(settings: RoomMatching, say: Say) -> dict[str, float]:
+    """Train, and leave a run's folder; the scores of the best epoch.
+
+    Raises:
+        InputError: no pairs, or the embedder that ships has no rows for turns.
+    """
+    network, embedder = shipped_embedder()
+    learned = read_examples(settings, settings.data.name, network, settings.views, say)
+    watched = read_examples(settings, settings.validation, network, 0, say)
+    torch.manual_seed(mixed(settings.seed))
+    job = MatcherJob(settings, learned, watched, embedder)
+    say(f"{len(learned)} pairs, {sum(p.numel() for p in job.network.parameters())} weights")
+    return run_network(job, settings, settings.steps, say)
+
+
+def judge(settings: RoomMatching, file: Path, say: Say) -> dict[str, Any]:
+    """Scores of weights on pairs of buildings that trained nothing."""
+    network, _ = shipped_embedder()
+    watched = read_examples(settings, settings.heldout.name, network, 0, say)
+    return {**matcher_scores(watched, read_matcher(file)), "pairs": len(watched)}
+
+
+def shipped_embedder() -> tuple[Embedder, str]:
+    """The embedder that ships, and its hash.
+
+    Raises:
+        InputError: it has no rows for turns.
+    """
+    import topomerge
+
+    folder = Path(topomerge.__path__[0]) / "embedding" / "pretrained"
+    network, _ = read_embedder(folder)
+    if network.network.turns == 1:
+        raise InputError("task=room_matcher: the embedder that ships tells no turns apart; train experiment=surroundings")
+    network.eval()
+    return network, embedder_hash(folder)
+
+
+def read_examples(settings: RoomMatching, name: str, network: Embedder, number: int, say: Say) -> list[Example]:
+    """The pairs of a manifest, each map with so many changed views.
+
+    Raises:
+        InputError: no such manifest, or a file is damaged.
+    """
+    manifest = Path(name) if name.endswith(".jsonl") else Path(settings.cache) / f"{name}.jsonl"
+    return examples(load_pairs(manifest, ["sheet"], say, around=network.network.node.around), network, number, say)
