@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.retrieval [MANIFEST] [--descriptor NAME] [--write FILE]``: of a cached set of evaluation pairs (by default
 ``cache/evaluation/heldout.jsonl``, which ``python -m topomerge.datasets.pairs.build data=heldout cache=cache/evaluation`` makes)
-the first map of each pair stands in the atlas, and the second map of each pair that has a room in common is looked for.
+the first map of each pair stands in the atlas, and the second map of each pair that has a room in common is looked for: compared
+with all maps, and with those on a shortlist. Below the table: how many of these pairs an atlas of more maps would register.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_set
 from topomerge.embedding.embedders import embedder
 from topomerge.embedding.turns import Rows
 from topomerge.evaluation.tables import write_section
-from topomerge.fusion.atlas.find import ranked
+from topomerge.fusion.atlas.find import SHORTLIST, ranked, shortlist
+from topomerge.fusion.atlas.neighbours import most_alike, nearest, owners, queries, vectors, votes
+from topomerge.fusion.atlas.solve import MOST_PARTNERS
 from topomerge.statistics import interval_text
-from topomerge.types import Array
 
 FIRST = (1, 5, 10)
+PARTNER_PAIRS, PARTNER_DRAWS = 15, 40  # pairs in an atlas of which partners are asked for, and how often they are drawn
 HELDOUT = Path("cache/evaluation/heldout.jsonl")
 
 
@@ -36,12 +39,14 @@ class Search:
     Args:
         building: the physical one.
         rank: of the first map of its building, from 1.
+        first: name of the map that came first.
         rooms: share of its rooms with a partner that stand beside it in the pair's map, if that map is named.
         seconds: of the search, without the rows of the new map.
     """
 
     building: str
     rank: int
+    first: str
     rooms: float
     seconds: float
 
@@ -51,47 +56,71 @@ def building(pair: EvaluationPair) -> str:
     return physical_building(str(pair.about["source"]), str(pair.about["building"]))
 
 
-def searches(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]]) -> list[Search]:
-    """Look for the second map of each pair that has a room in common among the first maps of all pairs."""
-    names = [str(k) for k in range(len(pairs))]
-    of = [building(pair) for pair in pairs]
+def searches(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]], compared: int) -> list[Search]:
+    """Look for the second map of each pair that has a room in common among the first maps of all pairs.
+
+    Args:
+        compared: maps that are compared room by room; with fewer than all by a shortlist.
+    """
+    of, atlas = [building(pair) for pair in pairs], [a for a, _ in rows]
+    places, owner = np.concatenate([vectors(a) for a in atlas]), owners([len(a) for a in atlas])
     out = []
     for k, pair in enumerate(pairs):
         if not len(pair.matches):
             continue
         began = time.process_time()
-        sightings = ranked(names, [a for a, _ in rows], rows[k][1], len(pairs))
+        maps, new = list(range(len(pairs))), rows[k][1]
+        if compared < len(pairs):
+            asked = queries(new)
+            maps = shortlist(votes(*nearest(places, np.concatenate(asked)), len(asked), owner, len(pairs)), compared)
+        sightings = ranked([str(m) for m in maps], [atlas[m] for m in maps], new, compared)
         seconds = time.process_time() - began
-        rank = next(n for n, s in enumerate(sightings, 1) if of[int(s.name)] == of[k])
-        best = {new: room for new, room, _ in next(s for s in sightings if s.name == str(k)).rooms}
+        rank = next((n for n, s in enumerate(sightings, 1) if of[int(s.name)] == of[k]), len(pairs))
+        best = {new: room for s in sightings if s.name == str(k) for new, room, _ in s.rooms}
         true = {(int(i), int(j)) for i, j in pair.matches}
         with_partner = sorted({j for _, j in true})
         right = [(best.get(j), j) in true for j in with_partner]
-        out.append(Search(of[k], rank, float(np.mean(right)), seconds))
+        out.append(Search(of[k], rank, sightings[0].name, float(np.mean(right)), seconds))
     return out
 
 
-def table(results: Sequence[Search], maps: int, buildings: int, rooms: int, name: str) -> str:
-    """The results as Markdown."""
-    groups = np.array([r.building for r in results])
+def partners_named(pairs: Sequence[tuple[Rows, Rows]]) -> float:
+    """Share of pairs of which one map names the other, in an atlas of all of them."""
+    named = list(most_alike([a for a, _ in pairs] + [b for _, b in pairs], MOST_PARTNERS))
+    return float(np.mean([k + len(pairs) in named[k] or k in named[k + len(pairs)] for k in range(len(pairs))]))
 
-    def share(values: Sequence[float]) -> str:
-        return interval_text(np.array(values, float), groups)
 
-    first = [share([r.rank <= n for r in results]) for n in FIRST]
-    chance = [1 - (1 - 1 / buildings) ** n for n in FIRST]
-    seconds: Array = np.array([r.seconds for r in results])
-    return "\n".join(
-        [
-            f"{len(results)} maps of {len(set(groups))} physical buildings looked for among {maps} maps of {buildings} with "
-            f"{rooms} rooms; in brackets 95 % intervals over buildings.",
-            "",
-            "| embedder | building first | among 5 | among 10 | rooms named right | s a search |",
-            "|---|---|---|---|---|---|",
-            f"| {name} | {' | '.join(first)} | {share([r.rooms for r in results])} | {np.median(seconds):.2f} |",
-            f"| by chance | {' | '.join(f'{c:.2f}' for c in chance)} | | |",
-        ]
+def partners_text(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]]) -> str:
+    """What atlases would register of the pairs with a room in common."""
+    common = [of for pair, of in zip(pairs, rows, strict=True) if len(pair.matches)]
+    rng = np.random.default_rng(0)
+    draws = [rng.permutation(len(common))[:PARTNER_PAIRS] for _ in range(PARTNER_DRAWS)]
+    few = np.mean([partners_named([common[k] for k in draw]) for draw in draws])
+    said = (
+        f"Pairs of which one map names the other among its {MOST_PARTNERS} most alike: {few:.2f} of {PARTNER_PAIRS} pairs in an"
     )
+    all_of_them = f"{partners_named(common):.2f} of {len(common)} in one of {2 * len(common)}"
+    return f"{said} atlas of {2 * PARTNER_PAIRS} maps ({PARTNER_DRAWS} draws), {all_of_them}."
+
+
+def table(results: Sequence[tuple[str, Sequence[Search]]], maps: int, buildings: int, rooms: int) -> str:
+    """Named results as Markdown."""
+    groups = np.array([r.building for r in results[0][1]])
+    chance = [1 - (1 - 1 / buildings) ** n for n in FIRST]
+    lines = [
+        f"{len(groups)} maps of {len(set(groups))} physical buildings looked for among {maps} maps of {buildings} with "
+        f"{rooms} rooms; in brackets 95 % intervals over buildings.",
+        "",
+        "| embedder | building first | among 5 | among 10 | the same map first | rooms named right | s a search |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, of in results:
+        first = [interval_text(np.array([r.rank <= n for r in of], float), groups) for n in FIRST]
+        right = interval_text(np.array([r.rooms for r in of]), groups)
+        same = np.mean([r.first == one.first for r, one in zip(of, results[0][1], strict=True)])
+        seconds = np.median([r.seconds for r in of])
+        lines.append(f"| {name} | {' | '.join(first)} | {same:.2f} | {right} | {seconds:.2f} |")
+    return "\n".join([*lines, f"| by chance | {' | '.join(f'{c:.2f}' for c in chance)} | | | |"])
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -107,9 +136,11 @@ def main(words: Sequence[str] | None = None) -> int:
     for pair in pairs:
         a, b = pair.maps()
         rows.append((describe(a), describe(b)))
-    results = searches(pairs, rows)
-    buildings = len({building(pair) for pair in pairs})
-    text = table(results, len(pairs), buildings, sum(len(a) for a, _ in rows), args.descriptor)
+    results = [(args.descriptor, searches(pairs, rows, len(pairs)))]
+    if len(pairs) > SHORTLIST:
+        results.append((f"{args.descriptor}, shortlist of {SHORTLIST}", searches(pairs, rows, SHORTLIST)))
+    text = table(results, len(pairs), len({building(pair) for pair in pairs}), sum(len(a) for a, _ in rows))
+    text += f"\n\n{partners_text(pairs, rows)}"
     command = " ".join(["python -m benchmarks.retrieval", *(sys.argv[1:] if words is None else words)])
     print(text)
     if args.write:

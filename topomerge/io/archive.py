@@ -9,8 +9,9 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -23,10 +24,14 @@ ARCHIVE_LIMIT = 4 << 30  # of all arrays together; a map of 100 million cells ne
 MAX_RATIO = 1100  # deflate can't shrink by more than 1032; a file that claims more is damaged or hostile
 USUAL_RATIO, MODEST = 100, 1 << 28  # of a whole file: maps shrink by 12 to 17; small ones may claim more
 LONGEST_ARRAY_HEADER = 4096  # longest header of an array, bytes
+R = TypeVar("R")
 
 
-def write(arrays: Mapping[str, Array], path: str | Path) -> None:
+def write(arrays: Mapping[str, Array], path: str | Path, effort: int = 6) -> None:
     """Write named arrays. The same arrays in the same order give the same bytes.
+
+    Args:
+        effort: of compression, 0 (none: read five times as fast) to 9.
 
     Raises:
         InputError: the path can't be written.
@@ -39,19 +44,34 @@ def write(arrays: Mapping[str, Array], path: str | Path) -> None:
             entry.external_attr = 0o644 << 16
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, np.asarray(array, order="C"), allow_pickle=False)
-            archive.writestr(entry, buffer.getbuffer(), compresslevel=6)
+            archive.writestr(entry, buffer.getbuffer(), compresslevel=effort)
 
 
-def read(path: str | Path, kind: str = "archive") -> dict[str, Array]:
-    """Read all arrays of a file that may be damaged or hostile.
+def read(path: str | Path, kind: str = "archive", only: Collection[str] | None = None) -> dict[str, Array]:
+    """Read arrays of a file that may be damaged or hostile.
 
     Args:
         path: the file.
         kind: what it should be, for messages.
+        only: names of the arrays to read, of which those that are not there are left out; None: all.
 
     Raises:
         InputError: no such file, not such an archive, damaged, or it declares more than it can hold.
     """
+    return _opened(path, kind, lambda archive, size: {name: _array(archive, e) for name, e in _entries(archive, size, only)})
+
+
+def names(path: str | Path, kind: str = "archive") -> list[str]:
+    """Names of the arrays of such a file, without reading them.
+
+    Raises:
+        InputError: as `read`; damage of the arrays is not looked for.
+    """
+    return _opened(path, kind, lambda archive, size: [name for name, _ in _entries(archive, size)])
+
+
+def _opened(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int], R]) -> R:
+    """What `use` makes of an archive and the size of its file; whatever goes wrong is told of the file."""
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder, not a {kind}; name a file")
@@ -62,7 +82,8 @@ def read(path: str | Path, kind: str = "archive") -> dict[str, Array]:
                 raise InputError(f"{path}: is empty; make the {kind} again")
             if start[:2] != b"PK":
                 raise InputError(f"{path}: is not a {kind}; check the name, or make one again")
-            return _read(file, path.stat().st_size)
+            with zipfile.ZipFile(file) as archive:
+                return use(archive, path.stat().st_size)
     except (InputError, MemoryError):
         raise
     except FileNotFoundError as error:
@@ -74,18 +95,19 @@ def read(path: str | Path, kind: str = "archive") -> dict[str, Array]:
         raise InputError(f"{path}: damaged or cut off ({reason}); copy or make the {kind} again") from error
 
 
-def _read(file: io.BufferedReader, size: int) -> dict[str, Array]:
-    with zipfile.ZipFile(file) as archive:
-        entries = [entry for entry in archive.infolist() if entry.filename.endswith(".npy")]
-        if entries and len({entry.filename for entry in entries}) < len(archive.infolist()):
-            raise ValueError("something is in it twice, or is no array")
-        for entry in entries:
-            if entry.compress_size > size or entry.file_size > MAX_RATIO * (entry.compress_size + 16):
-                raise ValueError(f"{entry.filename} claims {entry.file_size} bytes, more than it can hold")
-        total = sum(entry.file_size for entry in entries)
-        if total > ARCHIVE_LIMIT or total > max(MODEST, USUAL_RATIO * size):
-            raise ValueError(f"claims {total:,} bytes in {size:,}")
-        return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
+def _entries(archive: zipfile.ZipFile, size: int, only: Collection[str] | None = None) -> list[tuple[str, zipfile.ZipInfo]]:
+    """Names and places of the arrays in a file of so many bytes; what they declare is checked before any is read."""
+    entries = [entry for entry in archive.infolist() if entry.filename.endswith(".npy")]
+    if entries and len({entry.filename for entry in entries}) < len(archive.infolist()):
+        raise ValueError("something is in it twice, or is no array")
+    for entry in entries:
+        if entry.compress_size > size or entry.file_size > MAX_RATIO * (entry.compress_size + 16):
+            raise ValueError(f"{entry.filename} claims {entry.file_size} bytes, more than it can hold")
+    total = sum(entry.file_size for entry in entries)
+    if total > ARCHIVE_LIMIT or total > max(MODEST, USUAL_RATIO * size):
+        raise ValueError(f"claims {total:,} bytes in {size:,}")
+    named = [(entry.filename.removesuffix(".npy"), entry) for entry in entries]
+    return [(name, entry) for name, entry in named if only is None or name in only]
 
 
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:

@@ -13,7 +13,8 @@ from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
 from topomerge.cli.main import main as cli
 from topomerge.embedding.turns import TurnedRows
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.find import ROOMS_FILE, find, ranked
+from topomerge.fusion.atlas.find import find, ranked
+from topomerge.fusion.atlas.room_rows import ROOMS_FILE
 from topomerge.fusion.atlas.store import add, remove
 from topomerge.io import archive
 from topomerge.viz.atlas_report import atlas_html
@@ -78,6 +79,12 @@ def test_a_file_of_rooms_that_is_damaged_or_another_s_is_refused(house: Path, tm
         find(house, office_map(0))
     short = {name: array if name == "embedder" else array[:1] for name, array in arrays.items()}
     archive.write(short, path)
+    with pytest.raises(InputError, match="does not fit the map"):
+        find(house, office_map(0))
+    archive.write({name: array[..., 1:] if array.ndim == 3 else array for name, array in arrays.items()}, path)
+    with pytest.raises(InputError, match="does not fit the map"):
+        find(house, office_map(0))
+    archive.write({name: array for name, array in arrays.items() if not name.endswith(".places")}, path)
     with pytest.raises(InputError, match="does not fit the map"):
         find(house, office_map(0))
 

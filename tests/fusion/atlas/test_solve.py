@@ -13,6 +13,7 @@ from topomerge.errors import InputError
 from topomerge.fusion.atlas.maps import LOADED_AT_ONCE, Maps, map_key
 from topomerge.fusion.atlas.pairs import promise
 from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.atlas.solve import partners_of
 from topomerge.fusion.pose_difference import pose_difference
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
@@ -135,6 +136,44 @@ def test_files_are_read_when_needed(maps, atlas, registrations, tmp_path):
     inner = Maps(paths)
     assert [len(inner[k].rooms) for k in range(5)] == [len(m.rooms) for m in maps] and len(inner._loaded) == LOADED_AT_ONCE
     assert promise(inner, 0, 2) > promise(inner, 0, 4)
+
+
+def test_of_many_maps_only_those_that_look_alike_are_registered(maps, atlas, registrations, monkeypatch):
+    monkeypatch.setattr("topomerge.fusion.atlas.solve.MOST_PARTNERS", 2)
+    made = dict(registrations)
+    result = tm.atlas(maps, registrations=made)
+    assert result.components == atlas.components and right(result, {k: k for k in range(4)})
+    again = tm.atlas(maps[::-1], registrations=made)
+    assert {frozenset(4 - k for k in c) for c in again.components} == {frozenset(c) for c in result.components}
+    assert again.registered == result.registered and len(made) == len(registrations)
+
+
+class Looks:
+    """Maps of which nothing is there but looks of rooms and areas."""
+
+    def __init__(self, rows: list[np.ndarray]) -> None:
+        self.all = rows
+
+    def __len__(self) -> int:
+        return len(self.all)
+
+    def rows(self, k: int) -> np.ndarray:
+        return self.all[k]
+
+    def area(self, k: int) -> float:
+        return 100.0 + 1e-6 * k
+
+
+def test_partners_of_many_maps_are_those_that_either_names():
+    rng = np.random.default_rng(0)
+    rows = [rng.normal(size=(5, 12)) for _ in range(40)]
+    rows += [of + 0.1 * rng.normal(size=of.shape) for of in rows[:39]] + [np.zeros((0, 12))]
+    partners = partners_of(Looks(rows))
+    assert all(partners[k][0] == k + 40 and partners[k + 40][0] == k for k in range(39))
+    assert all(k in partners[m] for k in range(80) for m in partners[k]) and all(k not in partners[k] for k in range(80))
+    assert sum(map(len, partners)) <= 2 * 10 * 80 and partners[79] == list(range(78, 68, -1))  # the largest, of one without rooms
+    few = partners_of(Looks(rows[:11]))
+    assert all(sorted(few[k]) == [m for m in range(11) if m != k] for k in range(11))
 
 
 def test_strangers_stay_strangers(maps, registrations):

@@ -2,6 +2,7 @@
 
 Nothing depends on the order of the maps, and little on how many pairs there are: maps that lie in one frame already are not
 searched in each other again, they are only asked whether they agree. Maps that nothing connects stay apart, and are named.
+Of more than eleven maps each is only searched in the ten that its rooms look most like, and in those that name it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.assembly import Assembler, Assembly, Link
 from topomerge.fusion.atlas.maps import Maps, map_key
+from topomerge.fusion.atlas.neighbours import most_alike
 from topomerge.fusion.atlas.pairs import Checks, hypotheses, promise
 from topomerge.fusion.atlas.pose_graph import residual
 from topomerge.fusion.atlas.result import AtlasResult
@@ -30,6 +32,7 @@ from topomerge.types import Sim3, TopometricMap
 
 SURE_LINK = 4.0  # log odds of a link, above which no further ones are looked for within its component
 ENOUGH_REGISTRATIONS = 3  # of a map, after which none within its component is made
+MOST_PARTNERS = 10  # maps that a map names to be searched in
 RegistrationsByPair = MutableMapping[tuple[str, str], tuple[PoseHypothesis, ...]]  # by the keys of both maps
 
 
@@ -152,10 +155,7 @@ class _Explorer:
         self.tried: dict[tuple[int, int], tuple[PoseHypothesis, ...]] = {}
         self.checks = Checks(maps, scaled)
         self.assembler = Assembler(len(maps), self.tried, self.checks, threshold, scaled)
-        self.promise = np.zeros((len(maps), len(maps)))
-        for i in range(len(maps)):
-            for j in range(i):
-                self.promise[i, j] = self.promise[j, i] = promise(maps, j, i)
+        self.partners = partners_of(maps)
 
     def explored(self) -> Assembly:
         """The assembly that more registrations would not change."""
@@ -173,8 +173,7 @@ class _Explorer:
         for k in range(len(self.maps)):
             component = assembly.of(k)
             sure = any(link.log_odds >= SURE_LINK for link in assembly.links if k in link.maps)
-            partners = [m for m in np.argsort(-self.promise[k], kind="stable").tolist() if m != k]
-            partners = [m for m in partners if (min(k, m), max(k, m)) not in self.tried]
+            partners = [m for m in self.partners[k] if (min(k, m), max(k, m)) not in self.tried]
             outside = [m for m in partners if m not in component]
             inside = [m for m in partners if m in component and not sure and counts[k] < ENOUGH_REGISTRATIONS]
             for m in (*outside[:1], *inside[:1]):
@@ -185,6 +184,22 @@ class _Explorer:
         if pair not in self.registrations:
             self.registrations[pair] = hypotheses(self.maps, i, j, self.scale, self.same)
         return self.registrations[pair]
+
+
+def partners_of(maps: Maps) -> list[list[int]]:
+    """For each map those that it may be searched in, most promising first: all others where they are few, else the ten that its
+    rooms look most like, and those that name it. A map without rooms names the largest ones."""
+    count = len(maps)
+    if count <= MOST_PARTNERS + 1:
+        pairs = {(i, j) for j in range(count) for i in range(j)}
+    else:
+        by_area = sorted(range(count), key=lambda k: -maps.area(k))
+        named = enumerate(most_alike([maps.rows(k) for k in range(count)], MOST_PARTNERS))
+        pairs = {(min(k, m), max(k, m)) for k, of in named for m in of or [m for m in by_area if m != k][:MOST_PARTNERS]}
+    partners: list[dict[int, float]] = [{} for _ in range(count)]
+    for i, j in sorted(pairs):
+        partners[i][j] = partners[j][i] = promise(maps, i, j)
+    return [[m for _, m in sorted((-likely, m) for m, likely in of.items())] for of in partners]
 
 
 def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order: Sequence[int], rigid: bool) -> AtlasResult:

@@ -1,0 +1,106 @@
+"""Nearest rooms among many: exact search beside the index of a large atlas (`fusion.atlas.neighbours`, `rooms_index`).
+
+``python -m benchmarks.speed.room_search [ROOMS ...] [--write FILE]``: vectors of length 1 as of the embedder that ships (256
+numbers), noisy copies of a twentieth as many looks; what is looked for are noisy copies of some of them, as many as a map of 30
+rooms has at four turns. Seconds are of the processor: run it on one core. It prints a table, and a line a
+size as `bench.line` does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+
+from benchmarks.speed.bench import line
+from topomerge.evaluation.tables import write_section
+from topomerge.fusion.atlas.neighbours import nearest
+from topomerge.fusion.atlas.rooms_index import RoomsIndex
+from topomerge.types import Array
+
+ROOMS = (10_000, 100_000, 1_000_000)
+VECTOR, ALIKE, ASKED = 256, 20, 120  # numbers of a vector, rooms of one look, vectors that are looked for
+LOOK_NOISE, SEEN_NOISE = 0.6, 0.4  # length of what is added to a look, and to a room that is seen again
+MADE_AT_ONCE = 50_000
+SEARCH_COLUMNS = (
+    "| rooms | exact, ms a query | index, ms a query | exact / index | room itself first: exact, index | of the 10 nearest "
+    "| memory, MB: exact, index | file, MB | made, s | read, s |\n|---|---|---|---|---|---|---|---|---|---|"
+)
+
+
+def noisy(rng: np.random.Generator, vectors: Array, noise: float) -> Array:
+    """Vectors with noise of such a length added, of length 1, in single precision."""
+    other = vectors + np.float32(noise / np.sqrt(VECTOR)) * rng.standard_normal(vectors.shape, dtype=np.float32)
+    out: Array = other / np.linalg.norm(other, axis=1, keepdims=True)
+    return out
+
+
+def table_of(rng: np.random.Generator, rooms: int) -> Array:
+    """(rooms, VECTOR) vectors."""
+    looks = noisy(rng, np.zeros((max(rooms // ALIKE, 1), VECTOR), np.float32), 1.0)
+    table = np.empty((rooms, VECTOR), np.float32)
+    for k in range(0, rooms, MADE_AT_ONCE):
+        part = table[k : k + MADE_AT_ONCE]
+        part[:] = noisy(rng, looks[rng.integers(0, len(looks), len(part))], LOOK_NOISE)
+    return table
+
+
+def seconds(search: Callable[..., object], *inputs: Array) -> float:
+    """Of the processor, a query; the best of three runs."""
+    spent = []
+    for _ in range(3):
+        began = process_time()
+        search(*inputs)
+        spent.append(process_time() - began)
+    return min(spent) / ASKED
+
+
+def measure(rooms: int) -> str:
+    """One size: a row of the table."""
+    rng = np.random.default_rng(rooms)
+    table = table_of(rng, rooms)
+    itself = rng.integers(0, rooms, ASKED)
+    asked = noisy(rng, table[itself], SEEN_NOISE)
+    index = RoomsIndex(VECTOR)
+    began = process_time()
+    index.add(["all"], [rooms], table)
+    made = process_time() - began
+    exact, by_index = nearest(table, asked)[0], index.nearest(asked)[0]
+    slow, fast = seconds(nearest, table, asked), seconds(index.nearest, asked)
+    line(f"room_search_{rooms}", fast, slow)
+    recall = np.mean([len(set(a[:10]) & set(b[:10])) / 10 for a, b in zip(exact.tolist(), by_index.tolist(), strict=True)])
+    first = [float((hits[:, 0] == itself).mean()) for hits in (exact, by_index)]
+    memory = [size / 1e6 for size in (table.nbytes, index.memory)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rooms_index.npz"
+        index.write(path, "")
+        size = path.stat().st_size / 1e6
+        began = process_time()
+        RoomsIndex.read(path, VECTOR, "", {"all": rooms})
+        read = process_time() - began
+    searches = (
+        f"{rooms:,} | {slow * 1e3:.2f} | {fast * 1e3:.2f} | {slow / fast:.1f} | {first[0]:.2f}, {first[1]:.2f} | {recall:.2f}"
+    )
+    return f"| {searches} | {memory[0]:,.0f}, {memory[1]:,.0f} | {size:,.0f} | {made:,.0f} | {read:.1f} |"
+
+
+def main(rooms: Sequence[int] = ROOMS, write: Path | None = None) -> None:
+    """Measure, print, and write where asked."""
+    text = "\n".join([SEARCH_COLUMNS, *(measure(count) for count in rooms)])
+    print(text)
+    if write is not None:
+        words = " ".join(["python -m benchmarks.speed.room_search", *sys.argv[1:]])
+        write_section(write, "index", f"`{words}`\n\n{text}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed.room_search", description=__doc__)
+    parser.add_argument("rooms", nargs="*", type=int, help=f"sizes, instead of {ROOMS}")
+    parser.add_argument("--write", type=Path, help="file whose section between the marks `index` is replaced")
+    args = parser.parse_args()
+    main(args.rooms or ROOMS, args.write)
