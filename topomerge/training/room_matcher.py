@@ -129,8 +129,9 @@ class MatcherJob(NetworkJob):
             "pairs": len(learned),
         }
         rows = int(np.prod(learned[0].a[0].rows.shape[1:]))
-        super().__init__(settings, RoomMatcher(rows, settings.width, settings.layers, settings.dropout), origin)
-        self.network.fit_facts(np.concatenate([side[0].rows.facts for example in learned for side in (example.a, example.b)]))
+        network = RoomMatcher(rows, settings.width, settings.layers, settings.dropout)
+        network.fit_facts(np.concatenate([side[0].rows.facts for example in learned for side in (example.a, example.b)]))
+        super().__init__(settings, network, origin)
         self.options, self.learned, self.watched, self.embedder = settings, learned, watched, embedder
 
     def batches(self, state: State) -> Generator[list[tuple[Example, Array]], None, None]:
