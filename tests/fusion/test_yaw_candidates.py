@@ -5,8 +5,9 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
-from topomerge.fusion.yaw_candidates import yaw_candidates
+from topomerge.fusion.yaw_candidates import distinct_yaws, yaw_candidates
 from topomerge.matching.plan_fields import direction_profile
 
 
@@ -18,3 +19,8 @@ def test_yaw_candidates_of_a_pentagon():
     c, s = np.cos(turn), np.sin(turn)
     found = yaw_candidates(direction_profile(walls @ np.array([[c, s], [-s, c]]), 0.1), direction_profile(walls, 0.1))
     assert min(abs(np.degrees(y) - 23.0) for y in found) < 1.0
+
+
+def test_yaws_that_are_nearly_one_are_tried_once():
+    yaws = np.radians([10.0, 190.0, 10.3, -170.4, 100.0, 11.0, 370.1])
+    assert distinct_yaws(yaws.tolist()) == pytest.approx(np.radians([10.0, 190.0, 100.0, 11.0]))

@@ -11,6 +11,7 @@ from tests.embedding.test_descriptors import permuted
 from tests.matching.turned_maps import turned, uneven
 from tests.scenes_map import building
 from topomerge.errors import InputError
+from topomerge.matching.consistency import voted_pose
 from topomerge.matching.match import GrowingLimits, marginal, match
 from topomerge.matching.odds import match_probability
 from topomerge.matching.poses import PoseHypothesis
@@ -25,6 +26,27 @@ def test_transform_and_rooms_are_found_exactly():
     assert any(np.allclose(h.transform.apply(corners), true.apply(corners), atol=0.05) for h in found.alternatives)
     right = next(h for h in found.alternatives if np.allclose(h.transform.apply(corners), true.apply(corners), atol=0.05))
     assert [tuple(p) for p in right.rooms.tolist()] == [(i, i) for i in range(4)]
+
+
+def test_attention_matches_rooms_and_their_doors_give_the_pose():
+    b, true = turned(uneven(), (7.0, -3.0, 1.5))
+    result = match(uneven(), b, method="attention")
+    assert result.rooms.tolist() == [[k, k] for k in range(4)] and (result.probability > 0.9).all()
+    corners = b.rooms["centroid"]
+    assert result.transform is not None and result.transform.apply(corners) == pytest.approx(true.apply(corners), abs=1e-6)
+    other_way = match(b, uneven(), method="attention")
+    assert other_way.probability == pytest.approx(result.probability, abs=0.01)
+
+
+@pytest.mark.parametrize("options", [{"embedder": "engineered"}, {"scale_free": True}])
+def test_attention_needs_the_embedder_that_ships_and_one_scale(options):
+    b, _ = turned(uneven(), (7.0, -3.0, 1.5))
+    with pytest.raises(InputError, match="method attention needs the embedder that ships, and maps of one scale"):
+        match(uneven(), b, method="attention", **options)
+
+
+def test_attention_without_a_likely_match_gives_no_pose():
+    assert voted_pose(uneven(), building(2), np.zeros((4, 5))) is None
 
 
 def test_unknown_scale():

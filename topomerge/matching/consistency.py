@@ -37,6 +37,7 @@ class ConsistencySettings:
     overlaid: columns of floor, laid over each other to tell the rooms in common.
     storey_gap: m by which floors of one storey may differ.
     same: poses closer than this are one.
+    vote_reach: m by which votes of matches by attention for one pose differ.
     least_voter: certainty of a match by attention, from which on it votes for a pose.
     shortlist: share of the best agreement, below which a hypothesis ranks after all others.
     """
@@ -49,6 +50,7 @@ class ConsistencySettings:
     overlaid: int = 20_000
     storey_gap: float = 0.7
     same: PoseTolerance = SAME_MATCHING
+    vote_reach: float = 0.7
     least_voter: float = 0.05
     shortlist: float = 0.6
 
@@ -116,10 +118,10 @@ def voted_pose(a: TopometricMap, b: TopometricMap, certain: Array) -> Sim3 | Non
     poses = candidate_poses(a, b, plans, pairs, certain[tuple(pairs.T)], False)
     if not len(poses):
         return None
-    best = int(votes(poses).argmax())
-    at = poses.places(plans[1].middle)
-    near = (np.linalg.norm(at - at[best], axis=1) < CONSISTENCY.same.metres) & (np.cos(poses.yaw - poses.yaw[best]) > 0.99)
-    off = np.average(at[near], axis=0, weights=poses.weight[near]) - at[best]
+    at = np.column_stack([poses.places(plans[1].middle), 6 * np.cos(poses.yaw), 6 * np.sin(poses.yaw)])  # 10 degrees are 1 m
+    near = cKDTree(at).query_ball_point(at, CONSISTENCY.vote_reach, return_sorted=True)
+    best = int(np.argmax([poses.weight[n].sum() for n in near]))
+    off = np.average(at[near[best], :3], axis=0, weights=poses.weight[near[best]]) - at[best, :3]
     pose = poses.transform(best)
     x, y, z = (off + pose.translation).tolist()
     return replace(pose, translation=(x, y, z))
