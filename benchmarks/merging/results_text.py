@@ -7,7 +7,7 @@ from topomerge.fusion.verify import model
 THRESHOLD = float(model()["threshold"])
 COMMANDS = (
     "`python -m benchmarks.merging.cached_pairs test jobs=2; python -m benchmarks.merging.register test 1000; python "
-    "-m benchmarks.merging.register test_drawings 1000; python -m benchmarks.merging.strangers test 430; python -m "
+    "-m benchmarks.merging.register test_drawings 1000; python -m benchmarks.merging.strangers test 757; python -m "
     "benchmarks.merging.register real 100; python -m benchmarks.merging.strangers real 300; python -m "
     "benchmarks.merging.lookalikes test; python -m benchmarks.merging.results docs/results/merging.md`"
 )
