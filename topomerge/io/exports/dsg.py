@@ -16,7 +16,7 @@ import numpy as np
 import shapely
 
 from topomerge.io.atomic import replacing
-from topomerge.io.exports.floors import floor_polygons, inside
+from topomerge.structure.floors import floor_polygons, inside
 from topomerge.io.palette import room_colours
 from topomerge.types import Array, TopometricMap
 

@@ -18,7 +18,7 @@ import shapely
 
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
-from topomerge.io.exports.floors import floor_polygons, is_flight, jambs, room_levels
+from topomerge.structure.floors import floor_polygons, is_flight, jambs, room_levels
 from topomerge.types import Array, TopometricMap
 
 SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563  # m; the ellipsoid of WGS84

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from topomerge.io.atomic import replacing
-from topomerge.io.exports.floors import cell_polygons, floor_polygons, is_flight, room_levels
+from topomerge.structure.floors import cell_polygons, floor_polygons, is_flight, room_levels
 from topomerge.io.exports.ifc_model import Model
 from topomerge.io.exports.occupancy import storey_occupancy
 from topomerge.types import Array, TopometricMap

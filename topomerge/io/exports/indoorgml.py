@@ -15,7 +15,7 @@ from xml.etree import ElementTree as xml
 import numpy as np
 import shapely
 
-from topomerge.io.exports.floors import floor_polygons, inside, is_flight, jambs, room_levels
+from topomerge.structure.floors import floor_polygons, inside, is_flight, jambs, room_levels
 from topomerge.io.exports.markup import text, write_xml
 from topomerge.types import Array, TopometricMap
 

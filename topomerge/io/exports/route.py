@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
-from topomerge.io.exports.floors import is_flight
+from topomerge.structure.floors import is_flight
 from topomerge.io.exports.occupancy import Occupancy
 from topomerge.types import Array, TopometricMap
 
