@@ -1,10 +1,12 @@
 """Walls against the truth: how far their faces are off, how much of the true walls is there, how much is none, doors in them.
 
-``python -m benchmarks.extraction.walls --write docs/results/rooms.md`` scans simulated buildings of the validation list (``--dev``:
-of the training list, to develop on), makes maps of them and judges `topomerge.structure`. Scans are kept under ``cache/scans/``.
+``python -m benchmarks.extraction.walls --write docs/results/rooms.md`` scans simulated buildings of the validation list
+(``--dev``: of the training list, to develop on), makes maps of them and judges `topomerge.structure`. Scans are kept under
+``cache/scans/``.
 
 True faces are the outlines of the true rooms that were visited, without doors, as far as a point of the scan lies within
-`SEEN_REACH` of them at the height of faces. A face of a wall that was seen is compared with the true faces that look the same way.
+`SEEN_REACH` of them at the height of faces. A face of a wall that was seen is compared with the true faces that look the
+same way.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from itertools import pairwise
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -26,7 +29,6 @@ from benchmarks.extraction.tables import replace_section
 from topomerge.structure.face_points import FACE_HEIGHTS
 from topomerge.types import Array, TopometricMap
 
-ROOT = Path(__file__).parent.parent.parent
 STEP = 0.05  # m between places on faces
 SEEN_REACH = 0.05  # m between a true face and a point of the scan
 PRESENT, NONE = 0.15, 0.2  # m: so near a true face is present; a face farther than that from all true ones is none
@@ -132,7 +134,7 @@ def _true_places(polygons: dict[int, Array]) -> tuple[Array, Array, Array]:
     places, outs, rooms = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0, int)]
     for i, polygon in polygons.items():
         ring = np.asarray(shapely.geometry.polygon.orient(shapely.Polygon(polygon)).exterior.coords)
-        for a, b in zip(ring[:-1], ring[1:], strict=True):
+        for a, b in pairwise(ring):
             length = float(np.hypot(*(b - a)))
             along = (b - a) / max(length, 1e-9)
             t = np.arange(STEP / 2, length, STEP)
@@ -142,8 +144,8 @@ def _true_places(polygons: dict[int, Array]) -> tuple[Array, Array, Array]:
     return np.concatenate(places), np.concatenate(outs), np.concatenate(rooms)
 
 
-def _off(at: Array, out: Array, others: Array, outs: Array, most: float = 1.0) -> Array:
-    """(n,) m across the face from each place to the nearest of others that look the same way; inf beyond `most`."""
+def _off(at: Array, out: Array, others: Array, outs: Array) -> Array:
+    """(n,) m across the face from each place to the nearest of others that look the same way; inf without any within 0.4 m."""
     off = np.full(len(at), np.inf)
     if len(at) and len(others):
         far, rows = cKDTree(others).query(at, k=min(40, len(others)), distance_upper_bound=0.4)
@@ -246,7 +248,9 @@ def summary(row: Row) -> dict[str, float]:
 
 def report(rows: dict[str, Row], command: str) -> str:
     """The table of the maps, and of all of their places together."""
-    whole = {name: np.concatenate([row[name] for row in rows.values()]) for name in next(iter(rows.values())) if name not in ALONE}
+    whole = {
+        name: np.concatenate([row[name] for row in rows.values()]) for name in next(iter(rows.values())) if name not in ALONE
+    }
     lines = [f"`{command}`", "", "| map | walls | s | " + " | ".join(COLUMNS.values()) + " |", "|" + "---|" * (3 + len(COLUMNS))]
     for name, row in rows.items():
         lines.append(_line(name, row["walls"], f"{row['seconds']:.1f}", summary(row)))
@@ -267,7 +271,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dev", action="store_true", help="buildings of the training list")
     parser.add_argument("--only", default="", help="cases whose name contains this")
-    parser.add_argument("--scans", type=Path, default=ROOT / "cache" / "scans")
+    parser.add_argument("--scans", type=Path, default=Path("cache/scans"))
     parser.add_argument("--write", type=Path, help="file whose section between the marks of the walls is replaced")
     settings = parser.parse_args()
     data = Path(os.environ["TOPOMERGE_DATA"]) if os.environ.get("TOPOMERGE_DATA") else None

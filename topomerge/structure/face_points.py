@@ -1,4 +1,4 @@
-"""Cells in which a wall may have been seen from a room: where their points lie on average, and how many stand above each other."""
+"""Cells in which a wall may have been seen from a room, and where their points lie on average."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from topomerge.types import Array, TopometricMap
 
 FACE_HEIGHTS = (0.3, 2.2)  # m above the floor: skirting and ceilings are no faces of walls
 ABOVE = 6.0  # m above the floor: cells higher up are of no use
-STRAY = 0.5  # m: cells of no room belong to a floor this near
+STRAY = 1.0  # m: cells of no room belong to a floor this near
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +54,15 @@ def face_points(map: TopometricMap, storey: int, floors: list[shapely.MultiPolyg
     within = 0.5 if offset is None else (offset[rows].astype(np.float64) + 0.5) / OFFSET_STEPS
     middles = grid.origin + (cells + within) * grid.edge
     room = map.room[rows].astype(np.int32)
-    stray = np.flatnonzero(room < 0)
-    rooms = np.flatnonzero(map.rooms["storey"] == storey)
+    stray, rooms = np.flatnonzero(room < 0), np.flatnonzero(map.rooms["storey"] == storey)
     if len(stray) and len(rooms):
-        near, which = shapely.STRtree([floors[r] for r in rooms]).query_nearest(
-            shapely.points(middles[stray, :2]), max_distance=STRAY, all_matches=False
-        )
-        room[stray[near]] = rooms[which]
+        columns, of = np.unique(cells[stray, :2], axis=0, return_inverse=True)
+        middle = grid.origin[:2] + (columns + 0.5) * grid.edge
+        tree = shapely.STRtree([floors[r] for r in rooms])
+        near, which = tree.query_nearest(shapely.points(middle), max_distance=STRAY, all_matches=False)
+        nearest = np.full(len(columns), -1, np.int32)
+        nearest[near] = rooms[which]
+        room[stray] = nearest[of.ravel()]
     floor = np.append(room_levels(map)[0][:, 0], map.storeys["floor"][storey])
     height = middles[:, 2] - floor[room]
     use = (height > 0) & (height < ABOVE)

@@ -10,6 +10,7 @@ from topomerge.types import Array
 JOINT_REACH = 0.7  # m beyond the end of a wall
 IN_LINE = np.cos(np.radians(8.0))
 CROSSING = np.sin(np.radians(20.0))
+THROUGH = 0.1  # m that an end may lie beyond the middle of the wall that it meets
 INTO_ROOM = 0.03  # m by which a wall may reach into a room where it is lengthened
 
 
@@ -71,6 +72,3 @@ def _more(tip: Array, way: Array, thickness: float, others: Array) -> float | No
             more += other["thickness"] / 2 if corner else 0.0
             best = more if best is None or abs(more) < abs(best) else best
     return best
-
-
-THROUGH = 0.1  # m that an end may lie beyond the middle of the wall that it meets

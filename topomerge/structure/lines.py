@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,17 +23,31 @@ OFF_LINE = 0.04  # m, by which a line may leave its points at its ends when it i
 
 @dataclass(frozen=True)
 class Line:
-    """A straight line of points: through `middle` (2,) m, along `along` (2,) unit, from `start` to `end` m from the middle."""
+    """A straight line of points: through `middle` (2,) m, along `along` (2,) unit, from `start` to `end` m from the middle.
+
+    `weight` is how many metres of wall were seen on it; of a line that is only concluded, 0.
+    """
 
     middle: Array
     along: Array
     start: float
     end: float
+    weight: float = 0.0
 
     @property
     def length(self) -> float:
         """m."""
         return self.end - self.start
+
+    @property
+    def across(self) -> Array:
+        """(2,) unit, to its left."""
+        return np.array([-self.along[1], self.along[0]])
+
+    @property
+    def ends(self) -> Array:
+        """(2, 2) m."""
+        return self.middle + np.outer([self.start, self.end], self.along)
 
 
 def straight_lines(points: Array, weights: Array, main: float | None = None) -> list[Line]:
@@ -53,8 +67,9 @@ def straight_lines(points: Array, weights: Array, main: float | None = None) -> 
             break
         line = _fitted(points[left[rows]], weights[left[rows]], main)
         own = _near(points[left], line)
-        if weights[left[own]].sum() >= max(DENSE * line.length, LEAST_LINE / 2):
-            lines.append(line)
+        weight = float(weights[left[own]].sum())
+        if weight >= max(DENSE * line.length, LEAST_LINE / 2):
+            lines.append(replace(line, weight=weight))
         left = np.delete(left, np.union1d(own, rows))
     return lines
 
@@ -125,5 +140,5 @@ def _least_squares(points: Array, weights: Array, along: Array | None = None) ->
 
 
 def _near(points: Array, line: Line) -> Array:
-    t, off = (points - line.middle) @ line.along, (points - line.middle) @ (-line.along[1], line.along[0])
+    t, off = (points - line.middle) @ line.along, (points - line.middle) @ line.across
     return np.flatnonzero((np.abs(off) < LINE_REACH) & (t > line.start - LINE_REACH) & (t < line.end + LINE_REACH))

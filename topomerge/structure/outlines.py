@@ -1,4 +1,4 @@
-"""The outline of a room along its walls: the plane is cut by the lines of its walls, and a minimal cut says which pieces are room.
+"""The outline of a room along its walls: their lines cut the plane, and a minimal cut says which of its pieces are room.
 
 A piece is room rather than not by how much of it the floor covers; an edge of the outline costs nothing where a wall was seen,
 and its length where not. So leaks through windows are cut off, and corners that nobody saw are completed (compare Oesau et al.
@@ -17,32 +17,35 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from topomerge.structure.lines import LINE_GAP, Line
 from topomerge.types import Array
 
-AROUND = 3.0  # m around a floor, in which its corners are
-UNSEEN_COST = 0.5  # m2 that a metre of outline without a wall costs
+OUTLINE_MARGIN = 3.0  # m around a floor, in which its corners are
+UNSEEN_COST = 0.4  # m2 that a metre of outline without a wall costs
+BEYOND_COST = 0.5  # of a square metre that the floor does not cover, where one that it covers costs 1
 OWN_EDGE = 0.4  # m: longer edges of the floor cut the plane, too, where no wall is near
 SAME_LINE = 0.2  # m
 SAME_TURN = np.cos(np.radians(10.0))
 REACH_ON = 0.4  # m: a wall may go on so far past what was seen of it
 SIMPLER = 0.12  # m
+SLIVER = 0.1  # m: narrower parts of an outline that touches another one are none
 UNIT = 1e4  # of costs: a square centimetre
-GRID = 1e-6  # m, of corners
+CORNER_GRID = 1e-6  # m, of corners
 
 
 def room_outline(floor: shapely.MultiPolygon, lines: list[Line]) -> shapely.MultiPolygon:
     """The floor with its edges on the lines of walls, m; the floor itself where there are none."""
     if floor.is_empty or not lines:
         return floor
-    box = shapely.box(*floor.bounds).buffer(AROUND, join_style="mitre")
+    box = shapely.box(*floor.bounds).buffer(OUTLINE_MARGIN, join_style="mitre")
     low = np.array(floor.bounds[:2])
-    seen = [_segment(line, LINE_GAP / 2 if line.length > LINE_GAP else REACH_ON, low) for line in lines]
+    walls = [_segment(line, LINE_GAP / 2 if line.length > LINE_GAP else REACH_ON, low) for line in lines]
     long = [_segment(line, 1e3, low) for line in lines]
-    own = _own_edges(shapely.affinity.translate(floor, *-low), seen)
+    own = [_segment(edge, REACH_ON, low) for edge in unseen_edges(floor, lines)]
+    seen = [wall for wall, line in zip(walls, lines, strict=True) if line.weight > 0]
     box, moved = shapely.affinity.translate(box, *-low), shapely.affinity.translate(floor, *-low)
     drawn = shapely.intersection(np.array([*long, *own]), box)
-    network = shapely.union_all([*drawn, box.exterior], grid_size=GRID)
+    network = shapely.union_all([*drawn, box.exterior], grid_size=CORNER_GRID)
     pieces = shapely.get_parts(shapely.polygonize(shapely.get_parts(network)))
     room = _cut(pieces, moved, shapely.union_all([s.buffer(1e-4, cap_style="flat") for s in seen]))
-    shape = shapely.union_all(pieces[room], grid_size=GRID) if room.any() else moved
+    shape = shapely.union_all(pieces[room], grid_size=CORNER_GRID) if room.any() else moved
     parts = [p for p in shapely.get_parts(shapely.simplify(shape, 1e-4)) if p.area > 0.05]
     parts = [shapely.Polygon(p.exterior, [h for h in p.interiors if shapely.Polygon(h).area > 0.2]) for p in parts]
     placed = shapely.affinity.translate(shapely.MultiPolygon(parts), *low)
@@ -54,22 +57,23 @@ def _segment(line: Line, more: float, low: Array) -> shapely.LineString:
     return shapely.LineString(ends)
 
 
-def _own_edges(floor: shapely.MultiPolygon, seen: list[shapely.LineString]) -> list[shapely.LineString]:
-    """Edges of the floor beside which no wall was seen, a little longer than they are."""
+def unseen_edges(floor: shapely.MultiPolygon, lines: list[Line]) -> list[Line]:
+    """Edges of a floor, beside which no line of a wall runs; nothing was seen on them."""
     out = []
-    tree = shapely.STRtree(seen)
-    ways = np.array([np.diff(np.asarray(s.coords), axis=0)[0] / s.length for s in seen])
     for part in shapely.get_parts(shapely.simplify(floor, SIMPLER)):
         for ring in (part.exterior, *part.interiors):
             for a, b in pairwise(np.asarray(ring.coords)[:, :2]):
                 length = float(np.hypot(*(b - a)))
-                if length < OWN_EDGE:
-                    continue
-                way = (b - a) / length
-                near = tree.query(shapely.Point((a + b) / 2), predicate="dwithin", distance=SAME_LINE)
-                if not (np.abs(ways[near] @ way) > SAME_TURN).any():
-                    out.append(shapely.LineString([a - way * REACH_ON, b + way * REACH_ON]))
+                edge = Line((a + b) / 2, (b - a) / max(length, 1e-9), -length / 2, length / 2)
+                if length >= OWN_EDGE and not any(_runs_along(line, edge) for line in lines):
+                    out.append(edge)
     return out
+
+
+def _runs_along(line: Line, edge: Line) -> bool:
+    t = float((edge.middle - line.middle) @ line.along)
+    beside = line.start - REACH_ON < t < line.end + REACH_ON and abs(line.along @ edge.along) > SAME_TURN
+    return beside and abs(float((edge.middle - line.middle) @ line.across)) < SAME_LINE
 
 
 def _cut(pieces: Array, floor: shapely.MultiPolygon, seen: shapely.Geometry) -> Array:
@@ -82,7 +86,7 @@ def _cut(pieces: Array, floor: shapely.MultiPolygon, seen: shapely.Geometry) -> 
     source, sink, every = np.full(count, count), np.full(count, count + 1), np.arange(count)
     start = np.concatenate([a, b, source, every])
     end = np.concatenate([b, a, every, sink])
-    capacity = np.concatenate([cost, cost, inside, area - inside])
+    capacity = np.concatenate([cost, cost, inside, BEYOND_COST * (area - inside)])
     whole = np.maximum(np.round(capacity * UNIT), 0).astype(np.int32)
     graph = coo_array((whole, (start, end)), shape=(count + 2, count + 2)).tocsr()
     flow = maximum_flow(graph, count, count + 1).flow
@@ -116,7 +120,10 @@ def apart(outlines: list[shapely.MultiPolygon]) -> list[shapely.MultiPolygon]:
     out: list[shapely.MultiPolygon] = []
     for outline in outlines:
         taken = [out[k] for k in np.flatnonzero(shapely.intersects(out, outline))] if out else []
-        rest = shapely.difference(outline, shapely.union_all(taken)) if taken else outline
+        rest = outline
+        if taken:  # slivers between lines of two rooms go, corners stay
+            rest = shapely.difference(outline, shapely.union_all(taken)).buffer(-SLIVER, join_style="mitre")
+            rest = rest.buffer(SLIVER, join_style="mitre").intersection(outline)
         parts = [p for p in shapely.get_parts(rest) if p.geom_type == "Polygon" and p.area > 0.05]
         out.append(shapely.MultiPolygon([shapely.geometry.polygon.orient(p) for p in parts]))
     return out

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import shapely
 
 from topomerge.structure.face_points import FacePoints
-from topomerge.structure.floors import jambs, is_flight, room_levels
+from topomerge.structure.floors import is_flight, jambs, room_levels
 from topomerge.structure.joints import joined
 from topomerge.types import Array, TopometricMap
 
@@ -36,8 +37,24 @@ BRIDGED = 1.2  # m: shorter gaps in a face are shadows of furniture
 LEAST_WALL = 0.3  # m
 LEAST_FACE = 0.5  # m: shorter pieces of one face beside a wall of two are the end of a wall across
 DOOR_REACH = 0.8  # m between the middle of a door and the face that it is in
+BESIDE_DOOR = 3  # bins of a face that are seen beside a door: else it is no hole in a wall
 WIDEST = 3.5  # m: wider openings are no hole in a wall
 LOWER = 0.5  # m below the ceiling: a wall that ends so far below is a partition
+
+
+def wall_part(wall: Any, opening: Any = None, more: float = 0.0) -> shapely.Polygon:
+    """A wall (a row of WALL_DTYPE) from above, or what an opening (a row of OPENING_DTYPE) takes of it; counter-clockwise, m.
+
+    Args:
+        more: m by which it is thicker on either side.
+    """
+    start, end = wall["start"], wall["end"]
+    along = (end - start) / max(float(np.hypot(*(end - start))), 1e-9)
+    if opening is not None:
+        half = along * float(opening["width"]) / 2
+        start, end = opening["centre"][:2] - half, opening["centre"][:2] + half
+    across = np.array([-along[1], along[0]]) * (float(wall["thickness"]) / 2 + more)
+    return shapely.Polygon([start - across, end - across, end + across, start + across])
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +95,8 @@ def walls_between(map: TopometricMap, storey: int, rooms: list[shapely.MultiPoly
     for wall, (start, end, thick, seen, sides) in zip(walls, rows, strict=True):
         wall["storey"], wall["start"], wall["end"], wall["thickness"] = storey, start, end, thick
         wall["faces"], wall["rooms"] = seen, sides
-    walls = joined(walls, shapely.union_all([rooms[r] for r in np.flatnonzero(map.rooms["storey"] == storey)]))
-    return _with_heights(map, walls, points)
+    walls = _with_heights(map, walls, points)
+    return joined(walls, shapely.union_all([rooms[r] for r in np.flatnonzero(map.rooms["storey"] == storey)]))
 
 
 def _faces(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolygon], points: FacePoints) -> list[_Face]:
@@ -87,6 +104,7 @@ def _faces(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolygon], p
     upright = points.upright
     tree = shapely.STRtree(shapely.points(points.at[upright]))
     at, scale = points.at[upright], 0.1 / points.edge
+    reach = FACE_REACH if points.measured else FACE_REACH + points.edge / 2
     faces = []
     for r in np.flatnonzero(map.rooms["storey"] == storey).tolist():
         doors = [e for e in map.edges if r in e["rooms"] and not is_flight(e) and e["width"] <= WIDEST]
@@ -97,7 +115,7 @@ def _faces(map: TopometricMap, storey: int, rooms: list[shapely.MultiPolygon], p
                     if length < 1e-6:
                         continue
                     along = (b - a) / length
-                    near = tree.query(shapely.LineString([a, b]), predicate="dwithin", distance=FACE_REACH)
+                    near = tree.query(shapely.LineString([a, b]), predicate="dwithin", distance=reach)
                     count = np.bincount(
                         np.clip((at[near] - a) @ along / BIN, 0, np.ceil(length / BIN) - 1).astype(np.int64),
                         minlength=int(np.ceil(length / BIN)),
@@ -116,7 +134,7 @@ def _bridged(face: _Face, doors: list[Array]) -> _Face:
         middle, half = float(ends.mean()), float(door["width"]) / 2
         if off < DOOR_REACH and -half < middle < face.length + half:
             low, high = (int(np.clip(x / BIN, 0, len(seen))) for x in (middle - half - BIN, middle + half + BIN))
-            if seen[max(low - 5, 0) : high + 5].any():
+            if face.seen[:low].sum() + face.seen[high:].sum() >= BESIDE_DOOR:
                 seen[low:high] = True
     runs = np.flatnonzero(seen)
     for a, b in pairwise(runs.tolist()):
@@ -150,11 +168,8 @@ def _pairs(faces: list[_Face]) -> list[tuple[int, int, float, float]]:
             for start, end in _overlaps(free, low, high):
                 pairs.append((i, j, start, end))
             free = _without(free, low, high)
-    return [pair for pair in pairs if pair[0] < pair[1] or not _mirrored(pair, pairs, faces)]
-
-
-def _mirrored(pair: tuple[int, int, float, float], pairs: list[tuple[int, int, float, float]], faces: list[_Face]) -> bool:
-    return any(other[0] == pair[1] and other[1] == pair[0] for other in pairs)
+    there = {(i, j) for i, j, _, _ in pairs}
+    return [pair for pair in pairs if pair[0] < pair[1] or (pair[1], pair[0]) not in there]
 
 
 def _across(face: _Face, point: Array) -> Array:
@@ -222,10 +237,12 @@ def _runs(face: _Face, low: float, high: float) -> list[tuple[float, float]]:
 
 
 def _with_heights(map: TopometricMap, walls: Array, points: FacePoints) -> Array:
-    """The walls from the lower floor beside them to the higher ceiling, or to their own top where that is well below."""
+    """The walls from the lower floor beside them to the higher ceiling, or to their own top where that is well below; those of
+    which one side was seen, so low, are cupboards and left out."""
+    furniture = np.zeros(len(walls), bool)
     levels, seen = room_levels(map)
     tree = shapely.STRtree(shapely.points(points.at))
-    for wall in walls:
+    for k, wall in enumerate(walls):
         beside = wall["rooms"][wall["rooms"] >= 0]
         wall["low"], wall["high"] = levels[beside, 0].min(), levels[beside, 1].max()
         line = shapely.LineString([wall["start"], wall["end"]])
@@ -239,4 +256,5 @@ def _with_heights(map: TopometricMap, walls: Array, points: FacePoints) -> Array
         reached = float(np.quantile(top[top > 0], 0.8)) if (top > 0).any() else np.inf
         if wall["low"] + reached < wall["high"] - LOWER:
             wall["high"] = wall["low"] + reached
-    return walls
+            furniture[k] = wall["faces"] == 1
+    return walls[~furniture]
