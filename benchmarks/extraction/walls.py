@@ -54,11 +54,10 @@ COLUMNS = {
 
 
 def cases(development: bool) -> list[Case]:
-    """Buildings of the validation list, one of each kind and one with round and slanted walls; or those of `dev`."""
+    """Buildings of the validation list, one of each kind; or those of `dev`."""
     if development:
         return [case for case in dev() if case.source == "procedural" and case.spoil != "sparse"]
-    out = [Case("walls", "procedural", kind, sensor, VALIDATION + i, rooms=10) for i, (kind, sensor) in enumerate(KINDS)]
-    return [*out, Case("walls", "procedural", "office", "tls", VALIDATION + 50, rooms=10, difficulty=(("curved", 1.0),))]
+    return [Case("walls", "procedural", kind, sensor, VALIDATION + i, rooms=10) for i, (kind, sensor) in enumerate(KINDS)]
 
 
 def judged(scan: Scan, map: TopometricMap) -> Row:
