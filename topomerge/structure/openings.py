@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from topomerge.structure.floors import is_flight
@@ -60,7 +62,7 @@ def _carrier(edge: Array, walls: Array, storeys: Array) -> int:
     return int(np.flatnonzero(fits)[cost[fits].argmin()]) if fits.any() else -1
 
 
-def _set_into(opening: Array, wall: Array) -> None:
+def _set_into(opening: Any, wall: Array) -> None:
     line = wall["end"] - wall["start"]
     length = float(np.hypot(*line))
     along = line / length

@@ -10,8 +10,9 @@ import numpy as np
 import shapely
 
 from topomerge.structure.face_points import FacePoints
-from topomerge.structure.floors import is_flight, jambs, room_levels
+from topomerge.structure.floors import is_flight, jambs
 from topomerge.structure.joints import joined
+from topomerge.structure.wall_heights import with_heights
 from topomerge.types import Array, TopometricMap
 
 WALL_DTYPE = np.dtype(
@@ -39,7 +40,6 @@ LEAST_FACE = 0.5  # m: shorter pieces of one face beside a wall of two are the e
 DOOR_REACH = 0.8  # m between the middle of a door and the face that it is in
 BESIDE_DOOR = 3  # bins of a face that are seen beside a door: else it is no hole in a wall
 WIDEST = 3.5  # m: wider openings are no hole in a wall
-LOWER = 0.5  # m below the ceiling: a wall that ends so far below is a partition
 
 
 def wall_part(wall: Any, opening: Any = None, more: float = 0.0) -> shapely.Polygon:
@@ -92,10 +92,11 @@ def walls_between(map: TopometricMap, storey: int, rooms: list[shapely.MultiPoly
     thickness = float(np.median([row[2] for row in rows])) if rows else USUAL_THICKNESS
     rows += _singles(faces, pairs, thickness)
     walls = np.zeros(len(rows), WALL_DTYPE)
-    for wall, (start, end, thick, seen, sides) in zip(walls, rows, strict=True):
-        wall["storey"], wall["start"], wall["end"], wall["thickness"] = storey, start, end, thick
-        wall["faces"], wall["rooms"] = seen, sides
-    walls = _with_heights(map, walls, points)
+    walls["storey"] = storey
+    for k, (start, end, thick, seen, sides) in enumerate(rows):
+        walls["start"][k], walls["end"][k], walls["thickness"][k] = start, end, thick
+        walls["faces"][k], walls["rooms"][k] = seen, sides
+    walls = with_heights(map, walls, points)
     return joined(walls, shapely.union_all([rooms[r] for r in np.flatnonzero(map.rooms["storey"] == storey)]))
 
 
@@ -214,8 +215,8 @@ def _singles(faces: list[_Face], pairs: list[tuple[int, int, float, float]], thi
     for i, j, start, end in pairs:
         f, g = faces[i], faces[j]
         taken.setdefault(i, []).append((start, end))
-        ends = sorted(float((f.a + f.along * t - g.a) @ g.along) for t in (start, end))
-        taken.setdefault(j, []).append((ends[0], ends[1]))
+        there = sorted(float((f.a + f.along * t - g.a) @ g.along) for t in (start, end))
+        taken.setdefault(j, []).append((there[0], there[1]))
     for i, face in enumerate(faces):
         free = [(0.0, face.length)]
         for low, high in taken.get(i, []):
@@ -234,27 +235,3 @@ def _runs(face: _Face, low: float, high: float) -> list[tuple[float, float]]:
     change = np.flatnonzero(np.diff(np.pad(face.seen[first:last].astype(np.int8), 1)))
     runs = change.reshape(-1, 2) + first
     return [(max(a * BIN, low), min(b * BIN, high)) for a, b in runs.tolist()]
-
-
-def _with_heights(map: TopometricMap, walls: Array, points: FacePoints) -> Array:
-    """The walls from the lower floor beside them to the higher ceiling, or to their own top where that is well below; those of
-    which one side was seen, so low, are cupboards and left out."""
-    furniture = np.zeros(len(walls), bool)
-    levels, seen = room_levels(map)
-    tree = shapely.STRtree(shapely.points(points.at))
-    for k, wall in enumerate(walls):
-        beside = wall["rooms"][wall["rooms"] >= 0]
-        wall["low"], wall["high"] = levels[beside, 0].min(), levels[beside, 1].max()
-        line = shapely.LineString([wall["start"], wall["end"]])
-        rows = tree.query(line, predicate="dwithin", distance=wall["thickness"] / 2 + FACE_REACH)
-        if not len(rows) or not seen[beside].any():
-            continue
-        along = (wall["end"] - wall["start"]) / max(line.length, 1e-9)
-        place = ((points.at[rows] - wall["start"]) @ along / BIN).astype(np.int64)
-        top = np.full(place.max() + 1, -1.0) if place.min() >= 0 else np.full(1, -1.0)
-        np.maximum.at(top, np.clip(place, 0, len(top) - 1), points.height[rows])
-        reached = float(np.quantile(top[top > 0], 0.8)) if (top > 0).any() else np.inf
-        if wall["low"] + reached < wall["high"] - LOWER:
-            wall["high"] = wall["low"] + reached
-            furniture[k] = wall["faces"] == 1
-    return walls[~furniture]
