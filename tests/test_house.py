@@ -16,6 +16,7 @@ RANKS = {
     "writers": 0,
     "kernels": 0,
     "types": 1,
+    "structure": 1.5,  # what exports draw
     "io": 2,
     "numpy_nn": 2,
     "extraction": 3,

@@ -153,6 +153,11 @@ def _storeys(rows: list[Row]) -> str:
 
 
 def write(path: Path, rows: list[Row], command: str, mark: str = MARK) -> None:
+    """Replace what stands between the two marks of a file by the report."""
+    replace_section(path, report(rows, command), mark)
+
+
+def replace_section(path: Path, section: str, mark: str) -> None:
     """Replace what stands between the two marks of a file, or add marks and section at its end."""
     begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
     text = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
@@ -161,7 +166,7 @@ def write(path: Path, rows: list[Row], command: str, mark: str = MARK) -> None:
     before, rest = text.split(begin, 1)
     after = rest.split(end, 1)[1]
     with replacing(path) as beside:
-        beside.write_text(f"{before}{begin}\n{report(rows, command)}\n{end}{after}", encoding="utf-8")
+        beside.write_text(f"{before}{begin}\n{section}\n{end}{after}", encoding="utf-8")
 
 
 def _head(names: list[str], count: int | None = None) -> list[str]:

@@ -17,7 +17,8 @@ import topomerge
 from tests.io.export_maps import AT, GRID, flat, nothing, rectangles, stair_scene, two_floors, without_doors
 from tests.io.indoorgml_structure import CORE, GML, check, is_closed, positions, volume
 from tests.io.test_export_plans import with_areas, write
-from tests.scenes import corridor
+from tests.scenes import HEIGHT, THICK, corridor, two_rooms
+from topomerge.structure.plan_structure import plan_structure
 from topomerge.types import TopometricMap
 
 
@@ -32,8 +33,11 @@ def test_indoorgml_has_the_structure_of_its_schema(tmp_path, make):
     map = make()
     root = xml.parse(write(map, "indoorgml", tmp_path / "a.gml")).getroot()
     check(root)
-    solids = list(root.iter(GML + "Solid"))
-    assert len(solids) == len(map.rooms) and all(is_closed(solid) for solid in solids)
+    assert all(is_closed(solid) and volume(solid) > 0 for solid in root.iter(GML + "Solid"))
+    solids = [
+        solid for cell in root.iter(CORE + "CellSpace") if cell.get(GML + "id")[0] == "C" for solid in cell.iter(GML + "Solid")
+    ]
+    assert len(solids) == len(map.rooms)
     for solid, room in zip(solids, map.rooms, strict=True):
         assert volume(solid) == pytest.approx(room["volume"] or room["area"] * room["height"], rel=0.03)
 
@@ -135,7 +139,7 @@ def test_ifc_holds_storeys_spaces_and_doors(tmp_path, at):
     for door, edge in zip(doors, door_edges, strict=True):
         assert (door.OverallWidth, door.OverallHeight) == pytest.approx((1.0, 2.0))
         matrix = placement.get_local_placement(door.ObjectPlacement)
-        assert (matrix @ (0.5, 0, 0, 1))[:3] == pytest.approx(edge["centre"])
+        assert (matrix @ (0.5, 0, 0, 1))[:3] == pytest.approx(edge["centre"], abs=0.01)  # in the middle of its wall
         assert {b.RelatingSpace.Name for b in door.ProvidesBoundaries} == {f"room {r}" for r in edge["rooms"]}
     assert len(model.by_type("IfcStair")) == 1 and len(model.by_type("IfcWall")) > 0
     geometry = importlib.import_module("ifcopenshell.geom")
@@ -148,11 +152,51 @@ def test_ifc_holds_storeys_spaces_and_doors(tmp_path, at):
     assert len({e.GlobalId for e in model.by_type("IfcRoot")}) == len(model.by_type("IfcRoot"))
 
 
+def test_ifc_doors_fill_openings_that_void_walls(tmp_path):
+    ifcopenshell = pytest.importorskip("ifcopenshell")
+    element = importlib.import_module("ifcopenshell.util.element")
+    map = topomerge.extract(two_rooms().points())
+    model = ifcopenshell.open(str(write(map, "ifc", tmp_path / "a.ifc")))
+    walls = plan_structure(map).walls
+    assert len(model.by_type("IfcWall")) == len(walls) == 7
+    (voids,), (fills,) = model.by_type("IfcRelVoidsElement"), model.by_type("IfcRelFillsElement")
+    assert voids.RelatedOpeningElement == fills.RelatingOpeningElement and fills.RelatedBuildingElement.is_a("IfcDoor")
+    carrier = int(voids.RelatingBuildingElement.Name.split()[1])
+    assert sorted(walls["rooms"][carrier]) == [0, 1]
+    facts = [element.get_psets(wall) for wall in model.by_type("IfcWall")]
+    assert [f["Topomerge_Wall"]["FacesSeen"] for f in facts] == walls["faces"].tolist()
+    assert facts[carrier]["Qto_WallBaseQuantities"]["Width"] == pytest.approx(THICK, abs=0.02)
+    assert sum("Width" in f["Qto_WallBaseQuantities"] for f in facts) == 1, "the thickness of the others is a guess"
+    geometry = importlib.import_module("ifcopenshell.geom")
+    whole = np.hypot(*(walls["end"] - walls["start"])[carrier]) * THICK * HEIGHT
+    shape = geometry.create_shape(geometry.settings(), voids.RelatingBuildingElement).geometry
+    volume = importlib.import_module("ifcopenshell.util.shape").get_volume(shape)
+    door = model.by_type("IfcDoor")[0]
+    assert volume == pytest.approx(whole - door.OverallWidth * door.OverallHeight * THICK, rel=0.03)
+
+
+def test_indoorgml_walls_are_cells_that_share_the_faces_of_rooms(tmp_path):
+    map = topomerge.extract(two_rooms().points())
+    root = xml.parse(write(map, "indoorgml", tmp_path / "a.gml")).getroot()
+    check(root)
+    cells = {cell.get(GML + "id"): cell for cell in root.iter(CORE + "CellSpace")}
+    walls = {name: cell for name, cell in cells.items() if name[0] == "W"}
+    assert len(cells) == len(walls) + 2 and all(cell.find(CORE + "duality") is None for cell in walls.values())
+    assert all(is_closed(solid) and volume(solid) > 0 for solid in root.iter(GML + "Solid"))
+    plans = {name: shapely.MultiPoint(positions(cell)[:, :2]).convex_hull for name, cell in cells.items()}
+    carrier = next(k for k, wall in enumerate(plan_structure(map).walls) if wall["faces"] == 2)
+    parts = [plans[name] for name in walls if name.split("-")[0] == f"W{carrier}"]
+    assert len(parts) == 3, "beside the door, and over it"
+    for name in ("C0", "C1"):
+        assert min(plans[name].distance(part) for part in parts) < 1e-3
+        assert max(plans[name].intersection(part).area for part in plans.values() if part is not plans[name]) < 1e-3
+
+
 RULES = [pytest.param(False, id="types"), pytest.param(True, id="rules", marks=pytest.mark.slow)]  # EXPRESS takes 12 s a model
 
 
 @pytest.mark.parametrize("rules", RULES)
-@pytest.mark.parametrize("make", [two_floors, courtyard, nothing, without_doors])
+@pytest.mark.parametrize("make", [two_floors, courtyard, nothing, without_doors, lambda: topomerge.extract(two_rooms().points())])
 def test_ifc_is_valid(tmp_path, make, rules):
     ifcopenshell = pytest.importorskip("ifcopenshell")
     validate = importlib.import_module("ifcopenshell.validate")
@@ -203,7 +247,7 @@ def test_heights_that_nobody_saw(tmp_path):
     blind = replace(map, rooms=rooms, edges=edges)
     model = ifcopenshell.open(str(write(blind, "ifc", tmp_path / "a.ifc")))
     assert model.by_type("IfcDoor")[0].OverallHeight is None
-    assert not [q for q in model.by_type("IfcPhysicalQuantity") if q.Name != "GrossFloorArea"]
+    assert not [q for q in model.by_type("IfcPhysicalQuantity") if q.Name in ("Height", "GrossVolume")]
     check(xml.parse(write(blind, "indoorgml", tmp_path / "a.gml")).getroot())
     features = json.loads(Path(write(blind, "geojson", tmp_path / "a.geojson")).read_text())["features"]
     assert all(f["properties"]["height"] is None for f in features if f["properties"]["kind"] in ("room", "door"))

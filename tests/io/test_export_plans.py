@@ -13,12 +13,15 @@ import shapely
 
 import topomerge
 from tests.io.export_maps import AT, GRID, nothing, rectangles, two_floors, without_doors
+from tests.scenes import THICK, two_rooms
 from tests.scenes_map import building
 from topomerge.errors import InputError
 from topomerge.io.exports import FORMATS, formats, outputs
 from topomerge.io.exports.geojson import Origin, parse_origin
 from topomerge.io.points import read_points
 from topomerge.types import AREA_DTYPE, TopometricMap
+
+STRUCTURE = ("wall", "wall_opening")
 
 
 def write(map: TopometricMap, name: str, path: Path, **options) -> Path:
@@ -42,7 +45,7 @@ def test_floors_doors_and_stairs(tmp_path):
         assert floor.exterior.is_ccw and floor.exterior.has_z
         assert feature["properties"]["area"] == pytest.approx(rectangle.area) and feature["properties"]["height"] == 2.9
     assert [f["properties"]["storey"] for f in rooms] == [0, 0, 0, 1, 1, 1]
-    ways = [f for f in plan["features"] if f["properties"]["kind"] != "room"]
+    ways = [f for f in plan["features"] if f["properties"]["kind"] not in ("room", *STRUCTURE)]
     assert [f["properties"]["kind"] for f in ways] == ["door", "door", "door", "door", "stairs"]
     door = np.array(ways[0]["geometry"]["coordinates"])
     assert np.linalg.norm(door[1] - door[0]) == pytest.approx(1.0)
@@ -52,10 +55,30 @@ def test_floors_doors_and_stairs(tmp_path):
     ) == pytest.approx(3)
 
 
+def test_walls_and_their_openings(tmp_path):
+    map = topomerge.extract(two_rooms().points())
+    features = geojson(map, tmp_path)["features"]
+    shapes = {f["id"]: shapely.geometry.shape(f["geometry"]) for f in features}
+    walls = [f for f in features if f["properties"]["kind"] == "wall"]
+    assert len(walls) == 7 and all(f["properties"]["storey"] == 0 for f in walls)
+    (between,) = (f for f in walls if f["properties"]["rooms"] in ([0, 1], [1, 0]))
+    assert between["properties"]["thickness"] == pytest.approx(THICK, abs=0.02) and between["properties"]["faces"] == 2
+    assert all(None in f["properties"]["rooms"] and f["properties"]["faces"] == 1 for f in walls if f is not between)
+    (hole,) = (f for f in features if f["properties"]["kind"] == "wall_opening")
+    assert hole["properties"] | {"width": 0, "height": 0} == {
+        "kind": "wall_opening", "of": "door", "edge": 0, "wall": between["properties"]["wall"], "storey": 0, "rooms": [0, 1],
+        "width": 0, "height": 0,
+    }  # fmt: skip
+    assert shapes["opening 0"].difference(shapes[between["id"]].buffer(1e-3)).is_empty
+    for room in ("room 0", "room 1"):  # they share the wall's faces
+        assert shapes[room].distance(shapes[between["id"]]) < 1e-3
+        assert shapes[room].intersection(shapes[between["id"]]).area < 1e-2
+
+
 def test_one_storey(tmp_path):
     plan = geojson(two_floors(), tmp_path, storey=1)
     assert [f["properties"]["storey"] for f in plan["features"] if f["properties"]["kind"] == "room"] == [1, 1, 1]
-    assert sorted(f["properties"]["kind"] for f in plan["features"] if f["properties"]["kind"] != "room") == [
+    assert sorted(f["properties"]["kind"] for f in plan["features"] if f["properties"]["kind"] not in ("room", *STRUCTURE)) == [
         "door",
         "door",
         "stairs",

@@ -16,8 +16,8 @@ import numpy as np
 import shapely
 
 from topomerge.io.atomic import replacing
-from topomerge.io.exports.floors import floor_polygons, inside
 from topomerge.io.palette import room_colours
+from topomerge.structure.floors import floor_polygons, inside
 from topomerge.types import Array, TopometricMap
 
 VERSION = {"major": 1, "minor": 1, "patch": 3}

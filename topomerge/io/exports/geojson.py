@@ -1,4 +1,4 @@
-"""Floors as polygons and doors as lines: GeoJSON (RFC 7946), for QGIS, web maps and shapely.
+"""Rooms and walls as polygons, doors as lines and as openings in walls: GeoJSON (RFC 7946), for QGIS, web maps and shapely.
 
 With an origin, coordinates are longitude and latitude of WGS84. Without, they are metres in the frame of the map; then `crs` is
 null, which tells readers of the older GeoJSON that there are no degrees, and the member `topomerge` says so in words.
@@ -18,7 +18,9 @@ import shapely
 
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
-from topomerge.io.exports.floors import floor_polygons, is_flight, jambs, room_levels
+from topomerge.structure.floors import is_flight, jambs, room_levels
+from topomerge.structure.plan_structure import plan_structure
+from topomerge.structure.walls import wall_part
 from topomerge.types import Array, TopometricMap
 
 SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563  # m; the ellipsoid of WGS84
@@ -55,7 +57,8 @@ def parse_origin(text: str) -> Origin:
 
 
 def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: int | None = None) -> None:
-    """Write one FeatureCollection: a feature for each room, then for each door, opening and flight of stairs.
+    """Write one FeatureCollection: a feature for each room, then for each door, opening and flight of stairs, each wall, and
+    each door or opening as a hole in its wall.
 
     Args:
         map: any map.
@@ -73,6 +76,7 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
         _check_near(map)
     place = _metres if origin is None else _on_earth(origin)
     features = [*_rooms(map, place, storey), *_doors(map, place, storey)]
+    features += [*_walls(map, place, storey), *_openings(map, place, storey)]
     listing: dict[str, Any] = {"type": "FeatureCollection"}
     if origin is None:
         listing |= {"crs": None, "topomerge": _about(map, "metres in the frame of the map, z up; not longitude and latitude")}
@@ -96,7 +100,7 @@ def _text(listing: dict[str, Any], features: list[dict[str, Any]]) -> str:
 
 def _rooms(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
     levels, seen = room_levels(map)
-    for r, (room, floor) in enumerate(zip(map.rooms, floor_polygons(map), strict=True)):
+    for r, (room, floor) in enumerate(zip(map.rooms, plan_structure(map).rooms, strict=True)):
         if storey not in (None, int(room["storey"])):
             continue
         properties = {"kind": "room", "room": r, "storey": int(room["storey"]), "area": round(float(room["area"]), 3)}
@@ -117,6 +121,33 @@ def _doors(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dic
         properties |= {name: round(float(edge[name]), 3) for name in ("width", "confidence")}
         properties |= {"height": round(float(edge["height"]), 3) or None, "open": bool(edge["open"])}
         yield _feature(f"edge {i}", {"type": "LineString", "coordinates": place(line)}, properties)
+
+
+def _walls(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    for k, wall in enumerate(plan_structure(map).walls):
+        if storey in (None, int(wall["storey"])):
+            properties = {"kind": "wall", "wall": k, "storey": int(wall["storey"]), "rooms": _sides(wall)}
+            properties |= {"thickness": round(float(wall["thickness"]), 3), "faces": int(wall["faces"])}
+            properties |= {name: round(float(wall[name]), 3) for name in ("low", "high")}
+            shape = shapely.MultiPolygon([wall_part(wall)])
+            yield _feature(f"wall {k}", _polygons(shape, float(wall["low"]), place), properties)
+
+
+def _openings(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    structure = plan_structure(map)
+    for opening in structure.openings[structure.openings["wall"] >= 0]:
+        i, wall = int(opening["edge"]), structure.walls[opening["wall"]]
+        if storey in (None, int(wall["storey"])):
+            properties = {"kind": "wall_opening", "of": str(opening["kind"]), "edge": i, "wall": int(opening["wall"])}
+            properties |= {"storey": int(wall["storey"]), "rooms": map.edges["rooms"][i].tolist()}
+            properties |= {"width": round(float(opening["width"]), 3), "height": round(float(opening["height"]), 3) or None}
+            shape = shapely.MultiPolygon([wall_part(wall, opening)])
+            yield _feature(f"opening {i}", _polygons(shape, float(opening["centre"][2]), place), properties)
+
+
+def _sides(wall: Any) -> list[int | None]:
+    """Rooms to the left and to the right of a wall; null where none was seen."""
+    return [r if r >= 0 else None for r in wall["rooms"].tolist()]
 
 
 def _feature(name: str, geometry: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:

@@ -1,8 +1,9 @@
 """A building model, IFC4: site, building, storeys, spaces, doors, stairs; walls, floors and ceilings as far as they were seen.
 
-Spaces, floors, ceilings and walls are extruded polygons; a door is a box of its clear opening, an opening without a door an
-IfcVirtualElement, stairs and ramps a plate from their lower to their upper end. IfcRelSpaceBoundary says which spaces a door
-joins. The site is placed where the map lies, so that all else has small coordinates. Source: ISO 16739-1, IFC4 ADD2 TC1.
+Spaces, floors, ceilings and walls are extruded polygons. An IfcOpeningElement voids the wall that carries a door, which fills it;
+a door is a box of its clear opening, an opening without a door an IfcVirtualElement, stairs and ramps a plate from their lower to
+their upper end. IfcRelSpaceBoundary says which spaces a door joins. The site is placed where the map lies, so that all else has
+small coordinates. Source: ISO 16739-1, IFC4 ADD2 TC1.
 """
 
 from __future__ import annotations
@@ -14,14 +15,15 @@ import numpy as np
 import shapely
 
 from topomerge.io.atomic import replacing
-from topomerge.io.exports.floors import cell_polygons, floor_polygons, is_flight, room_levels
 from topomerge.io.exports.ifc_model import Model
-from topomerge.io.exports.occupancy import storey_occupancy
+from topomerge.structure.floors import is_flight, room_levels
+from topomerge.structure.plan_structure import plan_structure
+from topomerge.structure.walls import wall_part
 from topomerge.types import Array, TopometricMap
 
 LEAF_THICKNESS, IFC_SLAB, CEILING_THICKNESS = 0.1, 0.1, 0.05  # m, thickness
-IFC_LINTEL, IFC_STOREY_HEIGHT = 2.0, 2.5  # m, of doors and storeys without anything seen above
-LEAST_WALL = 0.03  # m2 seen from above: smaller pieces are legs of tables
+IFC_LINTEL = 2.0  # m, of doors without anything seen above
+CUT_THROUGH = 0.05  # m by which the body of an opening stands out of its wall, so that nothing of that stays
 
 
 def save(map: TopometricMap, path: Path) -> None:
@@ -33,7 +35,8 @@ def save(map: TopometricMap, path: Path) -> None:
     model = _Building(map)
     storeys = [model.storey(s) for s in range(len(map.storeys))]
     model.aggregate(model.building, storeys)
-    floors, (levels, seen) = floor_polygons(map), room_levels(map)
+    structure, (levels, seen) = plan_structure(map), room_levels(map)
+    floors = structure.rooms
     spaces = [model.space(r, floors[r], levels[r], bool(seen[r]), storeys) for r in range(len(map.rooms))]
     for s, storey in enumerate(storeys):
         rooms = np.flatnonzero(map.rooms["storey"] == s).tolist()
@@ -41,11 +44,17 @@ def save(map: TopometricMap, path: Path) -> None:
         rooms = [r for r in rooms if not floors[r].is_empty]
         built = [model.slab(r, floors[r], float(levels[r, 0]), storey) for r in rooms]
         built += [model.ceiling(r, floors[r], float(levels[r, 1]), storey) for r in rooms if seen[r]]
-        model.contain(storey, [*built, *model.walls(s, storey)])
+        model.contain(storey, built)
+    walls = [model.wall(k, wall, storeys[wall["storey"]]) for k, wall in enumerate(structure.walls)]
+    for s, storey in enumerate(storeys):
+        model.contain(storey, [walls[k] for k in np.flatnonzero(structure.walls["storey"] == s)])
+    openings = {int(opening["edge"]): opening for opening in structure.openings}
     for i, edge in enumerate(map.edges):
         a, b = edge["rooms"].tolist()
         storey = storeys[int(map.rooms["storey"][[a, b]].min())]
-        element = model.flight(i, edge, storey) if is_flight(edge) else model.door(i, edge, storey)
+        element = model.flight(i, edge, storey) if is_flight(edge) else model.door(i, openings[i], storey)
+        if i in openings and (k := int(openings[i]["wall"])) >= 0:
+            model.hole(openings[i], structure.walls[k], walls[k], element)
         model.contain(storey, [element])
         for r in (a, b):
             model.bound(i, spaces[r], element)
@@ -106,30 +115,46 @@ class _Building(Model):
         at = self.place(storey.ObjectPlacement, 0, 0, 0)
         return self.root("IfcCovering", f"ceiling {r}", ObjectPlacement=at, Representation=body, PredefinedType="CEILING")
 
-    def walls(self, s: int, storey: Any) -> list[Any]:
-        """What was seen of the walls of a storey, a wall for each connected piece, as high as the storey."""
-        plan, table = storey_occupancy(self.map, s), self.map.storeys[s]
-        height = float(table["ceiling"] - table["floor"])
-        height = height if height > 0 else IFC_STOREY_HEIGHT  # nan: not seen
-        pieces = cell_polygons(plan.wall, plan.low, plan.size, LEAST_WALL)
-        walls = []
-        for k, piece in enumerate(pieces.geoms):
-            body = {"Representation": self.prisms(shapely.MultiPolygon([piece]), 0.0, height), "PredefinedType": "NOTDEFINED"}
-            at = self.place(storey.ObjectPlacement, 0, 0, 0)
-            walls.append(self.root("IfcWall", f"wall {s}.{k}", ObjectPlacement=at, **body))
-        return walls
+    def wall(self, k: int, wall: Any, storey: Any) -> Any:
+        """A wall with what is known of it."""
+        low, high = (float(wall[name]) - storey.Elevation for name in ("low", "high"))
+        at = self.place(storey.ObjectPlacement, 0, 0, 0)
+        body = {"ObjectPlacement": at, "Representation": self.prisms(shapely.MultiPolygon([wall_part(wall)]), low, high - low)}
+        element = self.root("IfcWall", f"wall {k}", PredefinedType="NOTDEFINED", **body)
+        facts = [self._fact("FacesSeen", "IfcInteger", int(wall["faces"]))]
+        self._define(element, self._set("IfcPropertySet", "Topomerge_Wall", k, HasProperties=facts))
+        sizes = {"Length": float(np.hypot(*(wall["end"] - wall["start"])))}
+        if wall["faces"] == 2:  # else its thickness is a guess
+            sizes["Width"] = float(wall["thickness"])
+        quantities = [self.new("IfcQuantityLength", Name=name, LengthValue=value) for name, value in sizes.items()]
+        self._define(element, self._set("IfcElementQuantity", "Qto_WallBaseQuantities", k, Quantities=quantities))
+        return element
 
-    def door(self, i: int, edge: Any, storey: Any) -> Any:
+    def hole(self, opening: Any, wall: Any, voided: Any, door: Any) -> None:
+        """An opening in a wall; a door fills it."""
+        storey_height = float(self.map.storeys["floor"][wall["storey"]])
+        low = float(opening["centre"][2])
+        top = float(wall["high"]) + CUT_THROUGH - low
+        height = min(float(opening["height"]), top) if opening["height"] else min(IFC_LINTEL, top)
+        shape = shapely.MultiPolygon([wall_part(wall, opening, CUT_THROUGH)])
+        body = {"Representation": self.prisms(shape, low - storey_height, height), "PredefinedType": "OPENING"}
+        at = self.place(voided.ObjectPlacement, 0, 0, 0)
+        element = self.root("IfcOpeningElement", f"opening {opening['edge']}", ObjectPlacement=at, **body)
+        self.root("IfcRelVoidsElement", element.GlobalId, RelatingBuildingElement=voided, RelatedOpeningElement=element)
+        if door.is_a("IfcDoor"):
+            self.root("IfcRelFillsElement", element.GlobalId, RelatingOpeningElement=element, RelatedBuildingElement=door)
+
+    def door(self, i: int, opening: Any, storey: Any) -> Any:
         """A door as a box in its opening, or an opening without one as a line on the floor."""
-        across = float(edge["direction"])
+        across = float(opening["direction"])
         along = np.array([-np.sin(across), np.cos(across)])
-        width, height = float(edge["width"]), float(edge["height"])
-        x, y, z = edge["centre"] - (*along * width / 2, 0) - self.shift - (0, 0, storey.Elevation)
+        width, height = float(opening["width"]), float(opening["height"])
+        x, y, z = opening["centre"] - (*along * width / 2, 0) - self.shift - (0, 0, storey.Elevation)
         at = self.place(storey.ObjectPlacement, x, y, z, along)
-        if edge["kind"] != "door":
+        if opening["kind"] != "door":
             line = self.new("IfcPolyline", Points=[self.point(0, 0, 0), self.point(width, 0, 0)])
             shown = self.shape("FootPrint", "Curve3D", [line])
-            return self.root("IfcVirtualElement", f"{edge['kind']} {i}", ObjectPlacement=at, Representation=shown)
+            return self.root("IfcVirtualElement", f"{opening['kind']} {i}", ObjectPlacement=at, Representation=shown)
         middle = self.new("IfcAxis2Placement2D", Location=self.point(width / 2, 0))
         box = self.new("IfcRectangleProfileDef", ProfileType="AREA", Position=middle, XDim=width, YDim=LEAF_THICKNESS)
         up = self.new("IfcDirection", DirectionRatios=[0.0, 0.0, 1.0])

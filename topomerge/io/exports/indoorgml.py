@@ -1,4 +1,7 @@
-"""IndoorGML 1.0.3, core module: rooms as cells, doors as their boundaries, and the graph of how one walks between them.
+"""IndoorGML 1.0.3, core module: rooms and walls as cells, doors as boundaries, and the graph of how one walks between rooms.
+
+Rooms end at the faces of their walls, and walls are cells without a State (the standard's thick walls); a door leaves a gap in
+them, under its lintel.
 
 Each room is a CellSpace, whose solid is its floor drawn up to its ceiling, and a State; each door or opening a CellSpaceBoundary
 and a Transition; each flight of stairs or ramp a Transition. Source: OGC 19-011r4 and its schema indoorgmlcore.xsd.
@@ -15,13 +18,18 @@ from xml.etree import ElementTree as xml
 import numpy as np
 import shapely
 
-from topomerge.io.exports.floors import floor_polygons, inside, is_flight, jambs, room_levels
 from topomerge.io.exports.markup import text, write_xml
+from topomerge.structure.floors import inside, is_flight, jambs, room_levels
+from topomerge.structure.plan_structure import PlanStructure, plan_structure
+from topomerge.structure.walls import wall_part
 from topomerge.types import Array, TopometricMap
 
 CORE, GML = "http://www.opengis.net/indoorgml/1.0/core", "http://www.opengis.net/gml/3.2"
 LINK, SCHEMA = "http://www.w3.org/1999/xlink", "http://www.w3.org/2001/XMLSchema-instance"
 XSD = "http://schemas.opengis.net/indoorgml/1.0/indoorgmlcore.xsd"
+LEAST_BODY = 0.005  # m2 from above: smaller pieces of walls are left out
+BODY_GRID = 1e-4  # m, of corners, as they are written
+THROUGH = 0.05  # m by which a gap is deeper than its wall
 UNSEEN_LINTEL = 2.0  # m: of a door over which nothing was seen
 
 
@@ -35,13 +43,17 @@ def save(map: TopometricMap, path: Path) -> None:
     """
     for prefix, space in (("core", CORE), ("gml", GML), ("xlink", LINK), ("xsi", SCHEMA)):
         xml.register_namespace(prefix, space)
-    floors, (levels, _) = floor_polygons(map), room_levels(map)
+    structure, (levels, _) = plan_structure(map), room_levels(map)
+    floors = structure.rooms
     root = xml.Element(_core("IndoorFeatures"), {_gml("id"): "topomerge", f"{{{SCHEMA}}}schemaLocation": f"{CORE} {XSD}"})
     _head(root, map.source or "map")
     _bounds(root, map)
     place = _new(_new(root, "primalSpaceFeatures"), "PrimalSpaceFeatures", "PS")
     for r, floor in enumerate(floors):
         _cell(_new(place, "cellSpaceMember"), map, r, floor, levels[r])
+    for k, bodies in enumerate(_wall_bodies(structure)):
+        for n, body in enumerate(bodies):
+            _wall(_new(place, "cellSpaceMember"), f"W{k}-{n}", structure.walls[k], *body)
     for i, edge in enumerate(map.edges):
         if not is_flight(edge):
             _boundary(_new(place, "cellSpaceBoundaryMember"), i, edge)
@@ -93,14 +105,50 @@ def _cell(member: Any, map: TopometricMap, r: int, floor: shapely.MultiPolygon, 
     facts = {"storey": int(room["storey"]), "area": f"{room['area']:.2f}", "height": f"{room['height']:.2f}"}
     _head(cell, f"room {r}", **facts)
     if not floor.is_empty:
-        shape = _new(_new(cell, "cellSpaceGeometry"), "Geometry3D")
-        shell = _new(_new(_new(shape, "Solid", f"C{r}-solid", GML), "exterior", space=GML), "Shell", space=GML)
-        for k, faces in enumerate(_faces(max(floor.geoms, key=lambda part: part.area), *level.tolist())):
-            _polygon(_new(shell, "surfaceMember", space=GML), f"C{r}-face{k}", faces)
+        _solid(cell, f"C{r}", max(floor.geoms, key=lambda part: part.area), *level.tolist())
     _link(cell, "duality", f"S{r}")
     for i in np.flatnonzero((map.edges["rooms"] == r).any(axis=1)):
         if not is_flight(map.edges[i]):
             _link(cell, "partialboundedBy", f"B{i}")
+
+
+def _solid(cell: Any, id: str, plan: shapely.Polygon, low: float, high: float) -> None:
+    shape = _new(_new(cell, "cellSpaceGeometry"), "Geometry3D")
+    shell = _new(_new(_new(shape, "Solid", f"{id}-solid", GML), "exterior", space=GML), "Shell", space=GML)
+    for k, faces in enumerate(_faces(plan, low, high)):
+        _polygon(_new(shell, "surfaceMember", space=GML), f"{id}-face{k}", faces)
+
+
+def _wall(member: Any, id: str, wall: Any, plan: shapely.Polygon, low: float, high: float) -> None:
+    cell = _new(member, "CellSpace", id)
+    rooms = " ".join(str(r) for r in wall["rooms"].tolist() if r >= 0)
+    facts = {"kind": "wall", "storey": int(wall["storey"]), "rooms": rooms, "thickness": f"{wall['thickness']:.2f}"}
+    _head(cell, f"wall {id[1:]}", **facts, measured=str(int(wall["faces"]) == 2).lower())
+    _solid(cell, id, plan, low, high)
+
+
+def _wall_bodies(structure: PlanStructure) -> list[list[tuple[shapely.Polygon, float, float]]]:
+    """Of each wall its prisms: plan, foot and top, m. No two of a storey cover each other, and none a room."""
+    bodies = []
+    tree, rooms = shapely.STRtree(shapes := [wall_part(wall) for wall in structure.walls]), shapely.STRtree(structure.rooms)
+    for k, (wall, shape) in enumerate(zip(structure.walls, shapes, strict=True)):
+        before = [j for j in tree.query(shape) if j < k and structure.walls["storey"][j] == wall["storey"]]
+        levels = structure.storey_of_rooms[(near := rooms.query(shape))]
+        covered = [*(shapes[j] for j in before), *(structure.rooms[r] for r in near[levels == wall["storey"]])]
+        rest = shapely.difference(shape, shapely.union_all(covered))
+        own = structure.openings[structure.openings["wall"] == k]
+        gaps = [wall_part(wall, opening, THROUGH) for opening in own]
+        parts = [(rest.difference(shapely.union_all(gaps)), float(wall["low"]))]
+        lintels = [float(opening["centre"][2]) + (float(opening["height"]) or UNSEEN_LINTEL) for opening in own]
+        parts += [(rest.intersection(gap), lintel) for gap, lintel in zip(gaps, lintels, strict=True)]
+        high = float(wall["high"])
+        bodies.append([(p, low, high) for part, low in parts if low < high for p in _pieces(part)])
+    return bodies
+
+
+def _pieces(shape: Any) -> list[shapely.Polygon]:
+    parts = shapely.get_parts(shapely.set_precision(shape, BODY_GRID))
+    return [shapely.geometry.polygon.orient(p) for p in parts if p.geom_type == "Polygon" and p.area > LEAST_BODY]
 
 
 def _faces(floor: shapely.Polygon, low: float, high: float) -> Iterator[list[Array]]:

@@ -14,8 +14,8 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
-from topomerge.io.exports.floors import is_flight
 from topomerge.io.exports.occupancy import Occupancy
+from topomerge.structure.floors import is_flight
 from topomerge.types import Array, TopometricMap
 
 DOOR_REACH = 0.6  # m around the middle of a door through which its ways may lead

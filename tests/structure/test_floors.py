@@ -12,7 +12,7 @@ import topomerge
 from tests.io.export_maps import AT, GRID, flat, nothing, rectangles
 from tests.scenes import two_rooms
 from tests.scenes_map import building
-from topomerge.io.exports.floors import floor_polygons, inside, jambs, room_levels
+from topomerge.structure.floors import floor_polygons, inside, jambs, room_levels
 from topomerge.types import EDGE_DTYPE
 
 

@@ -95,19 +95,6 @@ def inside(floor: shapely.MultiPolygon, wanted: Array) -> Array:
     return np.asarray(max(floor.geoms, key=lambda part: part.area).representative_point().coords[0])
 
 
-def cell_polygons(cells: Array, low: Array, edge: float, least: float) -> shapely.MultiPolygon:
-    """(nx, ny) bool cells as polygons, m, without those smaller than `least` m2.
-
-    Args:
-        cells: bool; cell (i, j) covers x from low[0] + i * edge.
-        low: (2,) m.
-        edge: m.
-    """
-    shape = shapely.simplify(_polygon(cells, np.zeros(2)), 0.0)
-    large = [p for p in shapely.get_parts(shape) if p.area * edge**2 >= least]
-    return shapely.affinity.affine_transform(_parts(shapely.MultiPolygon(large)), [edge, 0, 0, edge, *low])
-
-
 def _by_room(label: Array, count: int) -> list[Array]:
     order = np.argsort(label, kind="stable")
     return np.split(order, np.searchsorted(label[order], np.arange(count + 1)))[1:-1]

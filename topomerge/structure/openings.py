@@ -1,0 +1,72 @@
+"""Doors and openings of a map, set into the walls that carry them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from topomerge.structure.floors import is_flight
+from topomerge.types import Array, TopometricMap
+
+OPENING_DTYPE = np.dtype(
+    [
+        ("edge", "i4"),  # row of the map's edges
+        ("wall", "i4"),  # row of the walls; -1: none was seen around it
+        ("centre", "f8", 3),  # on the floor, in the middle of the wall, in the input's frame
+        ("width", "f8"),  # m
+        ("height", "f8"),  # m; 0 where nothing was seen above
+        ("direction", "f8"),  # rad, of the wall's normal, in [0, pi)
+        ("kind", "U8"),  # door | opening
+    ]
+)
+CARRIER_REACH = 0.8  # m between the middle of a door and the middle line of its wall
+STRANGE = 0.4  # m: a wall of other rooms has to be so much nearer
+LEAST_SHARE = 0.5  # of an opening's width that is in its wall
+
+
+def openings_in_walls(map: TopometricMap, walls: Array) -> Array:
+    """(O,) OPENING_DTYPE, in the order of the map's edges; flights of stairs are none.
+
+    An opening lies in the middle of the wall that carries it, and turned as it is: the wall's direction is better known.
+
+    Args:
+        walls: WALL_DTYPE of the whole map.
+    """
+    rows = [i for i, edge in enumerate(map.edges) if not is_flight(edge)]
+    out = np.zeros(len(rows), OPENING_DTYPE)
+    for opening, i in zip(out, rows, strict=True):
+        edge = map.edges[i]
+        for name in ("centre", "width", "height", "direction", "kind"):
+            opening[name] = edge[name]
+        opening["edge"], opening["wall"] = i, _carrier(edge, walls, map.rooms["storey"][edge["rooms"]])
+        if opening["wall"] >= 0:
+            _set_into(opening, walls[opening["wall"]])
+    return out
+
+
+def _carrier(edge: Array, walls: Array, storeys: Array) -> int:
+    """Row of the wall nearest to a door among those that part its rooms, -1 none."""
+    line = walls["end"] - walls["start"]
+    length = np.maximum(np.hypot(*line.T), 1e-9)
+    along = line / length[:, None]
+    apart = edge["centre"][:2] - walls["start"]
+    place = (apart * along).sum(axis=1)
+    off = np.abs(apart[:, 0] * along[:, 1] - apart[:, 1] * along[:, 0])
+    past = np.maximum(np.maximum(-place, place - length), 0.0)
+    beside = np.isin(walls["rooms"], edge["rooms"]).sum(axis=1)
+    two = (np.sort(walls["rooms"], axis=1) == np.sort(edge["rooms"])).all(axis=1)
+    cost = np.hypot(off, past) + np.where(two, 0.0, STRANGE)
+    fits = np.isin(walls["storey"], storeys) & (beside > 0) & (off <= CARRIER_REACH)
+    fits &= past <= (0.5 - LEAST_SHARE) * edge["width"] + 0.1
+    return int(np.flatnonzero(fits)[cost[fits].argmin()]) if fits.any() else -1
+
+
+def _set_into(opening: Any, wall: Array) -> None:
+    line = wall["end"] - wall["start"]
+    length = float(np.hypot(*line))
+    along = line / length
+    width = min(float(opening["width"]), length)
+    place = float(np.clip((opening["centre"][:2] - wall["start"]) @ along, width / 2, length - width / 2))
+    opening["centre"][:2] = wall["start"] + along * place
+    opening["width"], opening["direction"] = width, float(np.arctan2(along[0], -along[1]) % np.pi)
