@@ -58,7 +58,7 @@ def read(path: str | Path, kind: str = "archive", only: Collection[str] | None =
     Raises:
         InputError: no such file, not such an archive, damaged, or it declares more than it can hold.
     """
-    return _opened(path, kind, lambda archive, size: {name: _array(archive, e) for name, e in _entries(archive, size, only)})
+    return _archive_of(path, kind, lambda archive, size: {name: _array(archive, e) for name, e in _entries(archive, size, only)})
 
 
 def names(path: str | Path, kind: str = "archive") -> list[str]:
@@ -67,10 +67,10 @@ def names(path: str | Path, kind: str = "archive") -> list[str]:
     Raises:
         InputError: as `read`; damage of the arrays is not looked for.
     """
-    return _opened(path, kind, lambda archive, size: [name for name, _ in _entries(archive, size)])
+    return _archive_of(path, kind, lambda archive, size: [name for name, _ in _entries(archive, size)])
 
 
-def _opened(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int], R]) -> R:
+def _archive_of(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int], R]) -> R:
     """What `use` makes of an archive and the size of its file; whatever goes wrong is told of the file."""
     path = Path(path)
     if path.is_dir():
