@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from tests.io.export_maps import flat, nothing, stair_scene, two_floors
 from tests.scenes import HEIGHT, THICK, Scene, corridor, rectangle, two_rooms
 from topomerge.structure.plan_structure import PlanStructure, plan_structure
 from topomerge.structure.walls import wall_part
-from topomerge.types import ROOM_DTYPE, TopometricMap, VoxelGrid
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, TopometricMap, VoxelGrid
 
 OFF = np.array([0.013, 0.017])  # by which scenes are moved off the lattice
 NEAR = 0.03  # m
@@ -218,6 +219,30 @@ def test_maps_without_walls():
     bare = flat(np.ones((40, 50), bool))
     plan = plan_structure(bare)
     assert len(plan.walls) == 0 and plan.rooms[0].area == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_noise_gives_valid_walls_and_rooms(seed):
+    rng = np.random.default_rng(seed)
+    side = int(rng.integers(8, 40))
+    floor = np.argwhere(rng.random((side, side)) < rng.choice([0.2, 0.6, 0.95]))
+    solid = rng.random((side, side, 25)) < rng.choice([0.02, 0.3])
+    solid[:, side // 2] = solid[side // 3] = True
+    cells = np.argwhere(solid)
+    grid = VoxelGrid.from_cells(cells, properties={"offset": rng.integers(0, 256, (len(cells), 3)).astype(np.uint8)})
+    navigable = VoxelGrid.from_cells(np.column_stack([floor, np.ones(len(floor), int)]))
+    rooms = np.zeros(3, ROOM_DTYPE)
+    rooms["area"], rooms["height"], rooms["hi"] = 1.0, 2.4, (side / 10, side / 10, 2.5)
+    edges = np.zeros(2, EDGE_DTYPE)
+    edges["rooms"], edges["kind"], edges["centre"] = [(0, 1), (1, 2)], "door", rng.random((2, 3)) * side / 10
+    edges["width"], edges["direction"] = 2 * rng.random(2), 3 * rng.random(2)
+    labels = rng.integers(-1, 3, len(grid)).astype(np.int32), rng.integers(0, 3, len(navigable)).astype(np.int32)
+    storey = np.array([(0.1, 2.5, 1.0)], STOREY_DTYPE)
+    plan = plan_structure(TopometricMap(grid, labels[0], navigable, labels[1], rooms, edges, storey))
+    assert all(room.is_valid for room in plan.rooms) and len(plan.openings) == 2
+    assert all(a.intersection(b).area < 1e-6 for a, b in combinations(plan.rooms, 2))
+    assert (plan.walls["high"] > plan.walls["low"]).all() and (plan.walls["thickness"] > 0).all()
+    assert (np.hypot(*(plan.walls["end"] - plan.walls["start"]).T) > 0.02).all()
 
 
 def test_a_storey_without_rooms():

@@ -122,8 +122,8 @@ def apart(outlines: list[shapely.MultiPolygon]) -> list[shapely.MultiPolygon]:
         taken = [out[k] for k in np.flatnonzero(shapely.intersects(out, outline))] if out else []
         rest = outline
         if taken:  # slivers between lines of two rooms go, corners stay
-            rest = shapely.difference(outline, shapely.union_all(taken)).buffer(-SLIVER, join_style="mitre")
-            rest = rest.buffer(SLIVER, join_style="mitre").intersection(outline)
+            free = shapely.difference(outline, shapely.union_all(taken))
+            rest = free.buffer(-SLIVER, join_style="mitre").buffer(SLIVER, join_style="mitre").intersection(free)
         parts = [p for p in shapely.get_parts(rest) if p.geom_type == "Polygon" and p.area > 0.05]
         out.append(shapely.MultiPolygon([shapely.geometry.polygon.orient(p) for p in parts]))
     return out
