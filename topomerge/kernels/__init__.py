@@ -14,6 +14,9 @@ from pathlib import Path
 
 from numba import config, njit
 
+if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:  # TBB is there with Open3D only, and may then hang when Python ends
+    config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
+
 
 def _probe() -> None: ...
 
