@@ -133,18 +133,16 @@ def odds_of(a: RoomsSeen, b: RoomsSeen, w: Mapping[str, Array]) -> RoomOdds:
         for m, f in zip((a, b), facts, strict=True)
     ]
     likely = np.sqrt(nn.softmax(FIRST_SHARPNESS * cosine) * nn.softmax(FIRST_SHARPNESS * cosine.T).T)
-    rows, columns, layer = np.zeros(0), np.zeros(0), 0
-    while True:
-        votes = agreement(likely, a, b)
-        rows, columns = _partners(layer, states, cosine, votes, w)
-        layer += 1
-        if f"{layer}.query.w" not in w:
-            return RoomOdds(rows, columns)
-        likely = np.sqrt(rows[:, :-1] * columns[:, :-1].T)
-        votes = agreement(likely, a, b)
+    rows, columns = _partners(0, states, cosine, agreement(likely, a, b), w)
+    layer = 1
+    while f"{layer}.query.w" in w:
+        votes = agreement(np.sqrt(rows[:, :-1] * columns[:, :-1].T), a, b)
         states = [_within(f"{layer}", state, m, w) for state, m in zip(states, (a, b), strict=True)]
         states = _across(f"{layer}", states, votes, w)
         states = [state + _each(f"{layer}", state, w) for state in states]
+        rows, columns = _partners(layer, states, cosine, votes, w)
+        layer += 1
+    return RoomOdds(rows, columns)
 
 
 def ways(places: Array, heights: Array, start: int = 0, stop: int | None = None) -> Array:
