@@ -20,6 +20,8 @@ from topomerge.types import Array
 LEAF_THICKNESS = 0.04  # m, thickness
 SWING = {"shut": (0.0, 0.0), "half": (0.5, 1.1), "open": (1.4, 1.9)}  # rad
 ROOMS_WITHOUT_DUCTS = ("stairs", "lift", "atrium", "bath", "hotel", "bedroom", "living", "void")  # rooms without ducts
+HANDLE, HANDLE_HEIGHT = (0.12, 0.05, 0.03), 1.05  # m
+CASED = 0.8  # share of the faces of doors with a frame that have a casing
 TWO_LEAVES = 1.25  # m; wider doors have two leaves
 
 
@@ -35,7 +37,7 @@ def fit(
 ) -> Array:
     """Add all fittings and furniture; returns (M,) THING_DTYPE."""
     things: list[tuple] = []
-    _leaves(soup, things, spaces, doors, rng)
+    _leaves(soup, things, spaces, doors, difficulty.frames, rng)
     for hole in holes:
         _pane(soup, hole)
     for space in spaces:
@@ -60,8 +62,14 @@ def leaf_yaw(door: Array, pivot: Array, angle: float) -> float:
     return float(np.arctan2(reach[1], reach[0]))
 
 
-def _leaves(soup: Soup, things: list[tuple], spaces: list[Space], doors: Array, rng: np.random.Generator) -> None:
-    """One leaf a door, two for wide ones, hung so that it swings into the room and not into the corridor."""
+def _leaves(
+    soup: Soup, things: list[tuple], spaces: list[Space], doors: Array, frames: float, rng: np.random.Generator
+) -> None:
+    """One leaf a door, two for wide ones, hung so that it swings into the room and not into the corridor.
+
+    Args:
+        frames: share of the doors with a frame and handles.
+    """
     kinds = {s.room: s.plan.kind for s in spaces}
     shapes = {s.room: s.shape for s in spaces if s.room >= 0}
     for d, door in enumerate(doors):
@@ -76,16 +84,34 @@ def _leaves(soup: Soup, things: list[tuple], spaces: list[Space], doors: Array, 
         side = 1.0 if shapes[into].covers(shapely.Point(probe)) else -1.0
         ends = (-1.0, 1.0) if door["width"] > TWO_LEAVES else (float(rng.choice([-1.0, 1.0])),)
         angle = float(rng.uniform(*SWING[str(door["state"])]))
+        framed = bool(frames) and rng.random() < frames
+        depth = _frame(soup, door, rng) if framed else 0.0
         for end in ends:
             pivot = door["centre"][:2] + end * along * (door["width"] / 2 - 0.01)
-            pivot = pivot + side * normal * (door["thickness"] / 2 - LEAF_THICKNESS / 2)
+            pivot = pivot + side * normal * (door["thickness"] / 2 - LEAF_THICKNESS / 2 - depth)
             yaw, length = leaf_yaw(door, pivot, angle), door["width"] / len(ends) - 0.02
             centre = [*(pivot + length / 2 * np.array([np.cos(yaw), np.sin(yaw)])), door["centre"][2]]
             size = (length, LEAF_THICKNESS, door["height"] - 0.03)
-            mesh = boxes(np.array([[0, 0, size[2] / 2 + 0.01, *size]]), np.array(centre), yaw)
-            soup.add(*mesh, "leaf", len(things))
+            parts = [[0, 0, size[2] / 2 + 0.01, *size]]
+            if framed:
+                across = LEAF_THICKNESS / 2 + HANDLE[1] / 2
+                parts += [[length / 2 - HANDLE[0], s * across, HANDLE_HEIGHT, *HANDLE] for s in (1, -1)]
+            soup.add(*boxes(np.array(parts), np.array(centre), yaw), "leaf", len(things))
             centre[2] += size[2] / 2
             things.append(("leaf", int(into), d, tuple(centre), size, yaw, tuple(pivot), True))
+
+
+def _frame(soup: Soup, door: Array, rng: np.random.Generator) -> float:
+    """A casing around a door on one face of its wall or both; returns how deep the leaf stands in the wall, m."""
+    wide, thick = float(rng.uniform(0.05, 0.1)), float(rng.uniform(0.008, 0.025))
+    half, height, out = door["width"] / 2 + wide / 2, float(door["height"]), door["thickness"] / 2 + thick / 2
+    for face in (1, -1):
+        if rng.random() < CASED:
+            posts = [[face * out, s * half, height / 2, thick, wide, height] for s in (1, -1)]
+            head = [face * out, 0, height + wide / 2, thick, 2 * half + wide, wide]
+            soup.add(*boxes(np.array([*posts, head]), door["centre"], float(door["direction"])), "wall")
+    deep = max(float(door["thickness"]) - LEAF_THICKNESS, 0.0)
+    return float(rng.uniform(0, deep if rng.random() < 0.5 else min(deep, 0.05)))
 
 
 def _pane(soup: Soup, hole: Hole) -> None:

@@ -33,6 +33,8 @@ class Difficulty:
         ducts: share of the rooms with ducts, trays or rows of panels under the ceiling.
         closets: share of the larger rooms beside a corridor out of which a closet is cut.
         spread: how much rooms of a kind differ in width: share that are half as wide again or more.
+        frames: share of the doors with a frame around them and handles, whose leaves stand anywhere in the wall's thickness; the
+            leaves of the others lie in the wall's face.
     """
 
     lintels: float = 0.9
@@ -57,6 +59,7 @@ class Difficulty:
     ducts: float = 0.25
     closets: float = 0.12
     spread: float = 0.2
+    frames: float = 0.0
 
     def __post_init__(self) -> None:
         limits = {"furniture": 3.0, "clutter": 5.0, "people": 5.0}

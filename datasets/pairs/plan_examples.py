@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from topomerge.datasets.buildings.erect import erect
@@ -106,6 +106,8 @@ class PlanExample:
 
 
 Plans = Mapping[str, Sequence[tuple[str, Plan]]]
+ItemT = TypeVar("ItemT", bound=PlanItem)
+MakeFile = Callable[[Any, Plan | None, str], Row]
 
 
 def check_plans(recipe: PlanRecipe) -> None:
@@ -123,17 +125,30 @@ def check_plans(recipe: PlanRecipe) -> None:
 
 def build_plans(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
     """The files of a set, made where they are missing, in the order of the seeds."""
+    return build_scans(recipe, "plans", draw_item, make_plan_file, sharing, say)
+
+
+def build_scans(
+    recipe: PlanRecipe, kind: str, draw: Callable[[int, Plans], ItemT], make: MakeFile, sharing: Sharing, say: Say
+) -> tuple[list[Path], Report]:
+    """The files of a set of scans, made where they are missing, in the order of the seeds.
+
+    Args:
+        kind: folder of the files in the cache.
+        draw: the item of a seed.
+        make: an item's file, from its plan, in a folder.
+    """
     check_plans(recipe)
     check_sharing(sharing)
     say("reading plans")
     plans = real_plans(recipe)
     first = splits.seeds(recipe.split)[0] + recipe.seed
-    items = [draw_item(seed, plans) for seed in range(first, first + recipe.scans)]
-    folder = Path(sharing.cache).resolve() / "plans"
+    items = [draw(seed, plans) for seed in range(first, first + recipe.scans)]
+    folder = Path(sharing.cache).resolve() / kind
     plan_of_item = {(source, name): plan for source, entries in plans.items() for name, plan in entries}
     begin, step = sharing.part
     tasks = [(item, plan_of_item.get((item.source, item.plan)), str(folder)) for item in items[begin - 1 :: step]]
-    report = build_set(folder.parent / f"{recipe.name}.jsonl", tasks, make_plan_file, sharing, say, unit="scans")
+    report = build_set(folder.parent / f"{recipe.name}.jsonl", tasks, make, sharing, say, unit="scans")
     return [path for item in items if (path := folder / f"{item.name}.npz").exists()], report
 
 

@@ -17,6 +17,8 @@ import pytest
 from tests.training import tiny
 from topomerge.embedding.engineered import scaled
 from topomerge.errors import InputError
+from topomerge.extraction.elevations.wall_doors import DoorCandidates, door_chance
+from topomerge.extraction.elevations.wall_network import place_probabilities
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
 from topomerge.fusion.evidence.network import weights as place_weights
@@ -24,22 +26,24 @@ from topomerge.fusion.verify import model
 from topomerge.io.weight_files import VARIABLE, weights_file
 from topomerge.matching.odds import odds_weights
 from topomerge.matching.room_matcher import matcher_weights
-from topomerge.training import door_classification, place_evidence, plan_segmentation, room_matcher
+from topomerge.training import door_classification, place_evidence, plan_segmentation, room_matcher, wall_doors, wall_segmentation
 from topomerge.training.door_classification import door_scores
 from topomerge.training.judging import judge_task
 from topomerge.training.loop import State
 from topomerge.training.plan_segmentation import class_scores
 from topomerge.training.tasks import TASKS, settings_of, train, weights_of
+from topomerge.types import EDGE_DTYPE
 
 ROOT = Path(__file__).parent.parent.parent
 NETWORKS = {
     "plan_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
     "door_classification": ["epochs=2", "batch=64", "hidden=4", "networks=2"],
+    "wall_segmentation": ["epochs=2", "steps=2", "batch=4", "length=32", "hold_out=2", "widths=[4,4,8,8]"],
     "place_evidence": ["epochs=2", "steps=2", "batch=8", "widths=[4,4,4]", "hold_out=2", "lookalikes=false"],
     "room_matcher": ["epochs=2", "steps=2", "batch=2", "width=8", "layers=1"],
 }
 WITHOUT_MORE = {"merge_belief": ["lookalikes=none", "floor=0"]}  # data that takes minutes to make
-FITS = ("merge_belief", "match_odds", "feature_scale")
+FITS = ("merge_belief", "match_odds", "feature_scale", "wall_doors")
 
 
 def quiet(text: str) -> None:
@@ -52,6 +56,9 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     paths = tiny.plan_files(tmp_path / "plans", 4)
     monkeypatch.setattr(plan_segmentation, "build_plans", lambda *_: (paths, None))
     monkeypatch.setattr(door_classification, "door_examples", lambda *_: tiny.door_tables(320))
+    walls = tiny.wall_files(tmp_path / "walls", 6)
+    monkeypatch.setattr(wall_segmentation, "build_walls", lambda *_: (walls, None))
+    monkeypatch.setattr(wall_doors, "build_walls", lambda *_: (walls, None))
     places = tiny.place_files(tmp_path / "places")
     monkeypatch.setattr(place_evidence, "hypothesis_files", lambda *_: places)
     monkeypatch.setattr(room_matcher, "read_examples", lambda *_: tiny.room_examples(4))
@@ -83,6 +90,8 @@ def read(task: str) -> Any:
         "door_classification": lambda: door_probability(np.zeros((3, 17))),
         "place_evidence": lambda: place_weights()["a.w"],
         "room_matcher": lambda: matcher_weights()["rows.w"],
+        "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
+        "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(3, EDGE_DTYPE), np.ones((3, 11)), np.arange(3))),
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "match_odds": lambda: odds_weights("match"),
         "feature_scale": lambda: scaled(np.ones((2, 18)), "matched"),
@@ -113,6 +122,7 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
 @pytest.mark.parametrize("task", list(NETWORKS))
 def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
     jobs = {"plan_segmentation": plan_segmentation.PlanJob, "door_classification": door_classification.DoorJob}
+    jobs |= {"wall_segmentation": wall_segmentation.WallJob}
     kind = {**jobs, "place_evidence": place_evidence.PlaceJob, "room_matcher": room_matcher.MatcherJob}[task]
     train(settings_of(words(task, "name=whole")), quiet)
     step, seen = kind.step, []
@@ -156,6 +166,8 @@ def test_fits_learn_what_is_so(words) -> None:
         (["task=plan_segmentation", "data.scan=3"], "data.scan"),
         (["task=plan_segmentation", "epochs=many"], "epochs"),
         (["task=plan_segmentation", "crop=30"], "crop"),
+        (["task=wall_segmentation", "length=31"], "length"),
+        (["task=wall_segmentation", "widths=[4,4]"], "widths"),
         (["task=plan_segmentation", "loss.classes=[1,2]"], "loss.classes"),
         (["task=door_classification", "networks=0"], "networks"),
         (["task=merge_belief", "risk=0"], "risk"),
@@ -198,6 +210,8 @@ SMALL_GRIDS = [
 SIMULATED = {
     "plan_segmentation": [*NETWORKS["plan_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "door_classification": ["data=plan_scans", "data.scans=4", "data.seed=0", "epochs=2", "hold_out=2", "heldout.scans=1"],
+    "wall_segmentation": [*NETWORKS["wall_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
+    "wall_doors": ["data.scans=2", "data.seed=0", "heldout.scans=2", "folds=2"],
     "place_evidence": [*NETWORKS["place_evidence"], *SMALL_GRIDS],
     "merge_belief": [*SMALL_GRIDS, *WITHOUT_MORE["merge_belief"], "folds=2"],
     "match_odds": [*SMALL_PAIRS, "folds=2"],

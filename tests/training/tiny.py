@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from topomerge.datasets.pairs.plan_examples import PlanExample, PlanItem, example_arrays
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
+from topomerge.datasets.pairs.wall_examples import WallExample, WallItem, wall_arrays
 
 from topomerge.embedding.engineered import FEATURES
 from topomerge.embedding.turns import FACTS, TurnedRows
+from topomerge.extraction.elevations.elevation import ALONG, BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.fusion.evidence.crops import LOOKED, SIDE
@@ -22,7 +24,7 @@ from topomerge.training.feature_scale import PairFeatures
 from topomerge.training.match_odds import Evidence
 from topomerge.training.packed import GraphPair
 from topomerge.training.room_matcher import Example, View
-from topomerge.types import Sim3
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, Sim3, TopometricMap, VoxelGrid
 
 EDGE = 0.1  # m
 
@@ -36,6 +38,48 @@ def plan_files(folder: Path, count: int) -> list[Path]:
         archive.write(example_arrays(PlanItem(k, "procedural", 0, "", ""), [two_rooms(4 * k)]), path)
         paths.append(path)
     return paths
+
+
+def wall_files(folder: Path, count: int) -> list[Path]:
+    """Files of scans of two rooms, the wall between them with an open door and a shut one, 0.1 m farther along in each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for k in range(count):
+        map, faces, strips, truth, doors = two_doors(2 * k)
+        example = WallExample(np.array([0, len(truth)]), strips, truth, doors, map, faces, "tls/procedural")
+        path = folder / f"{k}.npz"
+        archive.write(wall_arrays(WallItem(k, "procedural", 0, "", ""), example), path)
+        paths.append(path)
+    return paths
+
+
+def two_doors(later: int) -> tuple[TopometricMap, Array, Array, Array, Array]:
+    """The map of two rooms of 8 x 3 m without cells, the face of the wall between them, its strip, truth and doors.
+
+    Args:
+        later: places by which both doors are farther along.
+    """
+    x, y = np.meshgrid(np.arange(80), np.arange(61), indexing="ij")
+    columns = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size, int)])
+    columns = columns[columns[:, 1] != 30]
+    floor = VoxelGrid.from_cells(columns, np.zeros(3), 0.1)
+    rooms = np.zeros(2, ROOM_DTYPE)
+    rooms["completeness"] = 1.0
+    edge = np.zeros(1, EDGE_DTYPE)
+    edge["rooms"], edge["centre"], edge["width"], edge["kind"] = (0, 1), (2.4 + later * ALONG, 3.05, 0.0), 0.9, "door"
+    edge["open"], edge["confidence"] = True, 0.9
+    label = (floor.cells[:, 1] > 30).astype(np.int32)
+    none = np.zeros(0, np.int32)
+    empty = floor.with_cells(np.zeros((0, 3), np.int32))
+    map = TopometricMap(empty, none, floor, label, rooms, edge, np.zeros(1, STOREY_DTYPE))
+    face = np.array([(0, (0, 3), (1, 0), (0, 1), 8.0, 0.0)], FACE_DTYPE)
+    truth, strip = np.zeros(160, np.uint8), np.zeros((160, DEPTHS, STRIP_CHANNELS), np.uint8)
+    truth[40 + later : 58 + later], truth[100 + later : 118 + later] = 1, 2
+    strip[:, 12, :BANDS] = 200
+    strip[truth == 1, :, :BANDS] = 0
+    strip[truth == 2, 12, :BANDS], strip[truth == 2, 16, :BANDS] = 0, 200
+    doors = np.array([[2.45, 3.05, 0.0], [5.45, 3.05, 0.0]]) + (later * ALONG, 0, 0)
+    return map, face, strip, truth, doors
 
 
 def two_rooms(wider: int) -> PlanExample:

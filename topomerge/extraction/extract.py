@@ -6,15 +6,17 @@ from collections.abc import Iterable
 from dataclasses import asdict, replace
 from typing import Any
 
+from topomerge.extraction.elevations.wall_doors import with_wall_doors
 from topomerge.extraction.free_space import free_space
 from topomerge.extraction.navigable import navigable_volume
-from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
+from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, chosen_parameters
 from topomerge.extraction.plans.plan_rooms import rooms_of_plans
 from topomerge.extraction.scan import read_scan
 from topomerge.extraction.slices import with_raised_slice
 from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.views.view_rooms import rooms_of_views
+from topomerge.extraction.walked_doors import with_walked_doors
 from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid
 
 COARSE_CELL = 0.15  # m: in larger ones, the walls beside a door leave too little of it
@@ -61,6 +63,13 @@ def extract(
 
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+
+    if isinstance(p, DefaultParameters) and p.walls and scan.fine is not None:
+        watch.begin("doors on walls", 0.87)
+        map = with_wall_doors(map, scan.fine)
+    if isinstance(p, DefaultParameters) and scan.rays is not None:
+        map, doubt = with_walked_doors(map, scan.places)
+        scan = replace(scan, warnings=(*scan.warnings, *filter(None, [doubt])))
 
     watch.begin("free space", 0.9)
     free = free_space(scan, navigable, p.range) if p.carve else scan.free

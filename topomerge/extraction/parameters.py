@@ -37,6 +37,7 @@ class DefaultParameters(SharedParameters):
 
     door: float = 0.5  # narrowings of the floor that are doors with this probability part rooms
     narrow: float = 0.2  # and with this one areas of a room
+    walls: bool = True  # doors are looked for on walls, too: shut ones, and where open ones end (docs/adr/0018)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,13 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.extraction.sparsity import COARSEST_CELL, without_gaps
-from topomerge.extraction.voxels import voxelise
+from topomerge.extraction.voxels import LatticeCells, voxelise
 from topomerge.types import Array, PointCloud, VoxelGrid
 
 FINEST_CELL = 0.02  # m
+FINE_CELL = 0.05  # m: of the cells in which walls are looked at closely
+LEAST_FINE = 2.05  # times as long: a grid of such cells will do, if it has the means of its points
+MOST_FINE_CELLS = 12_000_000  # 0.7 GB; some 4,000 m2 of floor
 MOST_RAYS = 400_000  # of a portion of two million points
 MOST_RAYS_HELD = 4_000_000  # of all portions: 0.2 GB
 
@@ -24,6 +27,7 @@ class Scan:
 
     Args:
         grid: occupied cells.
+        fine: cells of about `FINE_CELL` with the means of their points, as walls are looked at; None where they are not known.
         rays: (k, 3) places of the sensor and (k, 3) of what it saw from there, m; None where they are unknown.
         free: cells that the file says are empty, or None.
         source: where it comes from.
@@ -31,10 +35,19 @@ class Scan:
     """
 
     grid: VoxelGrid
+    fine: VoxelGrid | None = None
     rays: tuple[Array, Array] | None = None
     free: VoxelGrid | None = None
     source: str = ""
     warnings: tuple[str, ...] = ()
+
+    @property
+    def places(self) -> Array:
+        """(n, 3) m, where the sensor was, in the order in which it was there; none where that is unknown."""
+        if self.rays is None or not len(self.rays[0]):
+            return np.zeros((0, 3))
+        starts = np.asarray(self.rays[0], np.float64)
+        return starts[np.concatenate([[True], (starts[1:] != starts[:-1]).any(axis=1)])]
 
     def with_grid(self, grid: VoxelGrid, warning: str) -> Scan:
         """The scan with another grid, and with what the user should know about that."""
@@ -58,13 +71,18 @@ def read_scan(
     if not (isinstance(edge, int | float) and FINEST_CELL <= edge <= COARSEST_CELL):
         raise InputError(f"voxel size must be between {FINEST_CELL} and {COARSEST_CELL} m to find rooms and doors, not {edge}")
     if isinstance(source, VoxelGrid):
-        return Scan(source)
-    chunks = _Chunks([PointCloud(source)] if isinstance(source, np.ndarray) else source)
+        return Scan(source, source if "offset" in source.properties and edge <= LEAST_FINE * FINE_CELL else None)
+    parts = max(round(edge / FINE_CELL), 1)
+    fine = LatticeCells(edge / parts, MOST_FINE_CELLS) if parts > 1 else None
+    chunks = _Chunks([PointCloud(source)] if isinstance(source, np.ndarray) else source, fine)
     with reasons(chunks.warnings):
         grid = voxelise(chunks, edge, chunks.warnings)
+    close = fine.within(grid) if fine is not None else grid
+    if close is None:
+        chunks.warnings.append("the scan is large: doors are read off its plan alone, not off its walls")
     if least_neighbours:
         grid = without_gaps(grid, least_neighbours, chunks.warnings)
-    return Scan(grid, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings))
+    return Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings))
 
 
 @contextmanager
@@ -81,8 +99,9 @@ def reasons(warnings: Sequence[str]) -> Iterator[None]:
 class _Chunks:
     """The chunks of a cloud, to be read once; it gathers what they know beside their points."""
 
-    def __init__(self, chunks: PointCloud | Iterable[PointCloud]) -> None:
+    def __init__(self, chunks: PointCloud | Iterable[PointCloud], fine: LatticeCells | None) -> None:
         self.chunks = [chunks] if isinstance(chunks, PointCloud) else chunks
+        self.fine = fine
         self.source = ""
         self.free: VoxelGrid | None = None
         self.warnings: list[str] = []
@@ -96,6 +115,8 @@ class _Chunks:
             self.warnings += [w for w in chunk.warnings if w not in self.warnings]
             if chunk.poses is not None and chunk.pose_of is not None and len(chunk):
                 self._hold(*_rays(chunk, chunk.poses, chunk.pose_of))
+            if self.fine is not None:
+                self.fine.add(chunk)
             yield chunk
 
     def _hold(self, starts: Array, ends: Array) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import ndimage
 
@@ -22,7 +24,7 @@ def with_raised_slice(scan: Scan) -> Scan:
     if not is_slice(scan.grid):
         return scan
     warning = f"the scan is a slice: walls of {EXTRUDED_HEIGHT:g} m and a floor were assumed"
-    return scan.with_grid(_extruded(scan.grid, scan.rays), warning)
+    return replace(scan.with_grid(_extruded(scan.grid, scan.rays), warning), fine=None)
 
 
 def is_slice(grid: VoxelGrid) -> bool:

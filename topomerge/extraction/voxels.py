@@ -46,7 +46,10 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
         chunks = [PointCloud(cloud)]
     else:
         chunks = cloud
-    cells, counts, sums = _gather(chunks, edge)
+    lattice = LatticeCells(edge)
+    for chunk in chunks:
+        lattice.add(chunk)
+    cells, counts, sums = lattice.all()
     if not len(cells):
         raise InputError("no finite point: nothing to voxelise")
     base, shape = _box(cells)
@@ -68,16 +71,48 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
     return VoxelGrid.from_cells(cells - base, base * edge, edge, size, {"count": counts, "offset": offset.astype(np.uint8)})
 
 
-def _gather(chunks: Iterable[PointCloud], edge: float) -> _Lattice:
-    """Lattice cells of all chunks. Pending chunks are merged when they outgrow what is merged already."""
-    merged: _Lattice = (np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.int64))
-    pending: list[_Lattice] = []
-    for chunk in chunks:
-        base, cells, counts, sums = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), edge)
-        pending.append((cells + base, counts, sums))
-        if sum(len(part[0]) for part in pending) > max(len(merged[0]), PENDING_CELLS):
-            merged, pending = _merge([merged, *pending]), []
-    return _merge([merged, *pending])
+class LatticeCells:
+    """Lattice cells of chunks that come one after the other. Pending ones are merged when they outgrow what is merged already.
+
+    Args:
+        edge: of a cell, m.
+        most: cells that are held; of a larger cloud there are none. 0: any number.
+    """
+
+    def __init__(self, edge: float, most: int = 0) -> None:
+        self.edge, self.most = edge, most
+        self.too_many = False
+        self._merged: _Lattice = (np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.int64))
+        self._pending: list[_Lattice] = []
+
+    def add(self, chunk: PointCloud) -> None:
+        """Take in the cells of a chunk."""
+        if self.too_many:
+            return
+        base, cells, counts, sums = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), self.edge)
+        self._pending.append((cells + base, counts, sums))
+        if sum(len(part[0]) for part in self._pending) > max(len(self._merged[0]), PENDING_CELLS):
+            self._merged = self.all()
+            if self.most and len(self._merged[0]) > self.most:
+                self.too_many = True
+                self._merged = tuple(part[:0] for part in self._merged)  # type: ignore[assignment]
+
+    def all(self) -> _Lattice:
+        """Cells (n, 3), counts (n,) and sums (n, 3) of the places of points within them, in `OFFSET_STEPS` parts."""
+        self._merged, self._pending = _merge([self._merged, *self._pending]), []
+        return self._merged
+
+    def within(self, grid: VoxelGrid) -> VoxelGrid | None:
+        """The cells in the box of a grid of whole multiples of them; None where they were too many."""
+        cells, counts, sums = self.all()
+        if self.too_many or (self.most and len(cells) > self.most):
+            return None
+        base = np.rint(grid.origin / self.edge).astype(np.int64)
+        size = np.array(grid.shape) * round(grid.edge / self.edge)
+        inside = ((cells >= base) & (cells < base + size)).all(axis=1)
+        offset = ((sums + counts[:, None] // 2) // np.maximum(counts, 1)[:, None]).astype(np.uint8)
+        shape = (int(size[0]), int(size[1]), int(size[2]))
+        return VoxelGrid.from_cells(cells[inside] - base, grid.origin, self.edge, shape, {"offset": offset[inside]})
 
 
 def _merge(parts: list[_Lattice]) -> _Lattice:

@@ -13,6 +13,8 @@ from topomerge.types import Array, TopometricMap
 
 FACE_HEIGHTS = (0.3, 2.2)  # m above the floor: skirting and ceilings are no faces of walls
 ABOVE = 6.0  # m above the floor: cells higher up are of no use
+LEAST_CELLS = 6  # of a column, between 0.3 and 2.2 m: fewer are furniture
+FULL_COLUMN = 12  # cells: as many say no more
 STRAY = 1.0  # m: cells of no room belong to a floor this near
 
 
@@ -42,11 +44,11 @@ class FacePoints:
         return np.asarray((self.height > FACE_HEIGHTS[0]) & (self.height < FACE_HEIGHTS[1]))
 
 
-def face_points(map: TopometricMap, storey: int, floors: list[shapely.MultiPolygon]) -> FacePoints:
+def face_points(map: TopometricMap, storey: int, floors: list[shapely.MultiPolygon] | None = None) -> FacePoints:
     """The cells of a storey above its floors.
 
     Args:
-        floors: of each room of the map, m.
+        floors: of each room of the map, m; cells of no room go to the nearest. None: they stay out.
     """
     grid = map.grid
     rows = np.flatnonzero(map.storey_of_cells() == storey)
@@ -55,7 +57,7 @@ def face_points(map: TopometricMap, storey: int, floors: list[shapely.MultiPolyg
     middles = grid.origin + (cells + within) * grid.edge
     room = map.room[rows].astype(np.int32)
     stray, rooms = np.flatnonzero(room < 0), np.flatnonzero(map.rooms["storey"] == storey)
-    if len(stray) and len(rooms):
+    if floors is not None and len(stray) and len(rooms):
         columns, of = np.unique(cells[stray, :2], axis=0, return_inverse=True)
         middle = grid.origin[:2] + (columns + 0.5) * grid.edge
         tree = shapely.STRtree([floors[r] for r in rooms])
@@ -65,6 +67,16 @@ def face_points(map: TopometricMap, storey: int, floors: list[shapely.MultiPolyg
         room[stray] = nearest[of.ravel()]
     floor = np.append(room_levels(map)[0][:, 0], map.storeys["floor"][storey])
     height = middles[:, 2] - floor[room]
-    use = (height > 0) & (height < ABOVE)
+    use = (height > 0) & (height < ABOVE) & ((floors is not None) | (room >= 0))
     column = (cells[:, 0].astype(np.int64) * grid.shape[1] + cells[:, 1]) * (len(map.rooms) + 1) + room + 1
     return FacePoints(middles[use, :2], height[use], room[use], column[use], grid.edge, offset is not None)
+
+
+def wall_columns(points: FacePoints, room: int) -> tuple[Array, Array]:
+    """(n, 2) where the columns of a room that fill like walls stand, m, and (n,) m of wall that each is."""
+    rows = np.flatnonzero(points.upright & (points.room == room))
+    _, column, count = np.unique(points.column[rows], return_inverse=True, return_counts=True)
+    at = np.column_stack([np.bincount(column, points.at[rows, k], len(count)) / np.maximum(count, 1) for k in (0, 1)])
+    scale = 0.1 / points.edge  # how many cells stand above each other
+    full = count >= LEAST_CELLS * scale
+    return at[full], np.minimum(count[full] / (FULL_COLUMN * scale), 1.0) * points.edge

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from topomerge.kernels.hough import strongest
 from topomerge.types import Array
 
 HOUGH_TURN = np.radians(3.0)
@@ -88,17 +89,8 @@ def main_direction(lines: list[Line]) -> float | None:
 
 def _strongest(points: Array, weights: Array, angles: Array) -> Array:
     """Rows of the points of the run that holds most: of a direction and an offset across it."""
-    best, chosen = 0.0, (0.0, 0.0)
     middle = points.mean(axis=0)
-    for angle in angles.tolist():
-        across = (points - middle) @ (-np.sin(angle), np.cos(angle))
-        low = across.min()
-        count = np.bincount(((across - low) / HOUGH_BIN).astype(np.int64), weights)
-        two = count[:-1] + count[1:] if len(count) > 1 else count
-        k = int(two.argmax())
-        if two[k] > best:
-            best, chosen = float(two[k]), (angle, low + (k + 1) * HOUGH_BIN)
-    angle, offset = chosen
+    angle, offset = strongest(points - middle, weights, angles, HOUGH_BIN)
     across = (points - middle) @ (-np.sin(angle), np.cos(angle))
     rows = np.flatnonzero(np.abs(across - offset) <= LINE_REACH)
     order = rows[np.argsort((points[rows] - middle) @ (np.cos(angle), np.sin(angle)), kind="stable")]

@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import shapely
 
-from topomerge.structure.face_points import FacePoints, face_points
+from topomerge.structure.face_points import FacePoints, face_points, wall_columns
 from topomerge.structure.floors import floor_polygons
 from topomerge.structure.lines import main_direction, straight_lines
 from topomerge.structure.openings import OPENING_DTYPE, openings_in_walls
@@ -16,9 +16,6 @@ from topomerge.structure.outlines import apart, room_outline
 from topomerge.structure.sides import one_side_each
 from topomerge.structure.walls import WALL_DTYPE, walls_between
 from topomerge.types import Array, TopometricMap
-
-LEAST_CELLS = 6  # of a column, between 0.3 and 2.2 m: fewer are furniture
-FULL_COLUMN = 12  # cells: as many say no more
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,18 +66,8 @@ def _structure(map: TopometricMap) -> PlanStructure:
 
 
 def _outlines(points: FacePoints, rooms: Array, floors: list[shapely.MultiPolygon]) -> list[shapely.MultiPolygon]:
-    columns = [_columns(points, r) for r in rooms.tolist()]
+    columns = [wall_columns(points, r) for r in rooms.tolist()]
     main = main_direction([line for column in columns for line in straight_lines(*column)])
     own = [floors[r] for r in rooms.tolist()]
     lines = one_side_each([straight_lines(*column, main) for column in columns], own)
     return apart([room_outline(*room) for room in zip(own, lines, strict=True)])
-
-
-def _columns(points: FacePoints, room: int) -> tuple[Array, Array]:
-    """(n, 2) where the columns that fill like walls stand, m, and (n,) m of wall that each is."""
-    rows = np.flatnonzero(points.upright & (points.room == room))
-    _, column, count = np.unique(points.column[rows], return_inverse=True, return_counts=True)
-    at = np.column_stack([np.bincount(column, points.at[rows, k], len(count)) / np.maximum(count, 1) for k in (0, 1)])
-    scale = 0.1 / points.edge  # how many cells stand above each other
-    full = count >= LEAST_CELLS * scale
-    return at[full], np.minimum(count[full] / (FULL_COLUMN * scale), 1.0) * points.edge

@@ -15,7 +15,7 @@ from topomerge.io.atomic import replacing
 from topomerge.training.log import Log
 from topomerge.training.loop import Say
 from topomerge.training.run_folder import export_files, write_card, write_settings
-from topomerge.training.task_settings import TaskSettings
+from topomerge.training.shared_settings import TaskSettings
 from topomerge.training.tasks import TASKS
 from topomerge.types import Array
 

@@ -30,7 +30,7 @@ from topomerge.io.weight_files import weights_file
 from topomerge.numpy_nn import perceptron, sigmoid
 from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import NetworkJob, run_network
-from topomerge.training.task_settings import DoorClassification
+from topomerge.training.scan_settings import DoorClassification
 from topomerge.types import Array
 
 PURE = 0.7  # share of a region in its true room; regions between rooms are no example

@@ -24,7 +24,8 @@ from topomerge.matching.match import match
 from topomerge.matching.odds import HYPOTHESIS, MATCH, ODDS_LENGTHS, hypothesis_features, match_features
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
-from topomerge.training.task_settings import MatchOdds, TaskSettings
+from topomerge.training.shared_settings import TaskSettings
+from topomerge.training.task_settings import MatchOdds
 from topomerge.types import Array, Sim3
 
 RIGHT_POSE = (0.5, np.radians(5))  # m in the middle of what both maps saw, rad

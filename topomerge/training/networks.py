@@ -14,7 +14,7 @@ from topomerge.checkpoint import NETWORK_FILE, load_state, write_network
 from topomerge.training.log import Log
 from topomerge.training.loop import Job, Loop, Say, Schedule, State, pace
 from topomerge.training.run_folder import export_files, write_card, write_settings
-from topomerge.training.task_settings import NetworkTask
+from topomerge.training.shared_settings import NetworkTask
 from topomerge.training.tasks import TASKS
 
 

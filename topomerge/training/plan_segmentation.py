@@ -23,7 +23,7 @@ from topomerge.io import archive
 from topomerge.models.plan_unet import PlanUNet, exported_weights
 from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import NetworkJob, run_network
-from topomerge.training.task_settings import PlanAugment, PlanLoss, PlanSegmentation
+from topomerge.training.scan_settings import PlanAugment, PlanLoss, PlanSegmentation
 from topomerge.types import Array
 
 LEAST_COLUMNS = 100  # inside of a plan that trains

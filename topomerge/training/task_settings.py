@@ -1,116 +1,15 @@
-"""Settings of the tasks of `train.py` but `embedding` (`training.settings`), as Hydra composes them: configs/task/<task>.yaml."""
+"""Settings of the tasks that learn from pairs of maps, but `embedding` (`training.settings`): configs/task/<task>.yaml."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from topomerge.datasets.pairs.grid_pairs import GridRecipe
 from topomerge.datasets.pairs.lookalikes import LookalikeRecipe
-from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.recipe import Recipe
+from topomerge.training.shared_settings import NetworkTask, TaskSettings
 
 LOOKALIKES_TAKEN = ("none", "judged", "fitted")
-
-
-@dataclass
-class TaskSettings:
-    """What every task has.
-
-    Args:
-        task: which of the learned parts.
-        name: of the run; its folder is `runs`/`name`.
-        cache: folder of the data, which is made where it is missing, by so many processes (`jobs`), or those of a Dask cluster.
-        part: [k, n]: make every n-th item of the data from the k-th on, for machines that share nothing.
-        resume: go on where the run of this name stopped.
-        export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
-    """
-
-    task: str = ""
-    name: str = "run"
-    runs: str = "runs"
-    cache: str = "cache"
-    seed: int = 0
-    jobs: int = 1
-    cluster: str | None = None
-    part: list[int] = field(default_factory=lambda: [1, 1])
-    resume: bool = False
-    tensorboard: bool = True
-    export: str = ""
-
-    @property
-    def folder(self) -> Path:
-        """Where the run is written."""
-        return Path(self.runs) / self.name
-
-
-@dataclass
-class NetworkTask(TaskSettings):
-    """What tasks that train a network have besides.
-
-    Args:
-        epochs: at most; rate: of learning; decay: of weights; batch: examples a step.
-        patience: epochs without a better validation after which it ends; 0: never.
-        hold_out: every n-th scan is watched and trains nothing.
-        watch: what is best: a score of validation.
-    """
-
-    epochs: int = 10
-    batch: int = 8
-    rate: float = 2e-3
-    decay: float = 1e-3
-    patience: int = 0
-    hold_out: int = 8
-    watch: str = ""
-
-
-@dataclass
-class PlanLoss:
-    """Weights in the cross-entropy.
-
-    Args:
-        classes: of the five classes (`plan_network.CLASSES`).
-        unseen: of columns of which nothing is known.
-    """
-
-    classes: list[float] = field(default_factory=lambda: [1.0, 2.0, 4.0, 6.0, 1.0])
-    unseen: float = 0.05
-
-
-@dataclass
-class PlanAugment:
-    """What is taken away from crops while training, now and then.
-
-    Args:
-        upper: share of crops without ceiling or without floor.
-        columns: share of crops that lose single columns; lost: share of these, drawn between 0 and this.
-    """
-
-    upper: float = 0.2
-    columns: float = 0.3
-    lost: float = 0.3
-
-
-@dataclass
-class PlanSegmentation(NetworkTask):
-    """Args:
-    steps: of an epoch; warmup: steps in which the rate rises.
-    crop: columns of a side, a multiple of 16.
-    widths: channels of the levels a to d down, and e to h up again.
-    """
-
-    task: str = "plan_segmentation"
-    name: str = "plan_segmentation"
-    data: PlanRecipe = field(default_factory=PlanRecipe)
-    heldout: PlanRecipe = field(default_factory=PlanRecipe)
-    epochs: int = 27
-    steps: int = 500
-    warmup: int = 100
-    crop: int = 128
-    widths: list[int] = field(default_factory=lambda: [16, 32, 40, 40, 40, 32, 16, 12])
-    loss: PlanLoss = field(default_factory=PlanLoss)
-    augment: PlanAugment = field(default_factory=PlanAugment)
-    watch: str = "mean_f1"
 
 
 @dataclass
@@ -153,27 +52,6 @@ class PlaceEvidence(NetworkTask):
     widths: list[int] = field(default_factory=lambda: [24, 32, 48])
     dropout: float = 0.2
     augment: PlaceAugment = field(default_factory=PlaceAugment)
-    watch: str = "auc"
-
-
-@dataclass
-class DoorClassification(NetworkTask):
-    """Args:
-    hidden: units of each network; networks: that are averaged.
-    noise: standard deviations that features jitter by while training.
-    """
-
-    task: str = "door_classification"
-    name: str = "door_classification"
-    data: PlanRecipe = field(default_factory=PlanRecipe)
-    heldout: PlanRecipe = field(default_factory=PlanRecipe)
-    epochs: int = 60
-    batch: int = 256
-    rate: float = 5e-3
-    decay: float = 3e-2
-    hidden: int = 16
-    networks: int = 5
-    noise: float = 0.1
     watch: str = "auc"
 
 

@@ -21,7 +21,7 @@ class Task:
     Args:
         module: of `topomerge.training`: its function `fit(settings, say)` trains, `judge(settings, file, say)` gives the scores
             of a file of weights on buildings that trained nothing.
-        schema: its settings, in `training.task_settings`.
+        schema: its settings, in the module `settings` of `topomerge.training`.
         package, file: where its weights ship.
         hours: that `make weights` takes for it on two cores, about; once it ran, what it took stands instead.
     """
@@ -31,13 +31,20 @@ class Task:
     package: str
     file: str
     hours: float
+    settings: str = "task_settings"
 
 
 TASKS = {
-    "plan_segmentation": Task("plan_segmentation", "PlanSegmentation", "topomerge.extraction.plans", "plan_network.npz", 1.5),
-    "door_classification": Task(
-        "door_classification", "DoorClassification", "topomerge.extraction.plans", "door_classifier.json", 0.7
+    "plan_segmentation": Task(
+        "plan_segmentation", "PlanSegmentation", "topomerge.extraction.plans", "plan_network.npz", 1.5, "scan_settings"
     ),
+    "door_classification": Task(
+        "door_classification", "DoorClassification", "topomerge.extraction.plans", "door_classifier.json", 0.7, "scan_settings"
+    ),
+    "wall_segmentation": Task(
+        "wall_segmentation", "WallSegmentation", "topomerge.extraction.elevations", "wall_network.npz", 1.2, "scan_settings"
+    ),
+    "wall_doors": Task("wall_doors", "WallDoors", "topomerge.extraction.elevations", "wall_doors.json", 0.2, "scan_settings"),
     "feature_scale": Task("feature_scale", "FeatureScale", "topomerge.embedding", "engineered.json", 0.3),
     "match_odds": Task("match_odds", "MatchOdds", "topomerge.matching", "odds.json", 0.3),
     "place_evidence": Task("place_evidence", "PlaceEvidence", "topomerge.fusion.evidence", "place_network.npz", 4.0),
@@ -67,7 +74,7 @@ def schema_of(task: str) -> type[Any]:
         from topomerge.training.settings import with_recipe
 
         return with_recipe()
-    schema: type[Any] = getattr(import_module("topomerge.training.task_settings"), TASKS[task].schema)
+    schema: type[Any] = getattr(import_module(f"topomerge.training.{TASKS[task].settings}"), TASKS[task].schema)
     return schema
 
 

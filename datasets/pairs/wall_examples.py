@@ -1,0 +1,230 @@
+"""Walls unrolled as the extraction sees them, with what is truly in them: what the network of elevations learns from.
+
+Scans of procedural buildings and of real plans of the split, by every sensor that sees whole walls, at the spacing of its points
+or finer; doors have frames and handles or none, and stand anywhere in their walls. A file holds the walls of one scan.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+from topomerge.datasets.buildings.erect import erect
+from topomerge.datasets.buildings.procedural import make_building
+from topomerge.datasets.buildings.profiles import BUILDING_KINDS
+from topomerge.datasets.core.builder import Report, Row, Say, Sharing, make_item
+from topomerge.datasets.core.building import SURFACES, Building
+from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.pairs.items import digest
+from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanItem, PlanRecipe, Plans, build_scans, draw_difficulty
+from topomerge.datasets.pairs.plan_truth import drawn_map
+from topomerge.datasets.simulation.scanner import moved, scan
+from topomerge.datasets.simulation.sensors import get_sensor
+from topomerge.datasets.simulation.spoils import drift_between, exact_sensor
+from topomerge.datasets.simulation.walk import part
+
+from topomerge.errors import InputError
+from topomerge.extraction.elevations.elevation import ALONG, WALL_CLASSES, Elevations, wall_elevations
+from topomerge.extraction.extract import extract
+from topomerge.extraction.scan import FINE_CELL
+from topomerge.extraction.voxels import voxelise
+from topomerge.io import archive
+from topomerge.io.listing import plain
+from topomerge.types import ROOM_DTYPE, Array, PointCloud, Sim3, TopometricMap, VoxelGrid
+
+WALL_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
+SOURCE_SHARES = {"procedural": 0.6, "r2v": 0.25, "campus": 0.15}
+SENSOR_SHARES = {"tls": 0.35, "depth": 0.25, "lidar": 0.2, "tablet": 0.12, "mono": 0.08}
+ROOMS_VISITED = (4, 11)  # at least, less than
+FINER = (0.5, 1.0)  # of a sensor's spacing
+COARSE_SHARE = 0.15  # of the scans that are seen in the cells of the map
+DRAWN_EVERY = 8  # seeds: one is a grid map of the plan, as robots and draughtsmen make them
+EXACT_SHARE = 0.5  # of the scans without drift
+DEEP = 0.3  # m beside a wall's middle: a strip there is of that wall
+ASKEW = 0.26  # sine of the angle between a wall and a strip along it
+LEVEL_TOLERANCE = 0.6  # m between floors of one storey
+WALL_ARRAYS = ("first", "strips", "truth", "doors", "faces")
+MAP_ARRAYS, ROOM_COLUMNS = ("edges", "storeys", "navigable_room"), ("storey", "completeness")
+LOW_SILL = 0.3  # m: panes that begin lower are walls of glass
+
+
+@dataclass(frozen=True)
+class WallItem(PlanItem):
+    """As of plans: everything that the bytes of one file depend on."""
+
+    @property
+    def name(self) -> str:
+        """A hash of the inputs and of the version of what is made from them."""
+        return hashlib.sha256(json.dumps(["walls", WALL_FORMAT, plain(asdict(self))], sort_keys=True).encode()).hexdigest()[:24]
+
+
+@dataclass(frozen=True, eq=False)
+class WallExample:
+    """The walls of one scan, with what is true about them.
+
+    Args:
+        first: (F + 1,) the first place of each wall.
+        strips: (n, 32, 14) uint8, of 255, as of `Elevations`.
+        truth: (n,) uint8, index into `WALL_CLASSES`.
+        doors: (D, 3) where the true doors are, m, in the map's frame.
+        map: the map, without its cells; of the rooms storey and completeness alone.
+        faces: (F,) FACE_DTYPE.
+        source: sensor/where the building is from.
+    """
+
+    first: Array
+    strips: Array
+    truth: Array
+    doors: Array
+    map: TopometricMap
+    faces: Array
+    source: str
+
+    @property
+    def elevations(self) -> Elevations:
+        """The walls as the extraction has them."""
+        return Elevations(self.faces, self.first, (self.strips / np.float32(255)).astype(np.float32))
+
+
+def build_walls(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
+    """The files of a set, made where they are missing, in the order of the seeds."""
+    return build_scans(recipe, "walls", draw_wall_item, make_wall_file, sharing, say)
+
+
+def draw_wall_item(seed: int, plans: Plans) -> WallItem:
+    """The item of a seed; `make_walls` draws the same numbers again."""
+    rng = np.random.default_rng([seed, 7])
+    source = str(rng.choice(list(SOURCE_SHARES), p=list(SOURCE_SHARES.values())))
+    entries = plans.get(source, ())
+    if not entries:
+        return WallItem(seed, "procedural", 0, "", "")
+    name, plan = entries[int(rng.integers(len(entries)))]
+    return WallItem(seed, source, len(entries), name, digest((plan,)))
+
+
+def make_wall_file(item: WallItem, plan: Plan | None, folder: str) -> Row:
+    """Make an item's file."""
+    return make_item(item.name, folder, lambda: wall_arrays(item, make_walls(item, plan)), LONGEST_SCAN)
+
+
+def wall_arrays(item: WallItem, example: WallExample) -> dict[str, Array]:
+    """The arrays of a file."""
+    about = {"file": f"{item.name}.npz", **asdict(item), "sources": [example.source]}
+    arrays: dict[str, Any] = {name: getattr(example, name) for name in WALL_ARRAYS}
+    arrays |= {f"map.{name}": getattr(example.map, name) for name in MAP_ARRAYS}
+    arrays |= {f"rooms.{name}": example.map.rooms[name] for name in ROOM_COLUMNS}
+    floor = example.map.navigable
+    arrays |= {"floor.cells": floor.cells, "floor.origin": floor.origin, "floor.edge": np.array(floor.edge)}
+    return {**arrays, "source": np.array(example.source), "about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
+
+
+def load_walls(path: Path) -> WallExample:
+    """The walls of a file.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    arrays = archive.read(path, "cached walls")
+    floor = VoxelGrid.from_cells(arrays["floor.cells"], arrays["floor.origin"], float(arrays["floor.edge"]))
+    grid, none = floor.with_cells(np.zeros((0, 3), np.int32)), np.zeros(0, np.int32)
+    edges, storeys, room = (arrays[f"map.{name}"] for name in MAP_ARRAYS)
+    rooms = np.zeros(len(arrays["rooms.storey"]), ROOM_DTYPE)
+    for name in ROOM_COLUMNS:
+        rooms[name] = arrays[f"rooms.{name}"]
+    map = TopometricMap(grid, none, floor, room, rooms, edges, storeys)
+    return WallExample(**{name: arrays[name] for name in WALL_ARRAYS}, map=map, source=str(arrays["source"]))
+
+
+def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
+    """The walls of one scan."""
+    seed = item.seed
+    rng = np.random.default_rng([seed, 8])
+    difficulty = replace(draw_difficulty(rng), frames=float(rng.uniform(0.3, 1.0)))
+    if plan is not None:
+        building = erect([plan], difficulty, rng, f"{item.source}-{seed}")
+    else:
+        building = make_building(str(rng.choice(BUILDING_KINDS)), seed, 1, difficulty)
+    visited = part(building, int(rng.integers(*ROOMS_VISITED)), rng)
+    name, cloud, shift = _seen(building, visited, seed, rng)
+    frame = Sim3(float(rng.uniform(-np.pi, np.pi)))
+    cloud = replace(moved(cloud, frame), rooms=())
+    map = extract(cloud, carve=False, walls=False)
+    cells = map.grid if rng.random() < COARSE_SHARE else voxelise(cloud, FINE_CELL)
+    walls = wall_elevations(map, cells)
+    if not len(walls.faces):
+        raise InputError(f"{seed}: no wall was seen")
+    strips, truth = np.rint(255 * walls.strips).astype(np.uint8), true_classes(building, walls, frame, shift)
+    doors = building.doors["centre"]
+    if shift is not None:
+        doors = doors - shift[1][cKDTree(shift[0] + shift[1]).query(doors)[1]]
+    return WallExample(walls.first, strips, truth, frame.apply(doors), map, walls.faces, f"{name}/{item.source}")
+
+
+def _seen(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
+    """How a building was seen, its cloud, and places of it with what undoes its drift there (None: it has none)."""
+    sensor = get_sensor(str(rng.choice(list(SENSOR_SHARES), p=list(SENSOR_SHARES.values()))))
+    if seed % DRAWN_EVERY == DRAWN_EVERY - 1:
+        return "drawn", drawn_map(building, visited, rng), None
+    if rng.random() < EXACT_SHARE:
+        sensor = replace(sensor, drift=0.0, tilt=0.0)
+    spacing = sensor.spacing * float(rng.uniform(*FINER))
+    cloud = scan(building, sensor, visited, np.random.default_rng(seed), spacing)
+    if not sensor.drift:
+        return sensor.name, cloud, None
+    straight = scan(building, exact_sensor(sensor), visited, np.random.default_rng(seed), budget=8)
+    return sensor.name, cloud, drift_between(cloud, straight)
+
+
+def true_classes(building: Building, walls: Elevations, frame: Sim3, shift: tuple[Array, Array] | None) -> Array:
+    """(n,) uint8 index into `WALL_CLASSES` of each place along the walls.
+
+    Args:
+        frame: of the map in which the walls are.
+        shift: places of the building that drift bent, and what undoes it there (None: none did).
+    """
+    truth = np.zeros(int(walls.first[-1]), np.uint8)
+    if not len(truth):
+        return truth
+    place = np.arange(len(truth)) - np.repeat(walls.first[:-1], np.diff(walls.first))
+    face = walls.faces[np.repeat(np.arange(len(walls.faces)), np.diff(walls.first))]
+    at = face["start"] + (place + 0.5)[:, None] * ALONG * face["along"]
+    ends = [frame.inverse().apply(np.column_stack([p, face["floor"]])) for p in (at, at + 0.01 * face["along"])]
+    if shift is not None:
+        ends = [p + shift[1][cKDTree(shift[0]).query(ends[0])[1]] for p in ends]
+    at, along = ends[0], (ends[1] - ends[0])[:, :2] / 0.01
+    for name, holes in (("window", panes(building)), ("open", _doors(building, False)), ("shut", _doors(building, True))):
+        for x, y, z, direction, width, thickness in holes:
+            normal = np.array([np.cos(direction), np.sin(direction)])
+            off = at[:, :2] - (x, y)
+            across, beside = np.abs(off @ normal), np.abs(off @ (-normal[1], normal[0]))
+            within = (across < thickness / 2 + DEEP) & (beside < width / 2) & (np.abs(along @ normal) < ASKEW)
+            truth[within & (np.abs(at[:, 2] - z) < LEVEL_TOLERANCE)] = WALL_CLASSES.index(name)
+    return truth
+
+
+def _doors(building: Building, shut: bool) -> Sequence[tuple[float, ...]]:
+    doors = building.doors[(building.doors["state"] == "shut") == shut]
+    return [(*d["centre"].tolist(), *(float(d[k]) for k in ("direction", "width", "thickness"))) for d in doors]
+
+
+def panes(building: Building) -> list[tuple[float, ...]]:
+    """Windows: their middle at the height of the floor, direction of the normal (rad), width and depth of the reveal (m)."""
+    glass = building.triangles[building.labels == SURFACES.index("glass")]
+    windows = []
+    for triangle in glass[::2]:  # two make a pane
+        corners = building.vertices[triangle].astype(float)
+        low, high = corners[:, 2].min(), corners[:, 2].max()
+        floors = building.storeys["floor"]
+        floor = float(floors[floors <= low + LOW_SILL].max(initial=floors[0]))
+        ends = corners[np.argsort(corners[:, 2])][:2, :2] if corners[1, 2] == low else corners[[0, 2], :2]
+        wide = ends[1] - ends[0]
+        if low > floor + LOW_SILL and high > low and np.hypot(*wide) > 0.2:
+            direction = float(np.arctan2(wide[1], wide[0]) + np.pi / 2)
+            windows.append((*ends.mean(axis=0).tolist(), floor, direction, float(np.hypot(*wide)), 0.3))
+    return windows

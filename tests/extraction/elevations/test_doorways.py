@@ -1,0 +1,112 @@
+"""Doorways out of probabilities along walls, and doors of plans and walls weighed together: answers known by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.training.tiny import two_doors
+from topomerge.errors import InputError
+from topomerge.extraction.elevations import wall_doors
+from topomerge.extraction.elevations.doorways import doorways
+from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, Elevations
+from topomerge.extraction.elevations.wall_doors import DOOR_FEATURES, SOURCES, DoorCandidates, door_candidates, door_chance
+from topomerge.extraction.elevations.wall_network import read_network
+
+STEP = 2 * ALONG
+
+
+def face(room=0, start=(0.0, 0.0), along=(1.0, 0.0), out=(0.0, 1.0), length=6.0, floor=0.0):
+    return np.array([(room, start, along, out, length, floor)], FACE_DTYPE)
+
+
+def walls(*faces):
+    sizes = [2 * round(f["length"][0] / STEP) for f in faces]
+    strips = np.full((sum(sizes), 32, 14), 0.5, np.float32)
+    return Elevations(np.concatenate(faces), np.concatenate([[0], np.cumsum(sizes)]), strips)
+
+
+def chances(length, *doors):
+    """(n, 2) where doors (start, stop, open, shut) stand in probabilities along `length` m."""
+    out = np.zeros((round(length / STEP), 2))
+    for start, stop, is_open, is_shut in doors:
+        out[round(start / STEP) : round(stop / STEP)] = is_open, is_shut
+    return out
+
+
+def test_a_stretch_is_a_doorway_in_its_middle_and_as_wide():
+    (door,) = doorways(walls(face()), chances(6, (2.0, 2.9, 0.9, 0.05)))
+    assert door["centre"][0] == pytest.approx(2.45) and 0 < door["centre"][1] < 0.15 and door["centre"][2] == 0
+    assert door["width"] == pytest.approx(0.9 * 0.95) and door["open"] == pytest.approx(0.9 / 0.95)
+    assert door["rooms"].tolist() == [0, -1] and door["faces"] == 1 and door["probability"] == pytest.approx(0.95)
+
+
+def test_what_is_narrow_or_unlikely_is_none():
+    doors = chances(6, (1.0, 1.3, 1.0, 0.0), (3.0, 4.0, 0.2, 0.2))
+    assert not len(doorways(walls(face()), doors))
+
+
+def test_both_faces_show_one_doorway_in_the_middle_of_the_wall():
+    both = walls(face(), face(room=1, start=(6.0, 0.2), along=(-1.0, 0.0), out=(0.0, -1.0)))
+    doors = np.concatenate([chances(6, (2.0, 3.0, 0.1, 0.8)), chances(6, (3.0, 4.0, 0.0, 0.7))])
+    (door,) = doorways(both, doors)
+    assert sorted(door["rooms"].tolist()) == [0, 1] and door["faces"] == 2
+    assert door["centre"][:2] == pytest.approx([2.5, 0.1], abs=0.01) and door["open"] < 0.15
+
+
+@pytest.mark.parametrize("change", [{"start": (0.0, 0.9)}, {"floor": 3.0}])
+def test_doorways_of_two_walls_or_two_storeys_stay_two(change):
+    doors = np.concatenate([chances(6, (2.0, 3.0, 0.9, 0.0))] * 2)
+    assert len(doorways(walls(face(), face(room=1, **change)), doors)) == 2
+
+
+def seen(doors, map=None):
+    example = two_doors(0)
+    elevations = Elevations(example[1], np.array([0, 160]), example[2] / np.float32(255))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wall_doors, "place_doors", lambda _: doors)
+        return door_candidates(example[0] if map is None else map, elevations)
+
+
+def test_a_door_of_the_plan_lies_where_the_wall_shows_it():
+    candidates = seen(chances(8, (2.0, 2.9, 0.95, 0.0)))
+    (edge,) = candidates.edges
+    assert candidates.source.tolist() == [SOURCES.index("both")] and edge["centre"][0] == pytest.approx(2.45)
+    assert edge["width"] == pytest.approx(0.855) and edge["rooms"].tolist() == [0, 1]
+    at = dict(zip(DOOR_FEATURES, candidates.features[0], strict=True))
+    assert at["plan"] == pytest.approx(0.9) and at["wall"] == pytest.approx(0.95) and at["apart"] == pytest.approx(0.05, abs=0.02)
+
+
+def test_a_shut_door_that_the_wall_alone_shows_joins_the_rooms_on_its_two_sides():
+    map = two_doors(0)[0]
+    map.edges["centre"][0, 0] = 7.2  # what the plan takes for a door is wall
+    candidates = seen(chances(8, (5.0, 5.9, 0.1, 0.8)), map)
+    assert candidates.source.tolist() == [SOURCES.index("plan"), SOURCES.index("wall")]
+    edge = candidates.edges[1]
+    assert edge["rooms"].tolist() == [0, 1] and not edge["open"] and edge["kind"] == "door"
+    assert edge["direction"] == pytest.approx(np.pi / 2)
+    near, covered = (candidates.features[0][DOOR_FEATURES.index(name)] for name in ("near", "covered"))
+    assert near == 0 and covered == 1
+
+
+def test_a_doorway_into_nothing_joins_nothing():
+    map = two_doors(0)[0]
+    map.navigable_room[map.navigable_room == 1] = -1
+    assert seen(chances(8, (5.0, 5.9, 0.1, 0.8)), map).source.tolist() == [SOURCES.index("plan")]
+
+
+def test_a_model_each_for_what_shows_a_door():
+    candidates = DoorCandidates(seen(chances(8)).edges[[0, 0, 0]], np.eye(3, len(DOOR_FEATURES)), np.arange(3))
+    zeros = [0.0] * len(DOOR_FEATURES)
+    models = {"both": [0.0, 2.0, *zeros[1:]], "plan": [-1.0, *zeros], "wall": [1.0, *zeros]}
+    assert door_chance(candidates, models) == pytest.approx(1 / (1 + np.exp([-2.0, 1.0, -1.0])))
+
+
+def test_damaged_weights_are_refused(tmp_path):
+    path = tmp_path / "wall_network.npz"
+    path.write_bytes(b"PK")
+    with pytest.raises(InputError, match="wall_network"):
+        read_network(path)
+    np.savez(path, **{"a.w": np.zeros((9, 4)), "a.b": np.zeros(4)})
+    with pytest.raises(InputError, match="walls"):
+        read_network(path)

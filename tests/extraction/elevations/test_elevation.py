@@ -1,0 +1,55 @@
+"""Walls unrolled: what stands where in rooms that are drawn point by point."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.extraction.elevations.doors import SHUT_DOOR, extracted, three_doors
+from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, BEFORE, PAST_ENDS, wall_elevations, wall_faces
+from topomerge.extraction.voxels import voxelise
+
+CLOUD = three_doors().points()
+
+
+@pytest.fixture(scope="module")
+def map():
+    return extracted(CLOUD, walls=False)
+
+
+def between(faces, x):
+    """Rows of the faces that lie along y at x."""
+    turned = np.abs(faces["along"] @ (1.0, 0.0)) < 0.05
+    return np.flatnonzero(turned & (np.abs(faces["start"][:, 0] - x) < 0.04))
+
+
+def test_each_face_has_its_room_before_it_and_the_wall_behind(map):
+    faces = wall_faces(map)
+    left, right = between(faces, 3.925 + 0.013), between(faces, 4.075 + 0.013)
+    assert len(left) and len(right)
+    assert (faces["out"][left] @ (1.0, 0.0) > 0.99).all() and (faces["out"][right] @ (1.0, 0.0) < -0.99).all()
+    assert len({*faces["room"][left]}) == len({*faces["room"][right]}) == 1
+    assert faces["length"][left].max() == pytest.approx(5 + 2 * PAST_ENDS, abs=0.4)
+
+
+def test_a_leaf_that_lies_back_shows_and_an_open_door_is_empty(map):
+    walls = wall_elevations(map, voxelise(CLOUD, 0.05))
+    face = max(between(walls.faces, 3.925 + 0.013), key=lambda f: walls.faces["length"][f])
+    strip = walls.strips[walls.first[face] : walls.first[face + 1]]
+    y = walls.faces["start"][face][1] + walls.faces["along"][face][1] * (np.arange(len(strip)) + 0.5) * ALONG
+    depth = (np.arange(strip.shape[1]) + 0.5) * ACROSS - BEFORE
+    standing = strip[:, :, 2:10].mean(axis=2)  # 0.3 to 1.9 m
+    wall = (y > 0.4) & (y < 1.0)
+    leaf, open_door = np.abs(y - SHUT_DOOR) < 0.35, np.abs(y - 4.0) < 0.35
+    assert abs(depth[standing[wall].mean(axis=0)[depth < 0.05].argmax()]) <= ACROSS
+    front = standing[leaf].mean(axis=0)
+    assert front[np.abs(depth) < 0.03].max() < 0.1 * front.max()  # nothing where the face would be
+    assert depth[front.argmax()] == pytest.approx(0.05, abs=0.03) or depth[front.argmax()] == pytest.approx(0.09, abs=0.03)
+    assert standing[open_door].max() < 0.2 and strip[open_door][:, :, 11].max() > 0.3  # the lintel is above it
+    assert strip[open_door][..., BANDS].mean() > 0.15  # where one can walk
+
+
+def test_strips_hold_shares_and_cover_all_faces(map):
+    walls = wall_elevations(map, voxelise(CLOUD, 0.05))
+    assert walls.strips.shape == (walls.first[-1], 32, BANDS + 1) and len(walls.first) == len(walls.faces) + 1
+    assert walls.strips.min() >= 0 and walls.strips.max() <= 1 and not (np.diff(walls.first) % 2).any()

@@ -1,0 +1,102 @@
+"""Doorways seen on walls: stretches that the network of elevations takes for an open or a shut door (beyond the thesis).
+
+A wall between two rooms has a face on either side; what is seen on both is one doorway, in the middle of the wall.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.cluster.hierarchy import fcluster, linkage
+
+from topomerge.extraction.elevations.elevation import ALONG, WALL_CLASSES, Elevations
+from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities
+from topomerge.types import Array
+
+DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of a doorway, and of one of them
+LEAST_WIDTH = 0.45  # m
+HALF_WALL = 0.06  # m from the face of a wall to its middle, where one face was seen only
+SAME_DOORWAY = 0.45  # m between what two faces show of one doorway
+LEVEL = 0.5  # m between their floors
+OPEN, SHUT = WALL_CLASSES.index("open"), WALL_CLASSES.index("shut")
+DOORWAY_DTYPE = np.dtype(
+    [
+        ("rooms", "i4", 2),  # that see it, the second -1 where one does
+        ("centre", "f8", 3),  # on the floor, in the map's frame
+        ("out", "f8", 2),  # unit, away from the first room
+        ("width", "f8"),  # m
+        ("probability", "f8"),  # of a door, the highest along it
+        ("mean", "f8"),  # and on average
+        ("open", "f8"),  # share of that which speaks for an open one
+        ("faces", "i4"),  # on which it was seen
+    ]
+)
+
+
+def place_doors(walls: Elevations) -> Array:
+    """(n / 2, 2) float32 probability of an open and of a shut door in each place along all strips."""
+    parts = [place_probabilities(walls.strips[low:high])[:, [OPEN, SHUT]] for low, high in _bounds(walls)]
+    return np.concatenate([np.zeros((0, 2), np.float32), *parts])
+
+
+def _bounds(walls: Elevations) -> Iterator[tuple[int, int]]:
+    return zip(walls.first[:-1].tolist(), walls.first[1:].tolist(), strict=True)
+
+
+def doorways(walls: Elevations, doors: Array) -> Array:
+    """(D,) DOORWAY_DTYPE, each once however many faces show it.
+
+    Args:
+        doors: (n / 2, 2) of `place_doors`.
+    """
+    rows = []
+    for face, (low, high) in zip(walls.faces, _bounds(walls), strict=True):
+        each = doors[low // PLACES : high // PLACES]
+        rows += [_doorway(face, each, start, stop) for start, stop in _runs(each.sum(axis=1))]
+    return _joined(np.array(rows, DOORWAY_DTYPE))
+
+
+def _runs(chance: Array) -> Iterator[tuple[int, int]]:
+    """First place and that after the last one of every stretch that is probably a door."""
+    likely = np.flatnonzero(np.diff(np.concatenate([[0], chance > DOOR_CHANCE, [0]]).astype(np.int8)))
+    for start, stop in likely.reshape(-1, 2).tolist():
+        if (stop - start) * PLACES * ALONG >= LEAST_WIDTH and chance[start:stop].max() >= LIKELY_DOOR:
+            yield start, stop
+
+
+def _doorway(face: Array, doors: Array, start: int, stop: int) -> tuple[object, ...]:
+    """Row of DOORWAY_DTYPE of one stretch of a face."""
+    step = PLACES * ALONG
+    chance = doors[start:stop].sum(axis=1)
+    at = (np.average(np.arange(start, stop), weights=chance) + 0.5) * step
+    middle = face["start"] + at * face["along"] + HALF_WALL * face["out"]
+    width = float(chance.sum()) * step
+    share = float(doors[start:stop, 0].sum() / chance.sum())
+    place = (*middle.tolist(), float(face["floor"]))
+    return (int(face["room"]), -1), place, face["out"], width, float(chance.max()), float(chance.mean()), share, 1
+
+
+def _joined(rows: Array) -> Array:
+    """What several faces show of one doorway as one row, the likeliest first."""
+    if len(rows) < 2:
+        return rows
+    place = np.column_stack([rows["centre"][:, :2], rows["centre"][:, 2] * (SAME_DOORWAY / LEVEL)])
+    of = fcluster(linkage(place, "average"), SAME_DOORWAY, "distance")
+    out = np.array([_one(rows[of == k]) for k in np.unique(of)], DOORWAY_DTYPE)
+    return out[np.argsort(-out["probability"], kind="stable")]
+
+
+def _one(rows: Array) -> Array:
+    """One row of several, by their probabilities; the other room is the likeliest that sees it from the other side."""
+    rows = rows[np.argsort(-rows["probability"], kind="stable")]
+    out, weight = rows[0].copy(), rows["probability"]
+    opposite = (rows["out"] @ out["out"] < 0) & (rows["rooms"][:, 0] != out["rooms"][0])
+    sides = [rows[0], rows[np.flatnonzero(opposite)[0]]] if opposite.any() else [rows[0]]
+    if opposite.any():
+        out["rooms"][1] = sides[1]["rooms"][0]
+    out["centre"] = np.mean([side["centre"] for side in sides], axis=0)
+    out["width"] = float(np.mean([side["width"] for side in sides]))
+    out["open"], out["mean"] = np.average(rows["open"], weights=weight), rows["mean"].max()
+    out["faces"] = len(rows)
+    return out

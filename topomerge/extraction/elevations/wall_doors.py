@@ -1,0 +1,211 @@
+"""Doors of a map, those that plans show and those that walls show weighed together (beyond the thesis: docs/adr/0018).
+
+What both show lies where the wall shows it: a leaf that stands open hides from the plan where its doorway ends. What the plan
+alone shows is dropped where the wall is seen and closed; what the wall alone shows is a door that the plan missed, mostly a shut
+one: it joins two rooms, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from topomerge.extraction.doors import DOOR_MOST_WIDTH
+from topomerge.extraction.elevations.doorways import doorways, place_doors
+from topomerge.extraction.elevations.elevation import ALONG, BEFORE, BEHIND, Elevations, wall_elevations
+from topomerge.extraction.elevations.wall_network import PLACES
+from topomerge.io.weight_files import read_weights_json
+from topomerge.numpy_nn import sigmoid
+from topomerge.types import EDGE_DTYPE, Array, TopometricMap, VoxelGrid
+
+WALL_DOORS_FILE = "wall_doors.json"
+DOOR_FEATURES = (
+    "wall",  # probability of a door that the wall shows, the highest along it
+    "wall_mean",  # and on average
+    "both_sides",  # 0 or 1: seen on two faces
+    "shut",  # share of that which speaks for a shut one
+    "plan",  # probability of a door that the plan shows
+    "near",  # the highest that walls show near a door of the plan alone
+    "covered",  # 0 or 1: is a wall seen there?
+    "odd_width",  # how far from 0.9 m, as a logarithm
+    "complete",  # of the less complete of the two rooms
+    "apart",  # m between where plan and wall show it
+    "wide",  # 0 or 1: an opening
+)
+SOURCES = ("both", "plan", "wall")  # what shows a door: there is a model for each
+REACH = 1.0  # m between a door of the plan and the same one on the wall
+BEYOND = (0.1, 1.0)  # m from a wall: there the other room begins
+NEAR = 0.3  # m around a door of the plan
+STOOD = 0.12  # m from the middle of a cell of a floor
+
+
+@dataclass(frozen=True, eq=False)
+class DoorCandidates:
+    """What plans or walls show.
+
+    Args:
+        edges: (n,) EDGE_DTYPE.
+        features: (n, 11) `DOOR_FEATURES`.
+        source: (n,) int8, index into `SOURCES`.
+    """
+
+    edges: Array
+    features: Array
+    source: Array
+
+
+def with_wall_doors(map: TopometricMap, cells: VoxelGrid) -> TopometricMap:
+    """The map with the doors that its walls show.
+
+    Args:
+        cells: as of `wall_elevations`.
+    """
+    if not len(map.rooms):
+        return map
+    candidates = door_candidates(map, wall_elevations(map, cells))
+    chance = door_chance(candidates)
+    edges = candidates.edges.copy()
+    edges["confidence"] = chance
+    flights = map.edges[~np.isin(map.edges["kind"], ("door", "opening"))]
+    edges = np.concatenate([edges[chance >= 0.5], flights])
+    return replace(map, edges=edges[np.lexsort((*edges["centre"].T[::-1], edges["rooms"][:, 1], edges["rooms"][:, 0]))])
+
+
+def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]] | None = None) -> Array:
+    """(n,) probability that each is a door.
+
+    Args:
+        models: of each of `SOURCES` a constant and the weights of `DOOR_FEATURES`; None: those that ship.
+
+    Raises:
+        InputError: the weights that ship are damaged.
+    """
+    models = read_weights_json("topomerge.extraction.elevations", WALL_DOORS_FILE) if models is None else models
+    table = np.array([models.get(name, ()) for name in SOURCES], float)
+    weights = table[candidates.source]
+    return sigmoid((weights[:, 1:] * candidates.features).sum(axis=1) + weights[:, 0])
+
+
+def door_candidates(map: TopometricMap, walls: Elevations) -> DoorCandidates:
+    """All doors and openings that the plan or the walls of a map show."""
+    doors = place_doors(walls)
+    ways = _with_other_room(map, doorways(walls, doors))
+    level = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
+    partner = _partners(level, ways)
+    edges, features, source = [], [], []
+    for edge, i in zip(level, partner, strict=True):
+        complete = float(map.rooms["completeness"][edge["rooms"]].min())
+        if i >= 0:
+            way = ways[i]
+            apart = float(np.hypot(*(way["centre"] - edge["centre"])[:2]))
+            edges.append(_moved(edge, way))
+            features.append([*_seen(way), float(edge["confidence"]), 0, 1, *_size(way["width"], complete, apart)])
+        else:
+            near, covered = _near(walls, doors, edge)
+            edges.append(edge)
+            features.append([0, 0, 0, 0, float(edge["confidence"]), near, covered, *_size(edge["width"], complete, 0)])
+        source.append(SOURCES.index("both" if i >= 0 else "plan"))
+    for i in np.setdiff1d(np.arange(len(ways)), partner).tolist():
+        way = ways[i]
+        if way["rooms"][1] >= 0:
+            complete = float(map.rooms["completeness"][way["rooms"]].min())
+            edges.append(_edge(way))
+            features.append([*_seen(way), 0, 0, 1, *_size(way["width"], complete, 0)])
+            source.append(SOURCES.index("wall"))
+    table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
+    return DoorCandidates(table, np.array(features, float).reshape(-1, len(DOOR_FEATURES)), np.array(source, np.int8))
+
+
+def _seen(way: Array) -> list[float]:
+    return [float(way["probability"]), float(way["mean"]), float(way["faces"] > 1), 1 - float(way["open"])]
+
+
+def _size(width: float, complete: float, apart: float) -> tuple[float, ...]:
+    """The last four of `DOOR_FEATURES`."""
+    odd = abs(float(np.log(max(float(width), 0.1) / 0.9)))
+    return odd, complete, apart, float(width > DOOR_MOST_WIDTH)
+
+
+def _with_other_room(map: TopometricMap, ways: Array) -> Array:
+    """The doorways with the room behind those that one face shows; without those that lead from a room into itself."""
+    ways = ways.copy()
+    floor = map.navigable.centroids()
+    storey = map.rooms["storey"][map.navigable_room]
+    trees = {s: np.flatnonzero((storey == s) & (map.navigable_room >= 0)) for s in range(len(map.storeys))}
+    looked = {s: cKDTree(floor[rows, :2]) for s, rows in trees.items() if len(rows)}
+    for way in ways:
+        s = int(map.rooms["storey"][way["rooms"][0]])
+        if way["rooms"][1] >= 0 or s not in looked:
+            continue
+        steps = np.arange(BEYOND[0], BEYOND[1] + 0.05, 0.1)
+        side = np.array([-way["out"][1], way["out"][0]]) * float(way["width"]) / 4
+        places = way["centre"][:2] + side * np.array([[-1.0], [0.0], [1.0]]) + steps[:, None, None] * way["out"]
+        far, row = looked[s].query(places, distance_upper_bound=STOOD)
+        rows = trees[s][np.minimum(row, len(trees[s]) - 1)]
+        label = np.where(np.isfinite(far), map.navigable_room[rows], -1)
+        other = label[(label >= 0) & (label != way["rooms"][0])]
+        if len(other):
+            way["rooms"][1] = np.bincount(other).argmax()
+    return ways
+
+
+def _partners(edges: Array, ways: Array) -> Array:
+    """(E,) the doorway that each door of the plan is, -1 none: the nearest first, each once."""
+    partner = np.full(len(edges), -1)
+    if not len(edges) or not len(ways):
+        return partner
+    apart = np.linalg.norm(edges["centre"][:, None, :2] - ways["centre"][None, :, :2], axis=2)
+    level = np.abs(edges["centre"][:, None, 2] - ways["centre"][None, :, 2]) < REACH
+    first, second = ways["rooms"].T
+    pair = edges["rooms"][:, None]
+    fits = (pair == first[:, None]).any(axis=2) & ((second < 0) | (pair == second[:, None]).any(axis=2))
+    apart = np.where(fits & level, apart, np.inf)
+    for i, j in np.column_stack(np.unravel_index(np.argsort(apart, axis=None, kind="stable"), apart.shape)).tolist():
+        reach = max(REACH, float(edges["width"][i]) / 2 + NEAR)
+        if apart[i, j] < reach and partner[i] < 0 and j not in partner:
+            partner[i] = j
+    return partner
+
+
+def _moved(edge: Array, way: Array) -> Array:
+    """A door of the plan where the wall shows it."""
+    out = edge.copy()
+    out["centre"] = (*way["centre"][:2], edge["centre"][2])
+    out["width"], out["direction"] = way["width"], _normal(way)
+    out["kind"] = "door" if way["width"] <= DOOR_MOST_WIDTH else "opening"
+    out["lower"] = out["upper"] = out["centre"]
+    return out
+
+
+def _edge(way: Array) -> Array:
+    """A door that the plan does not show."""
+    out = np.zeros((), EDGE_DTYPE)
+    out["rooms"], out["centre"], out["width"] = np.sort(way["rooms"]), way["centre"], way["width"]
+    out["direction"], out["open"] = _normal(way), way["open"] >= 0.5
+    out["kind"] = "door" if way["width"] <= DOOR_MOST_WIDTH else "opening"
+    out["lower"] = out["upper"] = out["centre"]
+    return out
+
+
+def _normal(way: Array) -> float:
+    return float(np.arctan2(way["out"][1], way["out"][0]) % np.pi)
+
+
+def _near(walls: Elevations, doors: Array, edge: Array) -> tuple[float, float]:
+    """The highest probability of a door that walls show around a door of the plan, and is any wall seen there?"""
+    best, covered = 0.0, 0.0
+    at = edge["centre"][:2] - walls.faces["start"]
+    t = (at * walls.faces["along"]).sum(axis=1)
+    off = (at * walls.faces["out"]).sum(axis=1)
+    level = np.abs(walls.faces["floor"] - edge["centre"][2]) < REACH
+    beside = (off > -BEFORE) & (off < BEHIND) & (t > 0) & (t < walls.faces["length"]) & level
+    for f in np.flatnonzero(beside).tolist():
+        first, last = int(walls.first[f]) // PLACES, int(walls.first[f + 1]) // PLACES
+        low, high = (first + round((t[f] + side * NEAR) / ALONG / PLACES) for side in (-1, 1))
+        some = slice(max(low, first), min(high + 1, last))
+        if doors[some].size and walls.strips[some.start * PLACES : some.stop * PLACES].any():
+            best, covered = max(best, float(doors[some].sum(axis=1).max())), 1.0
+    return best, covered

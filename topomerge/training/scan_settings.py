@@ -1,0 +1,138 @@
+"""Settings of the tasks that learn from scans whose plans or walls are looked at: configs/task/<task>.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from topomerge.datasets.pairs.plan_examples import PlanRecipe
+from topomerge.training.shared_settings import NetworkTask, TaskSettings
+
+
+@dataclass
+class PlanLoss:
+    """Weights in the cross-entropy.
+
+    Args:
+        classes: of the five classes (`plan_network.CLASSES`).
+        unseen: of columns of which nothing is known.
+    """
+
+    classes: list[float] = field(default_factory=lambda: [1.0, 2.0, 4.0, 6.0, 1.0])
+    unseen: float = 0.05
+
+
+@dataclass
+class PlanAugment:
+    """What is taken away from crops while training, now and then.
+
+    Args:
+        upper: share of crops without ceiling or without floor.
+        columns: share of crops that lose single columns; lost: share of these, drawn between 0 and this.
+    """
+
+    upper: float = 0.2
+    columns: float = 0.3
+    lost: float = 0.3
+
+
+@dataclass
+class PlanSegmentation(NetworkTask):
+    """Args:
+    steps: of an epoch; warmup: steps in which the rate rises.
+    crop: columns of a side, a multiple of 16.
+    widths: channels of the levels a to d down, and e to h up again.
+    """
+
+    task: str = "plan_segmentation"
+    name: str = "plan_segmentation"
+    data: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    epochs: int = 27
+    steps: int = 500
+    warmup: int = 100
+    crop: int = 128
+    widths: list[int] = field(default_factory=lambda: [16, 32, 40, 40, 40, 32, 16, 12])
+    loss: PlanLoss = field(default_factory=PlanLoss)
+    augment: PlanAugment = field(default_factory=PlanAugment)
+    watch: str = "mean_f1"
+
+
+@dataclass
+class WallAugment:
+    """What is done to stretches of walls while training, beside mirroring.
+
+    Args:
+        shift: elements by which a face is moved nearer or farther, at most.
+        sparse: share of stretches that lose elements; lost: share of these, drawn between 0 and this.
+        hidden: share of stretches of which some is not seen up to some height.
+        walk: share of stretches without the floor that one can walk on.
+    """
+
+    shift: int = 2
+    sparse: float = 0.4
+    lost: float = 0.7
+    hidden: float = 0.3
+    walk: float = 0.15
+
+
+@dataclass
+class WallSegmentation(NetworkTask):
+    """Args:
+    steps: of an epoch; warmup: steps in which the rate rises.
+    length: places of a stretch, even; at_holes: share of the stretches about the side of a door or window.
+    widths: of `models.wall_network.WallNetwork`.
+    classes: weights of the four classes in the cross-entropy; unseen: of places where nothing was seen.
+    """
+
+    task: str = "wall_segmentation"
+    name: str = "wall_segmentation"
+    data: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    epochs: int = 12
+    batch: int = 32
+    steps: int = 400
+    warmup: int = 100
+    length: int = 96
+    at_holes: float = 0.5
+    widths: list[int] = field(default_factory=lambda: [24, 32, 96, 64])
+    classes: list[float] = field(default_factory=lambda: [1.0, 1.5, 3.0, 1.5])
+    unseen: float = 0.05
+    augment: WallAugment = field(default_factory=WallAugment)
+    watch: str = "f1_doors"
+
+
+@dataclass
+class WallDoors(TaskSettings):
+    """Args:
+    pull: to 0, of all weights but the constants.
+    folds: of scans, for the scores.
+    """
+
+    task: str = "wall_doors"
+    name: str = "wall_doors"
+    data: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    pull: float = 1.0
+    folds: int = 5
+    watch: str = "precision"
+
+
+@dataclass
+class DoorClassification(NetworkTask):
+    """Args:
+    hidden: units of each network; networks: that are averaged.
+    noise: standard deviations that features jitter by while training.
+    """
+
+    task: str = "door_classification"
+    name: str = "door_classification"
+    data: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    epochs: int = 60
+    batch: int = 256
+    rate: float = 5e-3
+    decay: float = 3e-2
+    hidden: int = 16
+    networks: int = 5
+    noise: float = 0.1
+    watch: str = "auc"

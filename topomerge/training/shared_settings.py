@@ -1,0 +1,57 @@
+"""Settings that all tasks of `train.py` share, and those of the ones that train a network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass
+class TaskSettings:
+    """What every task has.
+
+    Args:
+        task: which of the learned parts.
+        name: of the run; its folder is `runs`/`name`.
+        cache: folder of the data, which is made where it is missing, by so many processes (`jobs`), or those of a Dask cluster.
+        part: [k, n]: make every n-th item of the data from the k-th on, for machines that share nothing.
+        resume: go on where the run of this name stopped.
+        export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
+    """
+
+    task: str = ""
+    name: str = "run"
+    runs: str = "runs"
+    cache: str = "cache"
+    seed: int = 0
+    jobs: int = 1
+    cluster: str | None = None
+    part: list[int] = field(default_factory=lambda: [1, 1])
+    resume: bool = False
+    tensorboard: bool = True
+    export: str = ""
+
+    @property
+    def folder(self) -> Path:
+        """Where the run is written."""
+        return Path(self.runs) / self.name
+
+
+@dataclass
+class NetworkTask(TaskSettings):
+    """What tasks that train a network have besides.
+
+    Args:
+        epochs: at most; rate: of learning; decay: of weights; batch: examples a step.
+        patience: epochs without a better validation after which it ends; 0: never.
+        hold_out: every n-th scan is watched and trains nothing.
+        watch: what is best: a score of validation.
+    """
+
+    epochs: int = 10
+    batch: int = 8
+    rate: float = 2e-3
+    decay: float = 1e-3
+    patience: int = 0
+    hold_out: int = 8
+    watch: str = ""

@@ -1,0 +1,97 @@
+"""Task `wall_doors`: how much what plans and what walls show says of a door (`extraction.elevations.wall_doors`).
+
+The extraction's candidates in scans that did not train the network of elevations, which ships; a candidate is a door where a true
+one lies as near as the doors of a map must lie to be right. There is a logistic model for each of what shows it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sklearn.linear_model import LogisticRegression
+
+from topomerge.datasets.pairs.plan_examples import PlanRecipe
+from topomerge.datasets.pairs.wall_examples import build_walls, load_walls
+from topomerge.errors import InputError
+from topomerge.extraction.elevations.wall_doors import DOOR_FEATURES, SOURCES, DoorCandidates, door_candidates, door_chance
+from topomerge.metrics import match_places
+from topomerge.training.closed_form import Fitted, calibration_error, run_fit
+from topomerge.training.loop import Say
+from topomerge.training.scan_settings import WallDoors
+from topomerge.types import Array
+
+Candidates = tuple[DoorCandidates, Array]  # of a scan, and (n,) which are doors
+
+
+def fit(settings: WallDoors, say: Say) -> dict[str, float]:
+    """Fit the models; the scores of left-out scans."""
+    return run_fit(settings, fit_doors, say)
+
+
+def fit_doors(settings: WallDoors, say: Say) -> Fitted:
+    """Weights of the three models from all scans, and scores of those that were fitted without each scan."""
+    scans = candidates_of(settings.data, settings, say)
+    parts = [scans[k :: settings.folds] for k in range(settings.folds)]
+    left_out = []
+    for k, part in enumerate(parts):
+        weights = doors_model([scan for j, other in enumerate(parts) if j != k for scan in other], settings.pull)
+        left_out += [(door_chance(c, weights), y) for c, y in part]
+    origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(scans)}
+    return Fitted(doors_model(scans, settings.pull), door_figures(left_out), origin)
+
+
+def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Candidates]:
+    """The candidates of each scan of a set, by the network of elevations that ships.
+
+    Raises:
+        InputError: too few scans.
+    """
+    paths, _ = build_walls(recipe, settings, say)
+    scans = []
+    for path in paths:
+        example = load_walls(path)
+        candidates = door_candidates(example.map, example.elevations)
+        right = np.zeros(len(candidates.edges), bool)
+        right[match_places(example.doors, candidates.edges["centre"])[:, 1]] = True
+        scans.append((candidates, right))
+    if len(scans) < settings.folds:
+        raise InputError(f"data.scans={recipe.scans}: too few scans for {settings.folds} folds")
+    return scans
+
+
+def doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[float]]:
+    """Of each of `SOURCES` a constant and the weights of `DOOR_FEATURES`."""
+    x = np.concatenate([c.features for c, _ in scans])
+    y, source = np.concatenate([y for _, y in scans]), np.concatenate([c.source for c, _ in scans])
+    weights = {}
+    for k, name in enumerate(SOURCES):
+        own = source == k
+        share = float(np.clip(y[own].mean(), 0.01, 0.99)) if own.any() else 0.5
+        row = [float(np.log(share / (1 - share))), *[0.0] * len(DOOR_FEATURES)]
+        if 0 < y[own].sum() < own.sum():
+            model = LogisticRegression(C=1 / pull, max_iter=5000).fit(x[own], y[own])
+            row = [float(model.intercept_[0]), *model.coef_[0].tolist()]
+        weights[name] = np.round(row, 3).tolist()
+    return weights
+
+
+def door_figures(scans: Sequence[tuple[Array, Array]]) -> dict[str, float]:
+    """Calibration error, precision and recall of the candidates at .5."""
+    p, y = (np.concatenate(arrays) for arrays in zip(*scans, strict=True))
+    said = p >= 0.5
+    return {
+        "calibration_error": calibration_error(p, y),
+        "precision": float(y[said].mean()) if said.any() else 0.0,
+        "recall": float(said[y].mean()) if y.any() else 0.0,
+        "candidates": float(len(y)),
+    }
+
+
+def judge(settings: WallDoors, file: Path, say: Say) -> dict[str, Any]:
+    """Scores of weights on scans of buildings that trained nothing."""
+    weights = json.loads(file.read_text(encoding="utf-8"))
+    return door_figures([(door_chance(c, weights), y) for c, y in candidates_of(settings.heldout, settings, say)])

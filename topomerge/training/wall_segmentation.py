@@ -1,0 +1,157 @@
+"""Task `wall_segmentation`: the network that says what is in each place along a wall (`extraction.elevations.wall_network`).
+
+Stretches of the walls of simulated scans, mirrored, seen from a little nearer or farther, with points taken away now and then.
+Every n-th scan is watched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from topomerge.datasets.pairs.wall_examples import WallExample, build_walls, load_walls
+from topomerge.errors import InputError
+from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, STRIP_CHANNELS, WALL_CLASSES
+from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities, read_network
+from topomerge.io import archive
+from topomerge.models.wall_network import WallNetwork, exported_network
+from topomerge.training.loop import Say, State, mixed
+from topomerge.training.networks import NetworkJob, run_network
+from topomerge.training.scan_settings import WallAugment, WallSegmentation
+from topomerge.types import Array
+
+Stretch = tuple[Array, Array, Array]  # strip, truth and weight of each place
+
+
+def fit(settings: WallSegmentation, say: Say) -> dict[str, float]:
+    """Train; the scores of the best epoch.
+
+    Raises:
+        InputError: no scan to train on or to watch.
+    """
+    paths, _ = build_walls(settings.data, settings, say)
+    scans = [load_walls(path) for path in paths]
+    watched, learned = scans[:: settings.hold_out], [s for k, s in enumerate(scans) if k % settings.hold_out]
+    if not learned or not watched:
+        raise InputError(f"data.scans={settings.data.scans}: too few scans to train on some and watch others")
+    torch.manual_seed(mixed(settings.seed))
+    job = WallJob(settings, learned, watched)
+    say(f"{len(learned)} scans, {sum(p.numel() for p in job.network.parameters())} weights")
+    return run_network(job, settings, settings.steps, say)
+
+
+class WallJob(NetworkJob):
+    """Stretches of walls, most of them about a door or a window."""
+
+    def __init__(self, settings: WallSegmentation, learned: Sequence[WallExample], watched: Sequence[WallExample]) -> None:
+        origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(learned), "watched": len(watched)}
+        super().__init__(settings, WallNetwork(settings.widths), origin)
+        self.options, self.learned, self.watched = settings, learned, watched
+        self.holes = [np.flatnonzero(np.diff(scan.truth.astype(int)) != 0) for scan in learned]
+
+    def batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
+        """Stretches, from a generator of each step."""
+        self.network.train()
+        options = self.options
+        for step in range(state.step, options.steps):
+            rng = np.random.default_rng([options.seed, 1, state.epoch, step])
+            stretches = []
+            for row in rng.integers(len(self.learned), size=options.batch).tolist():
+                scan, holes = self.learned[row], self.holes[row]
+                middle = int(rng.integers(len(scan.truth)))
+                if len(holes) and rng.random() < options.at_holes:
+                    middle = int(rng.choice(holes) + rng.integers(-options.length // 3, options.length // 3 + 1))
+                stretches.append(stretch(scan, middle, options, rng))
+            x, truth, weight = (np.stack(arrays) for arrays in zip(*stretches, strict=True))
+            yield torch.from_numpy(x).permute(0, 3, 1, 2), torch.from_numpy(truth), torch.from_numpy(weight)
+
+    def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
+        """One step of the optimizer."""
+        x, truth, weight = batch
+        each = functional.cross_entropy(self.network(x), truth, reduction="none")
+        return self.descend((each * weight).sum() / weight.sum(), self.options, state)
+
+    def size(self, batch: tuple[torch.Tensor, ...]) -> int:
+        """Stretches."""
+        return len(batch[0])
+
+    def weights(self) -> dict[str, Array]:
+        """As the package reads them: half precision, normalisation in them."""
+        assert isinstance(self.network, WallNetwork)
+        self.network.eval()
+        return {name: values.astype(np.float16) for name, values in exported_network(self.network).items()}
+
+    def scores(self) -> dict[str, float]:
+        """Of the scans that are watched."""
+        return wall_scores(self.watched, {name: values.astype(np.float32) for name, values in self.weights().items()})
+
+    def write_weights(self, path: Path) -> None:
+        """An archive of arrays."""
+        archive.write(self.weights(), path)
+
+
+def answers(truth: Array, strips: Array) -> tuple[Array, Array]:
+    """(n / 2,) class of each answer, that of its first element, and was anything seen there?"""
+    there = strips.reshape(len(strips), -1).any(axis=1)
+    return truth[::PLACES].astype(np.int64), there.reshape(-1, PLACES).any(axis=1)
+
+
+def stretch(scan: WallExample, middle: int, options: WallSegmentation, rng: np.random.Generator) -> Stretch:
+    """A stretch of the wall that holds a place, changed as other scans might show it.
+
+    Args:
+        middle: a place of the scan's strips.
+    """
+    wall = int(np.clip(np.searchsorted(scan.first, middle, "right") - 1, 0, len(scan.first) - 2))
+    low, high = int(scan.first[wall]), int(scan.first[wall + 1])
+    start = max(min(middle - int(rng.integers(options.length)), high - options.length), low) & ~1
+    start = max(start, low)
+    stop = min(start + options.length, high)
+    x = np.zeros((options.length, DEPTHS, STRIP_CHANNELS), np.float32)
+    truth, weight = np.zeros(options.length, np.uint8), np.zeros(options.length // PLACES, np.float32)
+    x[: stop - start], truth[: stop - start] = scan.strips[start:stop] / np.float32(255), scan.truth[start:stop]
+    right, there = answers(truth, x)
+    weight[: (stop - start) // PLACES] = 1.0
+    weight *= np.array(options.classes, np.float32)[right] * np.where(there, 1.0, options.unseen)
+    if rng.random() < 0.5:
+        x, right, weight = x[::-1], right[::-1], weight[::-1]
+    return _spoilt(x, options.augment, rng), np.ascontiguousarray(right), np.ascontiguousarray(weight, np.float32)
+
+
+def _spoilt(x: Array, augment: WallAugment, rng: np.random.Generator) -> Array:
+    """A strip with its face somewhat nearer or farther, without some of its points, and with what stands before it hidden."""
+    x = np.roll(x, int(rng.integers(-augment.shift, augment.shift + 1)), axis=1)
+    if rng.random() < augment.sparse:
+        x = x * (rng.random(x.shape) > rng.uniform(0, augment.lost)).astype(np.float32)
+    if rng.random() < augment.hidden:
+        start, length = int(rng.integers(len(x))), int(rng.integers(4, len(x) // 2))
+        x = x.copy()
+        x[start : start + length, :, : int(rng.integers(1, BANDS))] = 0
+    if rng.random() < augment.walk:
+        x = x.copy()
+        x[..., BANDS:] = 0
+    return np.ascontiguousarray(x)
+
+
+def wall_scores(examples: Sequence[WallExample], weights: dict[str, Array]) -> dict[str, float]:
+    """F1 of each class over the places where anything was seen, and the mean of those of doors."""
+    table = np.zeros((len(WALL_CLASSES), len(WALL_CLASSES)), np.int64)
+    for scan in examples:
+        for low, high in zip(scan.first[:-1], scan.first[1:], strict=True):
+            strip = scan.strips[low:high] / np.float32(255)
+            right, there = answers(scan.truth[low:high], strip)
+            np.add.at(table, (right[there], place_probabilities(strip, weights).argmax(axis=1)[there]), 1)
+    f1 = 2 * np.diag(table) / np.maximum(table.sum(axis=0) + table.sum(axis=1), 1)
+    scores = {f"f1_{name}": float(v) for name, v in zip(WALL_CLASSES, f1, strict=True)}
+    return {**scores, "f1_doors": float((scores["f1_open"] + scores["f1_shut"]) / 2)}
+
+
+def judge(settings: WallSegmentation, file: Path, say: Say) -> dict[str, Any]:
+    """Scores of weights on scans of buildings that trained nothing."""
+    paths, _ = build_walls(settings.heldout, settings, say)
+    return {**wall_scores([load_walls(path) for path in paths], read_network(file)), "scans": len(paths)}
