@@ -62,9 +62,7 @@ def leaf_yaw(door: Array, pivot: Array, angle: float) -> float:
     return float(np.arctan2(reach[1], reach[0]))
 
 
-def _leaves(
-    soup: Soup, things: list[tuple], spaces: list[Space], doors: Array, frames: float, rng: np.random.Generator
-) -> None:
+def _leaves(soup: Soup, things: list[tuple], spaces: list[Space], doors: Array, frames: float, rng: np.random.Generator) -> None:
     """One leaf a door, two for wide ones, hung so that it swings into the room and not into the corridor.
 
     Args:

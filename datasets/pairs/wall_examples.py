@@ -48,9 +48,9 @@ DRAWN_EVERY = 8  # seeds: one is a grid map of the plan, as robots and draughtsm
 EXACT_SHARE = 0.5  # of the scans without drift
 DEEP = 0.3  # m beside a wall's middle: a strip there is of that wall
 ASKEW = 0.26  # sine of the angle between a wall and a strip along it
-LEVEL_TOLERANCE = 0.6  # m between floors of one storey
+SAME_FLOOR = 0.6  # m between floors of one storey
 WALL_ARRAYS = ("first", "strips", "truth", "doors", "faces")
-MAP_ARRAYS, ROOM_COLUMNS = ("edges", "storeys", "navigable_room"), ("storey", "completeness")
+MAP_ARRAYS, ROOMS_HELD = ("edges", "storeys", "navigable_room"), ("storey", "completeness")
 LOW_SILL = 0.3  # m: panes that begin lower are walls of glass
 
 
@@ -118,7 +118,7 @@ def wall_arrays(item: WallItem, example: WallExample) -> dict[str, Array]:
     about = {"file": f"{item.name}.npz", **asdict(item), "sources": [example.source]}
     arrays: dict[str, Any] = {name: getattr(example, name) for name in WALL_ARRAYS}
     arrays |= {f"map.{name}": getattr(example.map, name) for name in MAP_ARRAYS}
-    arrays |= {f"rooms.{name}": example.map.rooms[name] for name in ROOM_COLUMNS}
+    arrays |= {f"rooms.{name}": example.map.rooms[name] for name in ROOMS_HELD}
     floor = example.map.navigable
     arrays |= {"floor.cells": floor.cells, "floor.origin": floor.origin, "floor.edge": np.array(floor.edge)}
     return {**arrays, "source": np.array(example.source), "about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
@@ -135,7 +135,7 @@ def load_walls(path: Path) -> WallExample:
     grid, none = floor.with_cells(np.zeros((0, 3), np.int32)), np.zeros(0, np.int32)
     edges, storeys, room = (arrays[f"map.{name}"] for name in MAP_ARRAYS)
     rooms = np.zeros(len(arrays["rooms.storey"]), ROOM_DTYPE)
-    for name in ROOM_COLUMNS:
+    for name in ROOMS_HELD:
         rooms[name] = arrays[f"rooms.{name}"]
     map = TopometricMap(grid, none, floor, room, rooms, edges, storeys)
     return WallExample(**{name: arrays[name] for name in WALL_ARRAYS}, map=map, source=str(arrays["source"]))
@@ -204,7 +204,7 @@ def true_classes(building: Building, walls: Elevations, frame: Sim3, shift: tupl
             off = at[:, :2] - (x, y)
             across, beside = np.abs(off @ normal), np.abs(off @ (-normal[1], normal[0]))
             within = (across < thickness / 2 + DEEP) & (beside < width / 2) & (np.abs(along @ normal) < ASKEW)
-            truth[within & (np.abs(at[:, 2] - z) < LEVEL_TOLERANCE)] = WALL_CLASSES.index(name)
+            truth[within & (np.abs(at[:, 2] - z) < SAME_FLOOR)] = WALL_CLASSES.index(name)
     return truth
 
 

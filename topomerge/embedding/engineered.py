@@ -133,7 +133,7 @@ def roughness(points: Array) -> float:
 
 def _graph_features(map: TopometricMap) -> Array:
     """(R, 6) float64 in the order of `GRAPH_FEATURES`."""
-    rooms, edges, count = map.rooms, map.edges, len(map.rooms)
+    rooms, edges, count = map.rooms, map.open_edges, len(map.rooms)
     ends = edges["rooms"].reshape(-1, 2)
     pairs = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
     flat = np.isin(edges["kind"], ("door", "opening"))

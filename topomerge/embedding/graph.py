@@ -63,9 +63,9 @@ def graph_arrays(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> 
     """
     if points_per_room < 1:
         raise InputError(f"points per room must be 1 or more, not {points_per_room}")
-    ends = map.edges["rooms"].astype(np.int64).reshape(-1, 2)
+    ends = map.open_edges["rooms"].astype(np.int64).reshape(-1, 2)
     index = np.concatenate([ends, ends[:, ::-1]]).T.copy()
-    doors = np.concatenate([map.edges, map.edges])
+    doors = np.concatenate([map.open_edges, map.open_edges])
     floors, spread, sides = _floors(map)
     pairs = _door_pairs(index[0])
     return {

@@ -130,7 +130,8 @@ def _between(profile: Array, low: float, high: float) -> Array:
 
 def _doors(map: TopometricMap, storey: int) -> Array:
     """(n, 2) m, middles of the doors of a storey's rooms."""
-    centres: Array = map.edges["centre"][(map.rooms["storey"][map.edges["rooms"]] == storey).any(axis=1), :2]
+    edges = map.open_edges
+    centres: Array = edges["centre"][(map.rooms["storey"][edges["rooms"]] == storey).any(axis=1), :2]
     return centres
 
 

@@ -11,7 +11,7 @@ from topomerge.extraction.free_space import free_space
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, chosen_parameters
 from topomerge.extraction.plans.plan_rooms import rooms_of_plans
-from topomerge.extraction.scan import read_scan
+from topomerge.extraction.scan import Scan, read_scan
 from topomerge.extraction.slices import with_raised_slice
 from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import topometric_map
@@ -64,12 +64,10 @@ def extract(
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
 
-    if isinstance(p, DefaultParameters) and p.walls and scan.fine is not None:
+    if isinstance(p, DefaultParameters):
         watch.begin("doors on walls", 0.87)
-        map = with_wall_doors(map, scan.fine)
-    if isinstance(p, DefaultParameters) and scan.rays is not None:
-        map, doubt = with_walked_doors(map, scan.places)
-        scan = replace(scan, warnings=(*scan.warnings, *filter(None, [doubt])))
+        map, doubts = _with_more_doors(map, scan, p.walls)
+        scan = replace(scan, warnings=(*scan.warnings, *doubts))
 
     watch.begin("free space", 0.9)
     free = free_space(scan, navigable, p.range) if p.carve else scan.free
@@ -83,6 +81,14 @@ def extract(
         seconds=watch.end(),
         warnings=(*scan.warnings, *_doubts(map)),
     )
+
+
+def _with_more_doors(map: TopometricMap, scan: Scan, walls: bool) -> tuple[TopometricMap, tuple[str, ...]]:
+    """The map with the doors that its walls show, and those that the sensor was carried through; and what is odd about them."""
+    if walls and scan.fine is not None:
+        map = with_wall_doors(map, scan.fine)
+    map, doubt = with_walked_doors(map, scan.places)
+    return map, (doubt,) if doubt else ()
 
 
 def _doubts(map: TopometricMap) -> list[str]:

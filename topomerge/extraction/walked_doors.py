@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
 
-STRIDE = 1.5  # m between two places of the sensor: farther apart they are no way
+WAY_STEP = 1.5  # m between two places of the sensor: farther apart they are no way
 SENSOR_HEIGHT = (0.2, 2.2)  # m of a carried sensor above the floor
 STOOD = 0.35  # m from above: a place this near to a floor stands on it
 SAME_DOOR = 1.2  # m between where a door is and where somebody changed rooms
@@ -44,7 +44,7 @@ def with_walked_doors(map: TopometricMap, places: Array) -> tuple[TopometricMap,
 
 def room_changes(map: TopometricMap, places: Array) -> list[tuple[tuple[int, int], Array, Array]]:
     """Rooms (the smaller number first) between which a sensor was carried, with the last place in the one and the first in the
-    other, m. Places above no floor are passed over; a way ends where the next place is farther than `STRIDE`."""
+    other, m. Places above no floor are passed over; a way ends where the next place is farther than `WAY_STEP`."""
     places = np.asarray(places, np.float64)
     places = places[np.isfinite(places).all(axis=1)]
     room = rooms_under(map, places)
@@ -52,10 +52,10 @@ def room_changes(map: TopometricMap, places: Array) -> list[tuple[tuple[int, int
     last, walked = -1, 0.0
     for i in range(len(places)):
         step = float(np.hypot(*(places[i] - places[i - 1])[:2])) if i else 0.0
-        walked = walked + step if step <= STRIDE else np.inf
+        walked = walked + step if step <= WAY_STEP else np.inf
         if room[i] < 0:
             continue
-        if last >= 0 and room[i] != room[last] and walked <= 2 * STRIDE:
+        if last >= 0 and room[i] != room[last] and walked <= 2 * WAY_STEP:
             pair = sorted((int(room[last]), int(room[i])))
             changes.append(((pair[0], pair[1]), places[last], places[i]))
         last, walked = i, 0.0

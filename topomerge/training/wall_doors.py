@@ -17,7 +17,7 @@ from sklearn.linear_model import LogisticRegression
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import build_walls, load_walls
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.wall_doors import DOOR_FEATURES, SOURCES, DoorCandidates, door_candidates, door_chance
+from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
 from topomerge.metrics import match_places
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
@@ -64,14 +64,14 @@ def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Can
 
 
 def doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[float]]:
-    """Of each of `SOURCES` a constant and the weights of `DOOR_FEATURES`."""
+    """Of each of `SOURCES` a constant and the weights of `WALL_DOOR_FEATURES`."""
     x = np.concatenate([c.features for c, _ in scans])
     y, source = np.concatenate([y for _, y in scans]), np.concatenate([c.source for c, _ in scans])
     weights = {}
     for k, name in enumerate(SOURCES):
         own = source == k
         share = float(np.clip(y[own].mean(), 0.01, 0.99)) if own.any() else 0.5
-        row = [float(np.log(share / (1 - share))), *[0.0] * len(DOOR_FEATURES)]
+        row = [float(np.log(share / (1 - share))), *[0.0] * len(WALL_DOOR_FEATURES)]
         if 0 < y[own].sum() < own.sum():
             model = LogisticRegression(C=1 / pull, max_iter=5000).fit(x[own], y[own])
             row = [float(model.intercept_[0]), *model.coef_[0].tolist()]

@@ -116,6 +116,12 @@ class TopometricMap:
         require(not len(storey) or (storey.min() >= 0 and storey.max() < len(self.storeys)), "a room's storey is missing")
         require(self.provenance is None or len(self.provenance) == len(self.grid), "provenance: one value a cell")
 
+    @property
+    def open_edges(self) -> Array:
+        """The edges that one can walk through: what networks and features of rooms see, as a shut door shows in few maps."""
+        out: Array = self.edges[self.edges["open"]]
+        return out
+
     def storey_of_cells(self) -> Array:
         """(n,) int32 storey of each occupied cell: its room's, or for a cell without a room the last one whose floor is
         not above it."""

@@ -10,7 +10,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.elevations import wall_doors
 from topomerge.extraction.elevations.doorways import doorways
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, Elevations
-from topomerge.extraction.elevations.wall_doors import DOOR_FEATURES, SOURCES, DoorCandidates, door_candidates, door_chance
+from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
 from topomerge.extraction.elevations.wall_network import read_network
 
 STEP = 2 * ALONG
@@ -73,7 +73,7 @@ def test_a_door_of_the_plan_lies_where_the_wall_shows_it():
     (edge,) = candidates.edges
     assert candidates.source.tolist() == [SOURCES.index("both")] and edge["centre"][0] == pytest.approx(2.45)
     assert edge["width"] == pytest.approx(0.855) and edge["rooms"].tolist() == [0, 1]
-    at = dict(zip(DOOR_FEATURES, candidates.features[0], strict=True))
+    at = dict(zip(WALL_DOOR_FEATURES, candidates.features[0], strict=True))
     assert at["plan"] == pytest.approx(0.9) and at["wall"] == pytest.approx(0.95) and at["apart"] == pytest.approx(0.05, abs=0.02)
 
 
@@ -85,7 +85,7 @@ def test_a_shut_door_that_the_wall_alone_shows_joins_the_rooms_on_its_two_sides(
     edge = candidates.edges[1]
     assert edge["rooms"].tolist() == [0, 1] and not edge["open"] and edge["kind"] == "door"
     assert edge["direction"] == pytest.approx(np.pi / 2)
-    near, covered = (candidates.features[0][DOOR_FEATURES.index(name)] for name in ("near", "covered"))
+    near, covered = (candidates.features[0][WALL_DOOR_FEATURES.index(name)] for name in ("near", "covered"))
     assert near == 0 and covered == 1
 
 
@@ -96,8 +96,8 @@ def test_a_doorway_into_nothing_joins_nothing():
 
 
 def test_a_model_each_for_what_shows_a_door():
-    candidates = DoorCandidates(seen(chances(8)).edges[[0, 0, 0]], np.eye(3, len(DOOR_FEATURES)), np.arange(3))
-    zeros = [0.0] * len(DOOR_FEATURES)
+    candidates = DoorCandidates(seen(chances(8)).edges[[0, 0, 0]], np.eye(3, len(WALL_DOOR_FEATURES)), np.arange(3))
+    zeros = [0.0] * len(WALL_DOOR_FEATURES)
     models = {"both": [0.0, 2.0, *zeros[1:]], "plan": [-1.0, *zeros], "wall": [1.0, *zeros]}
     assert door_chance(candidates, models) == pytest.approx(1 / (1 + np.exp([-2.0, 1.0, -1.0])))
 

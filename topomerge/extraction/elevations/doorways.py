@@ -18,7 +18,7 @@ DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of 
 LEAST_WIDTH = 0.45  # m
 HALF_WALL = 0.06  # m from the face of a wall to its middle, where one face was seen only
 SAME_DOORWAY = 0.45  # m between what two faces show of one doorway
-LEVEL = 0.5  # m between their floors
+DOORWAY_LEVEL = 0.5  # m between their floors
 OPEN, SHUT = WALL_CLASSES.index("open"), WALL_CLASSES.index("shut")
 DOORWAY_DTYPE = np.dtype(
     [
@@ -81,7 +81,7 @@ def _joined(rows: Array) -> Array:
     """What several faces show of one doorway as one row, the likeliest first."""
     if len(rows) < 2:
         return rows
-    place = np.column_stack([rows["centre"][:, :2], rows["centre"][:, 2] * (SAME_DOORWAY / LEVEL)])
+    place = np.column_stack([rows["centre"][:, :2], rows["centre"][:, 2] * (SAME_DOORWAY / DOORWAY_LEVEL)])
     of = fcluster(linkage(place, "average"), SAME_DOORWAY, "distance")
     out = np.array([_one(rows[of == k]) for k in np.unique(of)], DOORWAY_DTYPE)
     return out[np.argsort(-out["probability"], kind="stable")]

@@ -19,11 +19,11 @@ from topomerge.structure.floors import room_levels
 from topomerge.structure.lines import Line, main_direction, straight_lines
 from topomerge.types import Array, TopometricMap, VoxelGrid
 
-ALONG, ACROSS, UP = 0.05, 0.025, 0.2  # m, of an element
+ALONG, ACROSS, UPWARDS = 0.05, 0.025, 0.2  # m, of an element
 BEFORE, BEHIND = 0.3, 0.5  # m on both sides of a face
 LOWEST, HIGHEST = -0.1, 2.5  # m above the floor
 PAST_ENDS = 1.2  # m by which a strip goes on past both ends of its face
-DEPTHS, BANDS = round((BEFORE + BEHIND) / ACROSS), round((HIGHEST - LOWEST) / UP)
+DEPTHS, BANDS = round((BEFORE + BEHIND) / ACROSS), round((HIGHEST - LOWEST) / UPWARDS)
 STRIP_CHANNELS = BANDS + 1  # and where one can walk
 FULL = 0.75  # of the cells of a flat surface that make an element full
 SIDE_REACH = (0.15, 0.6)  # m from a face: where its room's floor lies
@@ -66,14 +66,14 @@ def wall_elevations(map: TopometricMap, cells: VoxelGrid) -> Elevations:
     faces = wall_faces(map)
     sizes = 2 * np.ceil(faces["length"] / ALONG / 2).astype(np.int64)
     frames = np.column_stack([faces["start"] - BEFORE * faces["out"], faces["along"], faces["out"], faces["floor"] + LOWEST])
-    step = np.array([ALONG, ACROSS, UP])
+    step = np.array([ALONG, ACROSS, UPWARDS])
     solid = fill_strips(np.ascontiguousarray(cell_middles(cells)), frames, sizes, (DEPTHS, BANDS), step, TILE)
     floor = map.navigable.centroids()
     standing = map.navigable.properties.get("standing")
     floor = floor if standing is None else floor[standing.astype(bool)]
-    frames[:, 6] -= BANDS * UP / 2 + LOWEST  # one band about the floor
-    walk = fill_strips(floor, frames, sizes, (DEPTHS, 1), np.array([ALONG, ACROSS, BANDS * UP]), TILE)
-    flat = ALONG * UP / cells.edge**2  # cells of a wall that an element holds
+    frames[:, 6] -= BANDS * UPWARDS / 2 + LOWEST  # one band about the floor
+    walk = fill_strips(floor, frames, sizes, (DEPTHS, 1), np.array([ALONG, ACROSS, BANDS * UPWARDS]), TILE)
+    flat = ALONG * UPWARDS / cells.edge**2  # cells of a wall that an element holds
     edge = map.navigable.edge
     strips = np.concatenate([solid / (FULL * flat), walk / (FULL * ALONG * ACROSS / edge**2)], axis=2)
     return Elevations(faces, np.concatenate([[0], np.cumsum(sizes)]), np.minimum(strips, 1.0))

@@ -22,7 +22,7 @@ from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap, VoxelGrid
 
 WALL_DOORS_FILE = "wall_doors.json"
-DOOR_FEATURES = (
+WALL_DOOR_FEATURES = (
     "wall",  # probability of a door that the wall shows, the highest along it
     "wall_mean",  # and on average
     "both_sides",  # 0 or 1: seen on two faces
@@ -36,7 +36,7 @@ DOOR_FEATURES = (
     "wide",  # 0 or 1: an opening
 )
 SOURCES = ("both", "plan", "wall")  # what shows a door: there is a model for each
-REACH = 1.0  # m between a door of the plan and the same one on the wall
+WALL_DOOR_REACH = 1.0  # m between a door of the plan and the same one on the wall
 BEYOND = (0.1, 1.0)  # m from a wall: there the other room begins
 NEAR = 0.3  # m around a door of the plan
 STOOD = 0.12  # m from the middle of a cell of a floor
@@ -48,7 +48,7 @@ class DoorCandidates:
 
     Args:
         edges: (n,) EDGE_DTYPE.
-        features: (n, 11) `DOOR_FEATURES`.
+        features: (n, 11) `WALL_DOOR_FEATURES`.
         source: (n,) int8, index into `SOURCES`.
     """
 
@@ -78,7 +78,7 @@ def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]
     """(n,) probability that each is a door.
 
     Args:
-        models: of each of `SOURCES` a constant and the weights of `DOOR_FEATURES`; None: those that ship.
+        models: of each of `SOURCES` a constant and the weights of `WALL_DOOR_FEATURES`; None: those that ship.
 
     Raises:
         InputError: the weights that ship are damaged.
@@ -116,7 +116,7 @@ def door_candidates(map: TopometricMap, walls: Elevations) -> DoorCandidates:
             features.append([*_seen(way), 0, 0, 1, *_size(way["width"], complete, 0)])
             source.append(SOURCES.index("wall"))
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
-    return DoorCandidates(table, np.array(features, float).reshape(-1, len(DOOR_FEATURES)), np.array(source, np.int8))
+    return DoorCandidates(table, np.array(features, float).reshape(-1, len(WALL_DOOR_FEATURES)), np.array(source, np.int8))
 
 
 def _seen(way: Array) -> list[float]:
@@ -124,7 +124,7 @@ def _seen(way: Array) -> list[float]:
 
 
 def _size(width: float, complete: float, apart: float) -> tuple[float, ...]:
-    """The last four of `DOOR_FEATURES`."""
+    """The last four of `WALL_DOOR_FEATURES`."""
     odd = abs(float(np.log(max(float(width), 0.1) / 0.9)))
     return odd, complete, apart, float(width > DOOR_MOST_WIDTH)
 
@@ -158,13 +158,13 @@ def _partners(edges: Array, ways: Array) -> Array:
     if not len(edges) or not len(ways):
         return partner
     apart = np.linalg.norm(edges["centre"][:, None, :2] - ways["centre"][None, :, :2], axis=2)
-    level = np.abs(edges["centre"][:, None, 2] - ways["centre"][None, :, 2]) < REACH
+    level = np.abs(edges["centre"][:, None, 2] - ways["centre"][None, :, 2]) < WALL_DOOR_REACH
     first, second = ways["rooms"].T
     pair = edges["rooms"][:, None]
     fits = (pair == first[:, None]).any(axis=2) & ((second < 0) | (pair == second[:, None]).any(axis=2))
     apart = np.where(fits & level, apart, np.inf)
     for i, j in np.column_stack(np.unravel_index(np.argsort(apart, axis=None, kind="stable"), apart.shape)).tolist():
-        reach = max(REACH, float(edges["width"][i]) / 2 + NEAR)
+        reach = max(WALL_DOOR_REACH, float(edges["width"][i]) / 2 + NEAR)
         if apart[i, j] < reach and partner[i] < 0 and j not in partner:
             partner[i] = j
     return partner
@@ -200,7 +200,7 @@ def _near(walls: Elevations, doors: Array, edge: Array) -> tuple[float, float]:
     at = edge["centre"][:2] - walls.faces["start"]
     t = (at * walls.faces["along"]).sum(axis=1)
     off = (at * walls.faces["out"]).sum(axis=1)
-    level = np.abs(walls.faces["floor"] - edge["centre"][2]) < REACH
+    level = np.abs(walls.faces["floor"] - edge["centre"][2]) < WALL_DOOR_REACH
     beside = (off > -BEFORE) & (off < BEHIND) & (t > 0) & (t < walls.faces["length"]) & level
     for f in np.flatnonzero(beside).tolist():
         first, last = int(walls.first[f]) // PLACES, int(walls.first[f + 1]) // PLACES
