@@ -84,7 +84,10 @@ def test_bending_by_nothing_gives_the_same_bytes(halves, straight):
         bent = fuse(halves, poses, {0: still, 1: still})
         for name in ("room", "provenance", "rooms", "edges", "navigable_room"):
             assert getattr(bent, name).tobytes() == getattr(straight, name).tobytes(), name
-        assert bent.grid.cells.tobytes() == straight.grid.cells.tobytes() and bent.free.cells.tobytes() == straight.free.cells.tobytes()
+        assert (
+            bent.grid.cells.tobytes() == straight.grid.cells.tobytes()
+            and bent.free.cells.tobytes() == straight.free.cells.tobytes()
+        )
 
 
 def test_what_drift_bent_is_joined_as_if_it_were_straight(halves, straight):
