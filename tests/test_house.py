@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -51,9 +52,16 @@ def sources() -> list[tuple[str, str, Path]]:
     return found
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """A file's syntax tree, parsed once for all rules."""
+    return ast.parse(path.read_text())
+
+
+@cache
 def imports(path: Path) -> list[tuple[str, bool, int]]:
     """(module, at the top level of the file?, line) of every import, leaving out those for type checkers."""
-    tree = ast.parse(path.read_text())
+    tree = tree_of(path)
     checked = {
         id(n)
         for node in ast.walk(tree)
@@ -112,9 +120,7 @@ def test_every_package_is_shipped():
 
 def test_nothing_is_unpickled():
     for _, _, path in sources():
-        text = path.read_text()
-        tree = ast.parse(text)
-        for node in ast.walk(tree):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Call):
                 called = ast.unparse(node.func)
                 where = f"{path}:{node.lineno}"

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import topomerge
-from tests.test_house import ROOT, imports, sources
+from tests.test_house import ROOT, imports, sources, tree_of
 
 
 def module_of(path: Path) -> str:
@@ -31,7 +31,7 @@ def import_graph() -> dict[str, set[str]]:
             homes = (".".join(parts[:k]) for k in range(len(parts), 1, -1))
             home = next((h for h in homes if h in files), topomerge._HOMES.get(name.removeprefix("topomerge.")))
             graph[module] |= {home} if home and home != module else set()
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "topomerge":
                 home = topomerge._HOMES.get(node.attr)
                 graph[module] |= {home} if home and home != module else set()

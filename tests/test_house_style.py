@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import topomerge
+from tests.test_house import tree_of
 
 ROOT = Path(__file__).parent.parent
 LONGEST_FILE, LONGEST_FUNCTION, MOST_PARAMETERS = 300, 60, 8
@@ -38,7 +39,7 @@ def test_files_and_functions_are_short(path: Path) -> None:
     assert text.count("\n") <= LONGEST_FILE, f"{identify(path)} has {text.count(chr(10))} lines: split it by what it does"
     if path.parent.name == "kernels":  # compiled loops take plain arrays, many of them
         return
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             where = f"{identify(path)}:{node.lineno}: {node.name}"
             assert node.end_lineno is not None
@@ -68,14 +69,14 @@ def identifiers(tree: ast.AST) -> set[tuple[str, int]]:
 
 @pytest.mark.parametrize("path", FILES)
 def test_names_say_what_a_thing_is(path: Path) -> None:
-    vague = sorted((line, name) for name, line in identifiers(ast.parse(path.read_text())) if name.strip("_") in VAGUE)
+    vague = sorted((line, name) for name, line in identifiers(tree_of(path)) if name.strip("_") in VAGUE)
     assert not vague, f"{identify(path)}: {vague}: name the thing, not that it is there"
 
 
 def test_constants_are_qualified() -> None:
     homes: dict[str, set[str]] = defaultdict(set)
     for path in product_files():
-        for node in ast.parse(path.read_text()).body:
+        for node in tree_of(path).body:
             targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
             for name in (n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)):
                 if re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
@@ -86,7 +87,7 @@ def test_constants_are_qualified() -> None:
 
 def lines_of(path: Path) -> list[tuple[int, str]]:
     """(number, text) of the lines that do something: no blank ones, comments, imports or lone brackets."""
-    tree = ast.parse(path.read_text())
+    tree = tree_of(path)
     skipped: set[int] = set()
     for node in ast.walk(tree):
         body = getattr(node, "body", None)

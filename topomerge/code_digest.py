@@ -131,8 +131,14 @@ class _Source:
 
 @cache
 def _source(path: Path) -> _Source:
+    return _source_of(path.read_text(encoding="utf-8"))
+
+
+@cache
+def _source_of(text: str) -> _Source:
+    """Of a file's text: the same file of another copy of the package is not read a second time."""
     reading = _Reading()
-    reading.read(ast.parse(path.read_text(encoding="utf-8")))
+    reading.read(ast.parse(text))
     words = hashlib.sha256("\n".join(reading.words).encode())
     return _Source(words.hexdigest(), frozenset(reading.names), frozenset(reading.texts))
 

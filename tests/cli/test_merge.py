@@ -13,7 +13,7 @@ import pytest
 
 import topomerge
 from tests.fusion.plans_of import MOVE, office, part
-from tests.scenes import Scene
+from tests.scenes import two_rooms
 from topomerge.cli.main import main as cli
 
 Run = Callable[..., tuple[int, str, str]]
@@ -22,12 +22,11 @@ MERGE_FILES = ["map.tmap", "merge.json", "merged.ply", "report.html"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cloud of the west of an office, maps of its east and of another building, and a merge of the first two."""
+    """A cloud of the west of an office's southern rooms, maps of their east and of another building; the first two merged."""
     place = tmp_path_factory.mktemp("merge")
     points = office().points()
-    np.save(place / "a.npy", part(points, high=(16, 99)))
-    other = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,)).points()
-    for name, cloud in (("b", part(points, low=(5, -99))), ("c", other)):
+    np.save(place / "a.npy", part(points, high=(11, 9)))
+    for name, cloud in (("b", part(points, (3, -99), (14.5, 9))), ("c", two_rooms().points())):
         moved = MOVE.apply(cloud).astype(np.float32)
         topomerge.save_map(topomerge.extract(moved, name=f"{name}.ply"), place / f"{name}.tmap")
     assert cli(["merge", str(place / "a.npy"), str(place / "b.tmap"), "-o", str(place / "merged"), "-q"]) == 0

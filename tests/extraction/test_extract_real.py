@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.real_models import duplex, duplex_map
 from topomerge.extraction.extract import extract
-from topomerge.io.points import read_chunks, read_points
+from topomerge.io.points import read_chunks
 from topomerge.types import TopometricMap
 
 pytestmark = pytest.mark.data
@@ -42,8 +43,7 @@ def test_an_octree_map_keeps_its_free_space(data_dir: Path) -> None:
 
 def test_a_building_model(data_dir: Path) -> None:
     """Two flats of two storeys: every room that the model calls one and somebody can stand in lies in one room of its own."""
-    cloud = read_points(data_dir / "ifc_buildings" / "duplex.ifc")
-    result = extract(cloud)
+    cloud, result = duplex(data_dir), duplex_map(data_dir)
     assert len(result.storeys) == 2
     np.testing.assert_allclose(np.diff(result.storeys["floor"]), 3.1, atol=0.15)
     assert (result.edges["kind"] == "stairs").sum() == 2

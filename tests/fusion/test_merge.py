@@ -11,10 +11,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import topomerge as tm
-from tests.fusion.atlas.atlas_scenes import office_map
+from tests.fusion.atlas.atlas_scenes import REGISTRATIONS, office_map
 from tests.fusion.atlas.atlas_scenes import stranger as another
 from tests.fusion.plans_of import MOVE, off, office, part
-from tests.scenes import Scene
+from tests.scenes import Scene, two_rooms
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.solve import solve
 from topomerge.fusion.fuse import room_of_rooms
@@ -45,9 +45,13 @@ def merged(halves):
 
 
 @pytest.fixture(scope="module")
+def whole(points):
+    return map_of(points, "whole")
+
+
+@pytest.fixture(scope="module")
 def stranger():
-    other = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,))
-    return map_of(other.points(), "c.ply", MOVE)
+    return map_of(two_rooms().points(), "c.ply", MOVE)
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +95,7 @@ def walled(map: TopometricMap) -> np.ndarray:
     return np.sort(np.bincount(connected_components(links, directed=False)[1], map.rooms["area"]))
 
 
-def test_the_joined_map_has_the_rooms_of_the_whole(merged, points):
-    whole = map_of(points, "whole")
+def test_the_joined_map_has_the_rooms_of_the_whole(merged, whole):
     assert len(walled(merged.map)) == len(walled(whole)) == 9
     assert walled(merged.map) == pytest.approx(walled(whole), rel=0.07)
     assert merged.map.rooms["area"].sum() == pytest.approx(whole.rooms["area"].sum(), rel=0.05)
@@ -100,8 +103,8 @@ def test_the_joined_map_has_the_rooms_of_the_whole(merged, points):
     assert merged.map.source == "a.ply + b.ply" and merged.map.free is not None
 
 
-def test_the_joined_map_has_as_many_rooms_as_the_whole(merged, points):
-    assert len(merged.map.rooms) == len(map_of(points, "whole").rooms)
+def test_the_joined_map_has_as_many_rooms_as_the_whole(merged, whole):
+    assert len(merged.map.rooms) == len(whole.rooms)
 
 
 def test_the_other_way_round_is_the_inverse(merged, halves):
@@ -246,27 +249,21 @@ def test_bad_maps_are_refused(halves, stranger):
         MergeResult("perhaps", 0.5, "")
 
 
-def test_maps_with_one_room_or_none_are_tried(halves):
+def test_maps_with_one_room_or_none_are_tried(stranger):
     room = map_of(Scene().shell(0, 0, 5, 4).points(), "room.ply")
-    assert any("room.ply: has one room" in w for w in tm.merge([room, halves[0]]).warnings)
+    assert any("room.ply: has one room" in w for w in tm.merge([room, stranger]).warnings)
     empty = replace(room, rooms=room.rooms[:0], edges=room.edges[:0], areas=room.areas[:0], narrows=room.narrows[:0],
                     room=np.full_like(room.room, -1), navigable_room=np.full_like(room.navigable_room, -1),
                     navigable_area=np.full_like(room.navigable_area, -1))  # fmt: skip
-    result = tm.merge([empty, halves[0]], force=True)
+    result = tm.merge([empty, stranger], force=True)
     assert any("has no rooms" in w for w in result.warnings)
     assert not result.merged
 
 
-@pytest.fixture(scope="module")
-def registrations() -> dict:
-    """No registration is made twice."""
-    return {}
-
-
 @pytest.fixture
-def remembered(registrations, monkeypatch):
+def remembered(monkeypatch):
     """Merging makes no registration twice."""
-    monkeypatch.setattr("topomerge.fusion.merge.solve", lambda maps, settings, _: solve(maps, settings, registrations))
+    monkeypatch.setattr("topomerge.fusion.merge.solve", lambda maps, settings, _: solve(maps, settings, REGISTRATIONS))
 
 
 def test_three_maps_are_merged_by_an_atlas(tmp_path, remembered):

@@ -210,7 +210,7 @@ def test_ifc_is_valid(tmp_path, make, rules):
 def test_our_own_reader_finds_the_rooms_of_an_ifc(tmp_path, at):
     pytest.importorskip("ifcopenshell")
     map = two_floors(at)
-    cloud = topomerge.read_points(write(map, "ifc", tmp_path / "a.ifc"))
+    cloud = topomerge.read_points(write(map, "ifc", tmp_path / "a.ifc"), spacing=0.1)
     assert [r.name for r in cloud.rooms] == [f"room {r}" for r in range(6)]
     for room, rectangle in zip(cloud.rooms, rectangles(1, 2, at), strict=True):
         floor = shapely.Polygon(room.polygon)
@@ -224,7 +224,7 @@ def test_our_own_reader_finds_the_rooms_of_an_ifc(tmp_path, at):
 def test_a_model_of_a_map_gives_the_map_again(tmp_path):
     pytest.importorskip("ifcopenshell")
     first = topomerge.extract(corridor().points())
-    second = topomerge.extract(topomerge.read_points(write(first, "ifc", tmp_path / "a.ifc")))
+    second = topomerge.extract(topomerge.read_points(write(first, "ifc", tmp_path / "a.ifc"), spacing=0.05))
     assert len(second.rooms) == len(first.rooms) == 9 and len(second.edges) == len(first.edges) == 8
     apart = np.linalg.norm(first.rooms["centroid"][:, None] - second.rooms["centroid"], axis=2).min(axis=1)
     assert (apart < 0.2).all()
@@ -234,7 +234,7 @@ def test_a_model_of_a_map_gives_the_map_again(tmp_path):
 def test_both_storeys_come_again_from_a_model(tmp_path):
     pytest.importorskip("ifcopenshell")
     first = topomerge.extract(stair_scene().points())
-    second = topomerge.extract(topomerge.read_points(write(first, "ifc", tmp_path / "a.ifc")))
+    second = topomerge.extract(topomerge.read_points(write(first, "ifc", tmp_path / "a.ifc"), spacing=0.05))
     assert [len(m.storeys) for m in (first, second)] == [2, 2]
     assert np.bincount(second.rooms["storey"]).tolist() == np.bincount(first.rooms["storey"]).tolist()
 

@@ -12,25 +12,25 @@ import pytest
 from topomerge.datasets.real import carmen
 
 from tests.io.test_export_plans import write
+from tests.real_models import duplex_map
 from topomerge.extraction.extract import extract
 from topomerge.io import read_points
-from topomerge.types import PointCloud
+from topomerge.types import TopometricMap
 
 pytestmark = pytest.mark.data
 IPA = "grids_ipa_room_segmentation"
-SPACING = 0.1  # m
-MAPS: dict[str, Callable[[Path], PointCloud]] = {
-    "robot grid of an office floor (GDC)": lambda data: read_points(data / "utexas_gdc_floors/maps/real/1n/1n.yaml"),
-    "robot grid (Freiburg 101)": lambda data: read_points(data / IPA / "Freiburg101_scan.png", resolution=0.05),
-    "furnished grid (IPA)": lambda data: read_points(data / IPA / "lab_ipa_furnitures.png", resolution=0.05),
-    "building model (duplex)": lambda data: read_points(data / "ifc_buildings/duplex.ifc", spacing=SPACING),
-    "laser log (CARMEN)": lambda data: dict(carmen.pairs(data / "carmen_logs"))["freiburg-101-first-last"]().a,
+MAPS: dict[str, Callable[[Path], TopometricMap]] = {
+    "robot grid of an office floor (GDC)": lambda data: extract(read_points(data / "utexas_gdc_floors/maps/real/1n/1n.yaml")),
+    "robot grid (Freiburg 101)": lambda data: extract(read_points(data / IPA / "Freiburg101_scan.png", resolution=0.05)),
+    "furnished grid (IPA)": lambda data: extract(read_points(data / IPA / "lab_ipa_furnitures.png", resolution=0.05)),
+    "building model (duplex)": duplex_map,
+    "laser log (CARMEN)": lambda data: extract(dict(carmen.pairs(data / "carmen_logs"))["freiburg-101-first-last"]().a),
 }
 
 
 @pytest.mark.parametrize("name", MAPS)
 def test_dsg_of_a_real_building(data_dir: Path, tmp_path: Path, name: str) -> None:
-    map = extract(MAPS[name](data_dir))
+    map = MAPS[name](data_dir)
     assert len(map.rooms) > 2 and len(map.edges) > 1
     path = write(map, "dsg", tmp_path / "a.json")
     graph = json.loads(path.read_text())

@@ -312,6 +312,13 @@ def test_bad_choices(tmp_path: Path, walk: Walk) -> None:
     assert "none of the 3 messages of /rear has a pose at its time (poses: late.txt)" in late
 
 
+def test_a_cut_bag_is_refused_by_the_process_that_reads(tmp_path: Path, walk: Walk) -> None:
+    path = write_bag(tmp_path, "mcap", walk_messages(walk))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert refusal_of(path).startswith(f"{path}: ")
+
+
+@pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 def test_cut_bags(tmp_path: Path, walk: Walk, kind: str) -> None:
     data = write_bag(tmp_path, kind, walk_messages(walk)).read_bytes()

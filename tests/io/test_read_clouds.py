@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from tests.samples import box_colors, box_points, write_e57, write_las, write_ply
 from topomerge.errors import InputError
 from topomerge.io import read_chunks, read_points
+from topomerge.types import PointCloud
 
 COLORED = ["ascii.ply", "little.ply", "big.ply", "ascii.pcd", "binary.pcd", "packed.pcd", "table.csv", "array.npz", "cloud.las"]
 
@@ -130,10 +132,15 @@ def test_npz_keeps_all_that_a_cloud_has(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cloud.poses, poses)
 
 
+@cache
+def whole(path: Path) -> PointCloud:
+    return read_points(path)
+
+
 @pytest.mark.parametrize("name", ["ascii.ply", "little.ply", "binary.pcd", "table.xyz", "array.npy", "cloud.laz", "cloud.e57"])
 @pytest.mark.parametrize("chunk", [7, 100, 600, 10_000])
 def test_chunks_join_to_the_whole(samples: dict[str, Path], name: str, chunk: int) -> None:
-    cloud = read_points(samples[name])
+    cloud = whole(samples[name])
     chunks = list(read_chunks(samples[name], chunk=chunk))
     assert all(len(c) == chunk for c in chunks[:-1])
     np.testing.assert_array_equal(np.concatenate([c.points for c in chunks]), cloud.points)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.real_models import duplex
 from topomerge.io import read_chunks, read_points
 from topomerge.io.ifc import area
 
@@ -64,7 +65,7 @@ def test_apartment_of_halmstad(data_dir: Path) -> None:
     [("duplex", 21, {0, 1, 2}, (9.3, 26.6, 8.2)), ("ExampleHOM", 11, {0, 1, 2}, (8.6, 11.4, 10.6))],
 )
 def test_building_models(data_dir: Path, name: str, rooms: int, storeys: set[int], size: tuple[float, float, float]) -> None:
-    cloud = read_points(data_dir / "ifc_buildings" / f"{name}.ifc", spacing=0.2)
+    cloud = duplex(data_dir) if name == "duplex" else read_points(data_dir / "ifc_buildings" / f"{name}.ifc", spacing=0.2)
     assert len(cloud.rooms) == rooms
     assert {r.storey for r in cloud.rooms} == storeys
     np.testing.assert_allclose(np.ptp(cloud.points, axis=0), size, atol=0.1)

@@ -9,11 +9,13 @@ import numpy as np
 from tests.fusion.plans_of import office, part
 from tests.scenes import Scene
 from topomerge.extraction.extract import extract
+from topomerge.fusion.atlas.solve import RegistrationsByPair
 from topomerge.types import Sim3, TopometricMap
 
 PARTS = (((-9, -9), (14, 99)), ((4.6, -9), (99, 8)), ((9, -9), (99, 99)), ((-9, 5), (99, 99)))  # low, high
 FRAMES = (Sim3(), Sim3(2.1, (7.0, -3.0, 0.4)), Sim3(-2.8, (-4.0, 2.0, -1.0)), Sim3(0.7, (1.0, 9.0, 2.0)))
 NAMES = ("west", "south", "east", "north")
+REGISTRATIONS: RegistrationsByPair = {}  # that were made before: they are the same for any order, in any file of tests
 
 
 @cache

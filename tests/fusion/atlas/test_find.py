@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,18 @@ from topomerge.io import archive
 from topomerge.viz.atlas_report import atlas_html
 
 
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An atlas of the office's west and a stranger."""
+    folder = tmp_path_factory.mktemp("atlas") / "built"
+    add(folder, [(NAMES[0], office_map(0)), ("stranger", stranger())], atlas_html)
+    return folder
+
+
 @pytest.fixture
-def house(tmp_path: Path) -> Path:
-    add(tmp_path / "house", [(NAMES[0], office_map(0)), ("stranger", stranger())], atlas_html)
-    return tmp_path / "house"
+def house(built: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(built, tmp_path / "house"))
 
 
 def unit_rows(rooms: int, seed: int) -> TurnedRows:

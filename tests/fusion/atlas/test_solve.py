@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import topomerge as tm
-from tests.fusion.atlas.atlas_scenes import FRAMES, NAMES, office_map, stranger, truth
+from tests.fusion.atlas.atlas_scenes import FRAMES, NAMES, REGISTRATIONS, office_map, stranger, truth
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.maps import LOADED_AT_ONCE, Maps, map_key
 from topomerge.fusion.atlas.pairs import promise
@@ -23,8 +23,8 @@ SHIFTED = Sim3(0.0, (4.5, 0.0, 0.0))  # by a room
 
 @pytest.fixture(scope="module")
 def registrations():
-    """Registrations that were made before: they are the same for any order."""
-    return {}
+    """Registrations that were made before."""
+    return REGISTRATIONS
 
 
 @pytest.fixture(scope="module")
