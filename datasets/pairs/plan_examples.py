@@ -202,8 +202,31 @@ def load_examples(path: Path) -> list[PlanExample]:
     return examples
 
 
-def make_examples(item: PlanItem, plan: Plan | None) -> list[PlanExample]:
-    """The storeys of one scan."""
+@dataclass(frozen=True, eq=False)
+class SimulatedScan:
+    """A scan of an item.
+
+    Args:
+        visited: (n,) rooms that the surveyor was in.
+        cloud: in the building's frame.
+        shift: places of it with what undoes its drift there; None: it has none.
+        frame: in which it is looked at.
+    """
+
+    building: Building
+    sensor: str
+    visited: Array
+    cloud: PointCloud
+    shift: Any
+    frame: Sim3
+
+
+def scan_of_item(item: PlanItem, plan: Plan | None) -> SimulatedScan:
+    """Simulate the scan of an item.
+
+    Args:
+        plan: the real plan that it names; None: its building is procedural.
+    """
     seed = item.seed
     rng = np.random.default_rng(seed)
     difficulty = draw_difficulty(rng)
@@ -220,11 +243,22 @@ def make_examples(item: PlanItem, plan: Plan | None) -> list[PlanExample]:
     else:
         cloud, shift = scanned(building, sensor, visited, rng, seed)
     frame = Sim3(float(rng.uniform(-np.pi, np.pi)) if rng.random() < 0.75 else 0.0)
-    storeys = storeys_of(moved(cloud, frame), VOXEL_SIZES[seed % len(VOXEL_SIZES)])
+    return SimulatedScan(building, sensor, visited, cloud, shift, frame)
+
+
+def make_examples(item: PlanItem, plan: Plan | None) -> list[PlanExample]:
+    """The storeys of one scan."""
+    made = scan_of_item(item, plan)
+    storeys = storeys_of(moved(made.cloud, made.frame), VOXEL_SIZES[item.seed % len(VOXEL_SIZES)])
     if not storeys:
-        raise InputError(f"{seed}: no storey was seen")
+        raise InputError(f"{item.seed}: no storey was seen")
     return [
-        PlanExample(plan, *truth_of(building, plan, places, frame, shift), visited, f"{sensor}/{item.source}")
+        PlanExample(
+            plan,
+            *truth_of(made.building, plan, places, made.frame, made.shift),
+            made.visited,
+            f"{made.sensor}/{item.source}",
+        )
         for plan, places in storeys
     ]
 

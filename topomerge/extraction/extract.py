@@ -10,12 +10,13 @@ from topomerge.extraction.free_space import free_space
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
 from topomerge.extraction.plans.plan_rooms import rooms_of_plans
+from topomerge.extraction.room_odds import with_room_odds
 from topomerge.extraction.scan import read_scan
 from topomerge.extraction.slices import with_raised_slice
 from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.views.view_rooms import rooms_of_views
-from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid
+from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid, with_outline_odds
 
 COARSE_CELL = 0.15  # m: in larger ones, the walls beside a door leave too little of it
 
@@ -61,6 +62,10 @@ def extract(
 
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+    if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
+        map = replace(map, rooms=with_outline_odds(map.rooms))
+    else:
+        map = with_room_odds(map, scan.rays)
 
     watch.begin("free space", 0.9)
     free = free_space(scan, navigable, p.range) if p.carve else scan.free

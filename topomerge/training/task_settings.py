@@ -263,6 +263,22 @@ class MatchOdds(TaskSettings):
 
 
 @dataclass
+class RoomOdds(TaskSettings):
+    """Args:
+    pull: to 0, of all weights but the constant.
+    folds: of scans, for the scores.
+    """
+
+    task: str = "room_odds"
+    name: str = "room_odds"
+    data: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    pull: float = 1.0
+    folds: int = 8
+    watch: str = "entered_auc"
+
+
+@dataclass
 class FeatureScale(TaskSettings):
     """Args:
     shrink: share of the features' own variances in the covariance of the differences: few rooms give a noisy one.

@@ -38,6 +38,7 @@ TASKS = {
     "door_classification": Task(
         "door_classification", "DoorClassification", "topomerge.extraction.plans", "door_classifier.json", 0.7
     ),
+    "room_odds": Task("room_odds", "RoomOdds", "topomerge.extraction", "room_odds.json", 0.5),
     "feature_scale": Task("feature_scale", "FeatureScale", "topomerge.embedding", "engineered.json", 0.3),
     "match_odds": Task("match_odds", "MatchOdds", "topomerge.matching", "odds.json", 0.3),
     "place_evidence": Task("place_evidence", "PlaceEvidence", "topomerge.fusion.evidence", "place_network.npz", 4.0),
