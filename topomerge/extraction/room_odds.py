@@ -20,8 +20,8 @@ from topomerge.types import ROOM_ODDS, Array, TopometricMap
 ROOM_ODDS_FILE = "room_odds.json"
 ENTERED_BY_POSES = "entered_by_poses"  # the model of `entered` that knows the sensor's places
 COVER = ROOM_FEATURES.index("map_ceiling")
-MODEL_LENGTHS = {name: 1 + 2 * len(ROOM_FEATURES) for name in ROOM_ODDS}
-MODEL_LENGTHS |= {ENTERED_BY_POSES: 1 + 2 * len(ROOM_FEATURES) + len(POSE_FEATURES)}
+MODEL_LENGTHS = {name: 1 + 3 * len(ROOM_FEATURES) for name in ROOM_ODDS}
+MODEL_LENGTHS |= {ENTERED_BY_POSES: 1 + 3 * len(ROOM_FEATURES) + len(POSE_FEATURES)}
 STANDARD = ("low", "high", "mean", "scale")  # of the features: what they are clipped to and divided by
 
 
@@ -57,11 +57,11 @@ def odds_of(weights: dict[str, Any], name: str, x: Array, poses: Array | None = 
 
 
 def model_inputs(weights: dict[str, Any], x: Array, poses: Array | None = None) -> Array:
-    """(R, 27 or 29) what the models weigh: 1, the features in units of their spread, and those times the map's share of ceiling,
-    for where no ceiling is seen other things count."""
+    """(R, 40 or 42) what the models weigh: 1, the features in units of their spread, those times the map's share of ceiling, for
+    where no ceiling is seen other things count, and their squares."""
     low, high, mean, scale = (np.asarray(weights[part], float) for part in STANDARD)
     z = (np.clip(x, low, high) - mean) / scale
-    columns = [np.ones((len(x), 1)), z, z * (2 * x[:, [COVER]] - 1)]
+    columns = [np.ones((len(x), 1)), z, z * (2 * x[:, [COVER]] - 1), z**2]
     return np.concatenate(columns if poses is None else [*columns, poses], axis=1)
 
 

@@ -37,7 +37,7 @@ DIGITS = 6  # micrometres: the digits behind are noise
 
 
 def room_words(room: Any) -> list[str]:
-    """What a row of ROOM_DTYPE has to be told in words: `outside`, `glimpsed` (only looked into), `doubtful` (probably no room)."""
+    """What is said of a row of ROOM_DTYPE: `outside`, `glimpsed` (only looked into), `doubtful` (probably no room)."""
     words = (("outside", room["outside"] > 0.5), ("glimpsed", room["glimpsed"]), ("doubtful", room["confidence"] < 0.5))
     return [word for word, so in words if so]
 

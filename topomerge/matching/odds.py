@@ -47,8 +47,8 @@ def hypothesis_probability(evidence: Array) -> Array:
 
 
 def match_features(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array) -> Array:
-    """(M, 5) 1, how well two rooms fit, log m2 of the smaller one, how many of both are mostly unseen, and whether one of both is in
-    several matches.
+    """(M, 5) 1, how well two rooms fit, log m2 of the smaller one, how many of both are mostly unseen, and whether one of
+    both is in several matches.
 
     Args:
         rooms, fit: (M, 2), (M,) of `consistency.matches_under`.
