@@ -1,8 +1,8 @@
 """Which rooms were only looked into: their odds against the truth, and the rooms' precision with them and without.
 
-``python -m benchmarks.extraction.entered --write docs/results/rooms.md`` scans simulated buildings of the validation list, a building
-of each kind by each sensor, and extracts each scan with the places of the sensor and without; robots' grids have none. *Before* are
-the same maps judged as they were when rooms of which less than 0.6 of the outline was seen were called glimpsed.
+``python -m benchmarks.extraction.entered --write docs/results/rooms.md`` scans simulated buildings of the validation list, one
+of each kind by each sensor, and extracts each scan with the places of the sensor and without; robots' grids have none. *Before*
+are the same maps judged as when rooms of which less than 0.6 of the outline was seen were called glimpsed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from benchmarks.extraction.scans import Case, Scan, load
 from benchmarks.extraction.tables import replace_section
 from topomerge.training.closed_form import calibration_error
 from topomerge.training.room_odds import ANSWER_OF, guess_scores
-from topomerge.types import ROOM_ODDS, Array, TopometricMap, with_outline_odds
+from topomerge.types import ROOM_ODDS, Array, with_outline_odds
 
 MARK = "entered"
 VALIDATION, TRAINING = 800_900, 41_000  # first seeds
@@ -127,7 +127,8 @@ def main(words: list[str] | None = None) -> int:
             scan = load(case, settings.scans, data)
             posed_scan = scan.cloud.poses is not None
             rows += [{**measured(case, scan, posed), "case": case.name} for posed in ((True, False) if posed_scan else (False,))]
-            print(case.name, [f"{r['rooms P before']:.2f} {r['rooms P now']:.2f}" for r in rows[-1 - posed_scan :]], file=sys.stderr)
+            shown = [f"{r['rooms P before']:.2f} {r['rooms P now']:.2f}" for r in rows if r["case"] == case.name]
+            print(case.name, *shown, file=sys.stderr, flush=True)
     command = " ".join(["python -m benchmarks.extraction.entered", *(words if words is not None else sys.argv[1:])])
     print(report(rows, command))
     if settings.write:

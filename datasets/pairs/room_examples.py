@@ -1,13 +1,11 @@
 """Rooms of simulated scans with what is true about them: what the odds of rooms are fitted to (`extraction.room_odds`).
 
-The scans are drawn as those of `plan_examples`: all sensors, voxel sizes and spoilt points, procedural buildings and real plans of
-the split, and drawn grids. Each is extracted as if the sensor's places were unknown; its poses are kept beside that. A file holds
-the rooms of one scan.
+The scans are drawn as those of `plan_examples` are (`scan_items`). Each is extracted with the sensor's places and as if they were
+unknown. A file holds the rooms of one scan.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -16,16 +14,8 @@ from pathlib import Path
 import numpy as np
 from topomerge.datasets.core.builder import Row, Say, Sharing, build_set, check_sharing, make_item
 from topomerge.datasets.core.plan import Plan
-from topomerge.datasets.pairs.plan_examples import (
-    LONGEST_SCAN,
-    VOXEL_SIZES,
-    PlanItem,
-    PlanRecipe,
-    check_plans,
-    draw_item,
-    real_plans,
-    scan_of_item,
-)
+from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, VOXEL_SIZES, PlanRecipe, check_plans, real_plans
+from topomerge.datasets.pairs.scan_items import PlanItem, draw_item, scan_of_item
 from topomerge.datasets.plans import splits
 from topomerge.datasets.simulation.floor_truth import in_frame, truth_of
 from topomerge.datasets.simulation.room_truth import room_truth
@@ -35,7 +25,6 @@ from topomerge.extraction.extract import extract
 from topomerge.extraction.room_features import POSE_FEATURES, pose_features, room_features
 from topomerge.extraction.scan import read_scan
 from topomerge.io import archive
-from topomerge.io.listing import plain
 from topomerge.types import Array
 
 ROOM_EXAMPLE_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
@@ -48,7 +37,7 @@ def build_rooms(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: No
     check_sharing(sharing)
     plans = real_plans(recipe)
     first = splits.seeds(recipe.split)[0] + recipe.seed
-    items = {_name(item): item for item in (draw_item(first + n, plans) for n in range(recipe.scans))}
+    items = {item.named(ROOM_EXAMPLE_FORMAT): item for item in (draw_item(first + n, plans) for n in range(recipe.scans))}
     named = {(source, name): plan for source, entries in plans.items() for name, plan in entries}
     folder = Path(sharing.cache).resolve() / "rooms"
     tasks = [(item, named.get((item.source, item.plan)), str(folder)) for item in items.values()]
@@ -57,14 +46,9 @@ def build_rooms(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: No
     return [path for name in items if (path := folder / f"{name}.npz").exists()]
 
 
-def _name(item: PlanItem) -> str:
-    inputs = [ROOM_EXAMPLE_FORMAT, plain(asdict(item))]
-    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:24]
-
-
 def make_room_file(item: PlanItem, plan: Plan | None, folder: str) -> Row:
     """Make an item's file."""
-    return make_item(_name(item), folder, lambda: room_rows(item, plan), LONGEST_SCAN)
+    return make_item(item.named(ROOM_EXAMPLE_FORMAT), folder, lambda: room_rows(item, plan), LONGEST_SCAN)
 
 
 def room_rows(item: PlanItem, plan: Plan | None) -> Mapping[str, Array]:
@@ -87,7 +71,7 @@ def room_rows(item: PlanItem, plan: Plan | None) -> Mapping[str, Array]:
         if prefix:
             poses = pose_features(map, read_scan(cloud, voxel).rays)
             arrays["posed.p"] = (np.full((len(rows), len(POSE_FEATURES)), np.nan) if poses is None else poses)[rows]
-    about = {"file": f"{_name(item)}.npz", **asdict(item), "sensor": made.sensor}
+    about = {"file": f"{item.named(ROOM_EXAMPLE_FORMAT)}.npz", **asdict(item), "sensor": made.sensor}
     return {**arrays, "about": np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)}
 
 

@@ -220,8 +220,8 @@ def judge(map: TopometricMap, truth: Truth, columns: Array | None = None) -> Ver
     """Score a map.
 
     Expected are the visited rooms of which the scan saw `LEAST_SEEN_AREA`. Rooms that the map calls glimpsed or outside and that
-    lie mostly outside of those are not held against it, and no more are doors that lead to one, or that are where a true door leads
-    out of the visited rooms.
+    lie mostly outside of those are not held against it, and no more are doors that lead to one, or that are where a true door
+    leads out of the visited rooms.
 
     Args:
         columns: `said(map, truth)` where it is known already.
