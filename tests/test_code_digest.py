@@ -54,6 +54,7 @@ def test_comments_docstrings_and_layout_keep_the_digest(before, after):
         ("topomerge.embedding.engineered", "embedding/engineered.json"),
         ("topomerge.embedding.learned", "embedding/pretrained/embedder.safetensors"),
         (EXTRACT, "extraction/plans/plan_network.npz"),
+        (EXTRACT, "extraction/room_odds.json"),
         ("topomerge.datasets.pairs.example", "extraction/plans/door_classifier.json"),
     ],
 )

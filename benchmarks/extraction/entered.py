@@ -27,7 +27,7 @@ from topomerge.training.closed_form import calibration_error
 from topomerge.training.room_odds import ANSWER_OF, guess_scores
 from topomerge.types import ROOM_ODDS, Array, with_outline_odds
 
-MARK = "entered"
+ENTERED_MARK = "entered"
 VALIDATION, TRAINING = 800_900, 41_000  # first seeds
 BANDS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
 Row = dict[str, Any]
@@ -132,7 +132,7 @@ def main(words: list[str] | None = None) -> int:
     command = " ".join(["python -m benchmarks.extraction.entered", *(words if words is not None else sys.argv[1:])])
     print(report(rows, command))
     if settings.write:
-        replace_section(settings.write, report(rows, command), MARK)
+        replace_section(settings.write, report(rows, command), ENTERED_MARK)
     return 0
 
 

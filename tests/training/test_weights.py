@@ -22,9 +22,9 @@ def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(weights, "make_task", make)
     assert weights.main([f"runs={tmp_path}"]) == 130
-    assert made == ["plan_segmentation", "door_classification", "feature_scale", "match_odds"]
+    assert made == ["plan_segmentation", "door_classification", "room_odds", "feature_scale", "match_odds"]
     assert "in all about" in capsys.readouterr().err
-    assert weights.main([f"runs={tmp_path}"]) == 0 and made[4:] == [
+    assert weights.main([f"runs={tmp_path}"]) == 0 and made[5:] == [
         "match_odds",
         "place_evidence",
         "merge_belief",
