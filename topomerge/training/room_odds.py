@@ -56,7 +56,7 @@ def room_scans(recipe: PlanRecipe, settings: RoomOdds, say: Say) -> list[Rows]:
     Raises:
         InputError: no scan could be made.
     """
-    scans = [read_room_rows(path) for path in build_rooms(recipe, settings, say)]
+    scans: list[Rows] = [read_room_rows(path) for path in build_rooms(recipe, settings, say)]
     scans = [scan for scan in scans if len(scan["x"])]
     if not scans:
         raise InputError(f"{recipe.name}: no scan could be made; see the reasons above")
