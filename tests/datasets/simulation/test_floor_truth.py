@@ -129,7 +129,9 @@ def test_what_is_true_about_each_room(building, floor, truth) -> None:
     astray = room_truth(drawn(building, floor, shift=500.0), turned, building.rooms)  # beyond the raster nothing is judged
     assert not astray.judged.any() and not astray.one.any() and not astray.whole.any()
     middle = FRAME.inverse().apply(whole.navigable.centroids())[:, 0]
-    left = np.where((whole.navigable_room == 0) & (middle > np.median(middle[whole.navigable_room == 0])), -1, whole.navigable_room)
+    left = np.where(
+        (whole.navigable_room == 0) & (middle > np.median(middle[whole.navigable_room == 0])), -1, whole.navigable_room
+    )
     half = room_truth(replace(whole, room=left.astype(np.int32), navigable_room=left.astype(np.int32)), turned, building.rooms)
     assert not half.whole[0] and half.entered[0] and half.whole[1:].all()
 
