@@ -78,7 +78,8 @@ def _rooms(layout: list[Box], storeys: int, at: Array, cells: Array) -> Array:
         s, (x0, x1, y0, y1) = i // len(layout), layout[i % len(layout)]
         low, high = at + np.array([x0, y0, s * HEIGHT]) * EDGE, at + np.array([x1, y1, (s + 1) * HEIGHT]) * EDGE
         area, height = (x1 - x0) * (y1 - y0) * EDGE**2, (HEIGHT - 1) * EDGE
-        rooms[i] = (s, (low + high) / 2, area, height, area * height, low, high, cells[i], 0.3 if i == 0 else 1.0, i == 0)
+        seen = (0.3 if i == 0 else 1.0, i == 0, 0.9, 0.8, 0.2 if i == 0 else 0.95, 0.05)  # glimpsed, and the odds behind
+        rooms[i] = (s, (low + high) / 2, area, height, area * height, low, high, cells[i], *seen)
     return rooms
 
 

@@ -30,7 +30,7 @@ from topomerge.extraction.extract import extract
 from topomerge.metrics import match_places
 from topomerge.types import Array, TopometricMap
 
-VALIDATION, TRAINING = 800_720, 5_700  # first seeds
+DOOR_SEEDS, TRAINING = 800_720, 5_700  # first seeds
 FRAMES = 0.7  # share of the doors with frames and handles
 STATES = ("open", "half", "shut")
 
@@ -41,7 +41,7 @@ Row = dict[str, Any]
 
 def cases(development: bool) -> list[Case]:
     """Every kind of building by both sensors."""
-    first = TRAINING if development else VALIDATION
+    first = TRAINING if development else DOOR_SEEDS
     made = [(kind, sensor) for sensor in ("tls", "depth") for kind in BUILDING_KINDS]
     return [
         Case("doors", "procedural", kind, sensor, first + i, rooms=8, difficulty=(("frames", FRAMES),), spacing=0.025)

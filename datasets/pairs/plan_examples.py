@@ -6,28 +6,19 @@ from the plans with furniture in them, as robots make them; most of them turned.
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from topomerge.datasets.buildings.erect import erect
-from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.buildings.profiles import BUILDING_KINDS
 from topomerge.datasets.core.builder import Report, Row, Say, Sharing, build_set, check_sharing, make_item
-from topomerge.datasets.core.building import Building
-from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.core.plan import Plan
-from topomerge.datasets.pairs.items import digest
-from topomerge.datasets.pairs.plan_truth import drawn_map, truth_of
+from topomerge.datasets.pairs.plan_truth import truth_of
+from topomerge.datasets.pairs.scan_items import PlanItem, Plans, draw_item, scan_of_item
 from topomerge.datasets.plans import splits
-from topomerge.datasets.simulation.scanner import moved, scan
-from topomerge.datasets.simulation.sensors import get_sensor
-from topomerge.datasets.simulation.spoils import drift_between, exact_sensor, spoilt, upper_half
-from topomerge.datasets.simulation.walk import part
+from topomerge.datasets.simulation.scanner import moved
 
 from topomerge.errors import InputError
 from topomerge.extraction.navigable import navigable_volume
@@ -38,16 +29,10 @@ from topomerge.extraction.scan import read_scan
 from topomerge.extraction.slices import with_raised_slice
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.io import archive
-from topomerge.io.listing import plain
-from topomerge.types import Array, PointCloud, Sim3
+from topomerge.types import Array, PointCloud
 
-PLAN_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
 LONGEST_SCAN = 600.0  # s
 VOXEL_SIZES = (0.1, 0.1, 0.1, 0.08, 0.15)  # m
-SOURCE_SHARES = {"procedural": 0.55, "r2v": 0.3, "campus": 0.15}
-SENSOR_SHARES = {"tls": 0.16, "lidar": 0.16, "depth": 0.12, "tablet": 0.12, "mono": 0.08, "laser2d": 0.2, "drawn": 0.16}
-SPOIL_SHARES = {"": 0.48, "sparse": 0.16, "noise": 0.1, "below2": 0.1, "drift": 0.06, "above": 0.1}  # above: no lower half
-ROOMS_VISITED = (4, 9)  # at least, less than
 PLANS_READ = 300  # of a source
 PLAN_RASTERS = ("wall", "inside", "profile", "ceiling")
 
@@ -70,23 +55,6 @@ class PlanRecipe:
     folder: str = ""
 
 
-@dataclass(frozen=True)
-class PlanItem:
-    """Everything that the bytes of one file depend on: the seed, where the building is from, of how many plans one was drawn,
-    which, and its digest."""
-
-    seed: int
-    source: str
-    candidates: int
-    plan: str
-    digest: str
-
-    @property
-    def name(self) -> str:
-        """A hash of the inputs and of the versions of what is made from them."""
-        return hashlib.sha256(json.dumps([PLAN_FORMAT, plain(asdict(self))], sort_keys=True).encode()).hexdigest()[:24]
-
-
 @dataclass(frozen=True, eq=False)
 class PlanExample:
     """A plan with what is true about it.
@@ -105,7 +73,6 @@ class PlanExample:
     source: str
 
 
-Plans = Mapping[str, Sequence[tuple[str, Plan]]]
 ItemT = TypeVar("ItemT", bound=PlanItem)
 MakeFile = Callable[[Any, Plan | None, str], Row]
 
@@ -164,23 +131,6 @@ def real_plans(recipe: PlanRecipe) -> Plans:
     return plans
 
 
-def draw_item(seed: int, plans: Plans) -> PlanItem:
-    """The item of a seed; `make_examples` draws the same numbers again."""
-    rng = np.random.default_rng(seed)
-    draw_difficulty(rng)
-    source, _ = _draw_source(rng)
-    entries = plans.get(source, ())
-    if not entries:
-        return PlanItem(seed, "procedural", 0, "", "")
-    name, plan = entries[int(rng.integers(len(entries)))]
-    return PlanItem(seed, source, len(entries), name, digest((plan,)))
-
-
-def _draw_source(rng: np.random.Generator) -> tuple[str, str]:
-    source = str(rng.choice(list(SOURCE_SHARES), p=list(SOURCE_SHARES.values())))
-    return source, str(rng.choice(list(SENSOR_SHARES), p=list(SENSOR_SHARES.values())))
-
-
 def make_plan_file(item: PlanItem, plan: Plan | None, folder: str) -> Row:
     """Make an item's file."""
     return make_item(item.name, folder, lambda: example_arrays(item, make_examples(item, plan)), LONGEST_SCAN)
@@ -219,58 +169,19 @@ def load_examples(path: Path) -> list[PlanExample]:
 
 def make_examples(item: PlanItem, plan: Plan | None) -> list[PlanExample]:
     """The storeys of one scan."""
-    seed = item.seed
-    rng = np.random.default_rng(seed)
-    difficulty = draw_difficulty(rng)
-    source, sensor = _draw_source(rng)
-    if plan is not None:
-        rng.integers(item.candidates)  # which plan: drawn already
-        building = erect([plan], difficulty, rng, f"{source}-{seed}")
-    else:
-        floors = 1 if sensor in ("laser2d", "drawn") else int(rng.choice([1, 1, 1, 2]))
-        building = make_building(str(rng.choice(BUILDING_KINDS)), seed, floors, difficulty)
-    visited = part(building, int(rng.integers(*ROOMS_VISITED)), rng)
-    if sensor == "drawn":
-        cloud, shift = drawn_map(building, visited, rng), None
-    else:
-        cloud, shift = scanned(building, sensor, visited, rng, seed)
-    frame = Sim3(float(rng.uniform(-np.pi, np.pi)) if rng.random() < 0.75 else 0.0)
-    storeys = storeys_of(moved(cloud, frame), VOXEL_SIZES[seed % len(VOXEL_SIZES)])
+    made = scan_of_item(item, plan)
+    storeys = storeys_of(moved(made.cloud, made.frame), VOXEL_SIZES[item.seed % len(VOXEL_SIZES)])
     if not storeys:
-        raise InputError(f"{seed}: no storey was seen")
+        raise InputError(f"{item.seed}: no storey was seen")
     return [
-        PlanExample(plan, *truth_of(building, plan, places, frame, shift), visited, f"{sensor}/{item.source}")
+        PlanExample(
+            plan,
+            *truth_of(made.building, plan, places, made.frame, made.shift),
+            made.visited,
+            f"{made.sensor}/{item.source}",
+        )
         for plan, places in storeys
     ]
-
-
-def draw_difficulty(rng: np.random.Generator) -> Difficulty:
-    """From tidy to hard, all kinds at once."""
-    wide = {"ceiling_spread": 0.4, "furniture": 2.0, "clutter": 1.0, "glass": 0.2, "lamps": 1.0, "beams": 0.5, "columns": 1.0}
-    drawn = {name: float(rng.uniform(0, most)) for name, most in (wide | {"slopes": 0.5, "curved": 0.4}).items()}
-    ajar = float(rng.uniform(0.4, 0.9))
-    lintels = float(rng.choice([0, 0.5, 0.9, 1.0]))
-    return Difficulty(**drawn, open=ajar, half=float(rng.uniform(0, 1 - ajar)), lintels=lintels)
-
-
-def scanned(building: Building, name: str, visited: Array, rng: np.random.Generator, seed: int) -> tuple[PointCloud, Any]:
-    """A scan, and places of it with what undoes its drift there (None: it has none)."""
-    sensor = get_sensor(name)
-    spoil = str(rng.choice(list(SPOIL_SHARES), p=list(SPOIL_SHARES.values()))) if sensor.beams != 1 and name != "mono" else ""
-    if spoil == "below2" and sensor.lowest > 0:  # hardly anything would be left
-        spoil = ""
-    if spoil == "drift":
-        sensor = replace(sensor, drift=1.0)
-    elif rng.random() < 0.6:
-        sensor = replace(sensor, drift=0.0, tilt=0.0)
-    spacing = max(sensor.spacing, 0.05) if sensor.beams != 1 else None
-    cloud = scan(building, sensor, visited, np.random.default_rng(seed), spacing)
-    shift = None
-    if sensor.drift:
-        straight = scan(building, exact_sensor(sensor), visited, np.random.default_rng(seed), budget=8)
-        shift = drift_between(cloud, straight)
-    cloud = upper_half(cloud, building, rng) if spoil == "above" else spoilt(cloud, building, spoil, rng)
-    return replace(cloud, rooms=()), shift
 
 
 def storeys_of(cloud: PointCloud, edge: float) -> list[tuple[StoreyPlan, Array]]:

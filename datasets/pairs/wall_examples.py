@@ -22,8 +22,9 @@ from topomerge.datasets.core.builder import Report, Row, Say, Sharing, make_item
 from topomerge.datasets.core.building import SURFACES, Building
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.pairs.items import digest
-from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanItem, PlanRecipe, Plans, build_scans, draw_difficulty
+from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanRecipe, build_scans
 from topomerge.datasets.pairs.plan_truth import drawn_map
+from topomerge.datasets.pairs.scan_items import PlanItem, Plans, draw_difficulty
 from topomerge.datasets.simulation.scanner import moved, scan
 from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.spoils import drift_between, exact_sensor

@@ -219,9 +219,9 @@ class Verdict:
 def judge(map: TopometricMap, truth: Truth, columns: Array | None = None) -> Verdict:
     """Score a map.
 
-    Expected are the visited rooms of which the scan saw `LEAST_SEEN_AREA`. Rooms that the map calls glimpsed and that lie
-    mostly outside of those are not held against it, and no more are doors that lead to one, or that are where a true door leads
-    out of the visited rooms.
+    Expected are the visited rooms of which the scan saw `LEAST_SEEN_AREA`. Rooms that the map calls glimpsed or outside and that
+    lie mostly outside of those are not held against it, and no more are doors that lead to one, or that are where a true door
+    leads out of the visited rooms.
 
     Args:
         columns: `said(map, truth)` where it is known already.
@@ -234,7 +234,7 @@ def judge(map: TopometricMap, truth: Truth, columns: Array | None = None) -> Ver
     expected = truth.visited & (seen >= LEAST_SEEN_AREA)
     own = np.bincount(labels[(labels >= 0) & np.append(expected, False)[true]], minlength=len(map.rooms))
     all_of = np.bincount(labels[labels >= 0], minlength=len(map.rooms))
-    counted = ~map.rooms["glimpsed"] | (2 * own > all_of)
+    counted = ~(map.rooms["glimpsed"] | (map.rooms["outside"] > 0.5)) | (2 * own > all_of)
     if not truth.complete:
         counted &= all_of * TRUTH_CELL**2 >= LEAST_SEEN_AREA
     rooms = score_rooms(np.where(true >= 0, true, -1), labels, true_count, counted, expected)

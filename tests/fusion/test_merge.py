@@ -21,7 +21,7 @@ from topomerge.fusion.fuse import room_of_rooms
 from topomerge.fusion.inputs import checked_threshold, risk_threshold
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, merge_to_json
 from topomerge.matching.odds import match_probability
-from topomerge.types import Sim3, TopometricMap
+from topomerge.types import Sim3, TopometricMap, mostly_unseen
 
 
 def map_of(points: np.ndarray, name: str, frame: Sim3 | None = None) -> TopometricMap:
@@ -130,7 +130,7 @@ def test_rooms_match_where_both_saw_them(merged, halves):
 
 def test_whole_rooms_are_surer_than_scraps(halves):
     a = halves[0]
-    whole, scrap = (int(pick(np.where(a.rooms["glimpsed"], np.nan, a.rooms["area"]))) for pick in (np.nanargmax, np.nanargmin))
+    whole, scrap = (int(pick(np.where(mostly_unseen(a.rooms), np.nan, a.rooms["area"]))) for pick in (np.nanargmax, np.nanargmin))
     tiny = replace(a, rooms=a.rooms.copy())
     tiny.rooms["area"][scrap] = 0.6
     assert match_probability(tiny, tiny, np.array([[scrap, scrap]]), np.ones(1))[0] < 0.75

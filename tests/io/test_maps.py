@@ -14,8 +14,8 @@ import pytest
 from tests.scenes_map import building, same
 from topomerge.errors import InputError
 from topomerge.io import archive
-from topomerge.io.maps import load_map, map_to_json, save_json, save_map, save_rooms_ply
-from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
+from topomerge.io.maps import OLDER_ROOMS, load_map, map_to_json, save_json, save_map, save_rooms_ply
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, ROOM_ODDS, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +285,7 @@ def test_json_fields_and_strictness(scene: TopometricMap, tmp_path: Path) -> Non
     room = listing["rooms"][1]
     assert list(room) == [
         "id", "storey", "centroid", "area", "height", "volume", "bounding_box", "cells",
-        "completeness", "glimpsed",
+        "completeness", "glimpsed", "confidence", "whole", "entered", "outside",
     ]  # fmt: skip
     assert room["area"] == 20.0 and room["id"] == 1 and room["glimpsed"] is False
     assert room["bounding_box"]["min"] == [2.1, 4.1, 0.5]
@@ -295,6 +295,27 @@ def test_json_fields_and_strictness(scene: TopometricMap, tmp_path: Path) -> Non
     assert listing["storeys"][1]["ceiling"] is None
     assert listing["parameters"]["nothing"] is None
     assert list(listing["seconds"]) == ["read and voxelise", "rooms"]
+
+
+def test_maps_of_earlier_versions_open(saved: Path, scene: TopometricMap, tmp_path: Path) -> None:
+    """Their tables of rooms say nothing of probabilities: what was mostly unseen was only looked into."""
+    rooms = archive.read(saved)["rooms"]
+    older = np.zeros(len(rooms), OLDER_ROOMS)
+    for name in OLDER_ROOMS.names or ():
+        older[name] = rooms[name]
+    opened = load_map(rewritten(saved, tmp_path / "old.tmap", rooms=older)).rooms
+    assert all((opened[name] == scene.rooms[name]).all() for name in OLDER_ROOMS.names or ())
+    assert (opened["entered"] == ~opened["glimpsed"]).all() and (opened["entered"] == opened["whole"]).all()
+    assert (opened["confidence"] == 1).all() and (opened["outside"] == 0).all()
+    assert opened["glimpsed"].any() and not opened["glimpsed"].all()
+
+
+@pytest.mark.parametrize("name", ROOM_ODDS)
+@pytest.mark.parametrize("value", [-0.01, 1.01, np.nan, np.inf])
+def test_odds_that_are_none_are_refused(name: str, value: float, saved: Path, tmp_path: Path) -> None:
+    rooms = archive.read(saved)["rooms"].copy()
+    rooms[name][3] = value
+    refused(rewritten(saved, tmp_path / "bad.tmap", rooms=rooms), name)
 
 
 def test_json_of_odd_values(scene: TopometricMap, tmp_path: Path) -> None:

@@ -49,7 +49,8 @@ def test_conflict_speaks_against_a_hypothesis():
 def test_features_of_a_match():
     a, b = building(2), building(2)
     a.rooms["area"], b.rooms["area"] = (12.0, 0.1, 30.0, 8.0, 9.0), (10.0, 20.0, 4.0, 8.0, 9.0)
-    a.rooms["glimpsed"], b.rooms["glimpsed"] = (True, False, False, False, False), (True, False, True, False, False)
+    a.rooms["completeness"], b.rooms["completeness"] = (0.5, 1.0, 0.6, 0.9, 0.8), (0.2, 0.7, 0.59, 1.0, 1.0)
+    a.rooms["glimpsed"] = ~a.rooms["glimpsed"]  # that it was only looked into is another thing, and counts for nothing here
     rooms, fit = np.array([[0, 0], [1, 1], [2, 2], [3, 3], [3, 4]]), np.array([0.9, 0.8, 0.7, 0.6, 0.5])
     features = match_features(a, b, rooms, fit)
     assert features[:, :2] == pytest.approx(np.column_stack([np.ones(5), fit]))
@@ -62,6 +63,6 @@ def test_features_of_a_match():
 
 def test_rooms_that_fit_well_are_likelier_one_than_glimpsed_scraps():
     a, b = building(2), building(2)
-    a.rooms["area"][2], a.rooms["glimpsed"][2] = 0.3, True
+    a.rooms["area"][2], a.rooms["completeness"][2] = 0.3, 0.2
     good, poor, scrap = match_probability(a, b, np.array([[0, 0], [1, 1], [2, 2]]), np.array([0.95, 0.2, 0.2]))
     assert 1 > good > poor > scrap > 0

@@ -21,6 +21,7 @@ from topomerge.extraction.elevations.wall_doors import DoorCandidates, door_chan
 from topomerge.extraction.elevations.wall_network import place_probabilities
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
+from topomerge.extraction.room_odds import room_weights
 from topomerge.fusion.evidence.network import weights as place_weights
 from topomerge.fusion.verify import model
 from topomerge.io.weight_files import VARIABLE, weights_file
@@ -43,7 +44,7 @@ NETWORKS = {
     "room_matcher": ["epochs=2", "steps=2", "batch=2", "width=8", "layers=1"],
 }
 WITHOUT_MORE = {"merge_belief": ["lookalikes=none", "floor=0"]}  # data that takes minutes to make
-FITS = ("merge_belief", "match_odds", "feature_scale", "wall_doors")
+FITS = ("merge_belief", "room_odds", "match_odds", "feature_scale", "wall_doors")
 
 
 def quiet(text: str) -> None:
@@ -64,6 +65,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(room_matcher, "read_examples", lambda *_: tiny.room_examples(4))
     for task, name, make in (
         ("merge_belief", "belief_rows", tiny.belief_rows),
+        ("room_odds", "room_scans", tiny.room_scans),
         ("match_odds", "pair_evidence", tiny.evidence),
         ("feature_scale", "pair_features", tiny.feature_pairs),
     ):
@@ -93,6 +95,7 @@ def read(task: str) -> Any:
         "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
         "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(3, EDGE_DTYPE), np.ones((3, 11)), np.arange(3))),
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
+        "room_odds": lambda: np.array(room_weights()["entered"]),
         "match_odds": lambda: odds_weights("match"),
         "feature_scale": lambda: scaled(np.ones((2, 18)), "matched"),
     }[task]()
@@ -212,6 +215,7 @@ SIMULATED = {
     "door_classification": ["data=plan_scans", "data.scans=4", "data.seed=0", "epochs=2", "hold_out=2", "heldout.scans=1"],
     "wall_segmentation": [*NETWORKS["wall_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "wall_doors": ["data.scans=2", "data.seed=0", "heldout.scans=2", "folds=2"],
+    "room_odds": ["data=plan_scans", "data.scans=4", "data.seed=0", "folds=2", "heldout.scans=1"],
     "place_evidence": [*NETWORKS["place_evidence"], *SMALL_GRIDS],
     "merge_belief": [*SMALL_GRIDS, *WITHOUT_MORE["merge_belief"], "folds=2"],
     "match_odds": [*SMALL_PAIRS, "folds=2"],

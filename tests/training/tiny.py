@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from topomerge.datasets.pairs.plan_examples import PlanExample, PlanItem, example_arrays
+from topomerge.datasets.pairs.plan_examples import PlanExample, example_arrays
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
+from topomerge.datasets.pairs.scan_items import PlanItem
 from topomerge.datasets.pairs.wall_examples import WallExample, WallItem, wall_arrays
 
 from topomerge.embedding.engineered import FEATURES
@@ -17,6 +18,7 @@ from topomerge.embedding.turns import FACTS, TurnedRows
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.room_features import POSE_FEATURES, ROOM_FEATURES
 from topomerge.fusion.evidence.crops import LOOKED, SIDE
 from topomerge.io import archive
 from topomerge.matching.odds import hypothesis_features
@@ -166,6 +168,16 @@ def evidence(*_: Any) -> list[Evidence]:
         rooms = np.column_stack([np.ones(8), one + rng.random(8), rng.random(8), np.zeros(8), np.zeros(8)])
         pairs.append(Evidence(f"b{k}", hypothesis_features(metres), right, rooms, one))
     return pairs
+
+
+def room_scans(*_: Any) -> list[dict[str, Any]]:
+    """Rooms of scans of which those with a higher first feature were entered; every third scan has no poses."""
+    rng, scans = np.random.default_rng(0), []
+    for k in range(16):
+        x, p = rng.random((9, len(ROOM_FEATURES))), rng.random((9, len(POSE_FEATURES)))
+        scan = {"x": x, "one": x[:, 1] > 0.3, "whole": x[:, 2] > 0.5, "entered": x[:, 0] > 0.5, "outside": x[:, 3] < 0.1}
+        scans.append(scan if k % 3 == 0 else {**scan, "posed.x": x, "posed.p": p, "posed.entered": p[:, 0] > 0.5})
+    return scans
 
 
 def feature_pairs(*_: Any) -> list[PairFeatures]:

@@ -27,7 +27,7 @@ import numpy as np
 from topomerge.embedding.schema import EDGE_KINDS
 from topomerge.errors import InputError
 from topomerge.extraction.storeys import lowest_of_column
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, TopometricMap, mostly_unseen
 
 if TYPE_CHECKING:
     from torch_geometric.data import Data
@@ -115,7 +115,7 @@ def _room_features(map: TopometricMap, index: Array, doors: Array, spread: Array
     columns = [
         rooms["area"], rooms["height"], rooms["volume"], sides[:, 0], sides[:, 1], sides[:, 1] / np.maximum(sides[:, 0], 1e-6),
         rooms["area"] / box, spread, degree, *of_kind, widths / np.maximum(of_kind[0] + of_kind[1], 1), reach,
-        rooms["completeness"], rooms["glimpsed"],
+        rooms["completeness"], mostly_unseen(rooms),
     ]  # fmt: skip
     return np.stack(columns, axis=1).astype(np.float32)
 

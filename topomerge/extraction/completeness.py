@@ -9,7 +9,6 @@ from topomerge.extraction.convolution import Kernel, any_at
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import Array, VoxelGrid
 
-GLIMPSED_SHARE = 0.6  # rooms of which less of the outline was seen were only looked into
 STEP_HEIGHT = 0.3  # m: floor beside a cell may be this much higher or lower
 WALL_SIGHT = (0.3, 1.5)  # m above the floor: where a wall has to be seen
 PLAN_WALL_REACH = 0.15  # m: between a floor and its wall in a plan

@@ -9,15 +9,16 @@ from typing import Any
 from topomerge.extraction.elevations.wall_doors import with_wall_doors
 from topomerge.extraction.free_space import free_space
 from topomerge.extraction.navigable import navigable_volume
-from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, chosen_parameters
+from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
 from topomerge.extraction.plans.plan_rooms import rooms_of_plans
+from topomerge.extraction.room_odds import with_room_odds
 from topomerge.extraction.scan import Scan, read_scan
 from topomerge.extraction.slices import with_raised_slice
 from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.views.view_rooms import rooms_of_views
 from topomerge.extraction.walked_doors import with_walked_doors
-from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid
+from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid, with_outline_odds
 
 COARSE_CELL = 0.15  # m: in larger ones, the walls beside a door leave too little of it
 
@@ -64,10 +65,8 @@ def extract(
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
 
-    if isinstance(p, DefaultParameters):
-        watch.begin("doors on walls", 0.87)
-        map, doubts = _with_more_doors(map, scan, p.walls)
-        scan = replace(scan, warnings=(*scan.warnings, *doubts))
+    watch.begin("odds of rooms, doors on walls", 0.87)
+    map, doubts = _with_odds_and_doors(map, scan, p)
 
     watch.begin("free space", 0.9)
     free = free_space(scan, navigable, p.range) if p.carve else scan.free
@@ -79,16 +78,20 @@ def extract(
         source=scan.source if name is None else name,
         parameters={**chosen, "preset": preset if isinstance(preset, str) else "custom"},
         seconds=watch.end(),
-        warnings=(*scan.warnings, *_doubts(map)),
+        warnings=(*scan.warnings, *doubts, *_doubts(map)),
     )
 
 
-def _with_more_doors(map: TopometricMap, scan: Scan, walls: bool) -> tuple[TopometricMap, tuple[str, ...]]:
-    """The map with the doors that its walls show, and those that the sensor was carried through; and what is odd about them."""
-    if walls and scan.fine is not None:
+def _with_odds_and_doors(map: TopometricMap, scan: Scan, p: Parameters) -> tuple[TopometricMap, list[str]]:
+    """The map with how likely each room is one, with the doors that its walls show, and with those that the sensor was carried
+    through; and what is odd about its way."""
+    if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
+        return replace(map, rooms=with_outline_odds(map.rooms)), []
+    map = with_room_odds(map, scan.rays)
+    if p.walls and scan.fine is not None:
         map = with_wall_doors(map, scan.fine)
     map, doubt = with_walked_doors(map, scan.places)
-    return map, (doubt,) if doubt else ()
+    return map, [doubt] if doubt else []
 
 
 def _doubts(map: TopometricMap) -> list[str]:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.classified_storey import leads_through_wall
-from topomerge.extraction.completeness import GLIMPSED_SHARE, completeness
+from topomerge.extraction.completeness import completeness
 from topomerge.extraction.doors import find_edges
 from topomerge.extraction.floor import Floor
 from topomerge.extraction.storeys import ceiling_height, floor_to_ceiling, lowest_of_column
@@ -71,7 +71,6 @@ def _measured_rooms(grid: VoxelGrid, room: Array, floor: Floor, label: Array, ab
         rooms["completeness"] = floor.completeness[numbers]
     else:
         rooms["completeness"] = completeness(grid, cells, label, count, floor.body_width)
-    rooms["glimpsed"] = rooms["completeness"] < GLIMPSED_SHARE
     lowest = lowest_of_column(cells)
     order = lowest[np.argsort(label[lowest], kind="stable")]
     floor_of = np.split(order, np.searchsorted(label[order], np.arange(count + 1)))[1:-1]

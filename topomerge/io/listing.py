@@ -6,15 +6,16 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
     {"format": 1, "source": "a.ply", "voxel_size": 0.1,
      "rooms": [{"id", "storey", "centroid": [x, y, z], "area", "height", "volume",
                 "bounding_box": {"min": [x, y, z], "max": [x, y, z]}, "cells",
-                "completeness", "glimpsed"}, …],
+                "completeness", "glimpsed", "confidence", "whole", "entered", "outside"}, …],
      "edges": [{"rooms": [id, id], "door": {"centre": [x, y, z], "width", "height", "direction"}, "kind",
                 "open", "confidence", "lower": [x, y, z], "upper": [x, y, z]}, …],
      "areas": [{"id", "room", "centroid": [x, y, z], "area"}, …], "narrows": [like edges, "areas" for "rooms"],
      "storeys": [{"id", "floor", "ceiling", "area"}, …],
      "seconds": {step: s}, "parameters": {…}, "warnings": […]}
 
-`completeness` is the share of a floor's outline at which a wall was seen; `glimpsed` rooms were only looked into. `kind` is
-door, opening or stairs; `direction` is that of the wall's normal seen from above, from x towards y.
+`completeness` is the share of a floor's outline at which a wall was seen; `confidence` the probability that it is a room, `whole`
+that most of it was seen, `entered` that the sensor was in it, `outside` that it is out of doors; `glimpsed` rooms were probably
+only looked into. `kind` is door, opening or stairs; `direction` is that of the wall's normal seen from above, from x towards y.
 """
 
 from __future__ import annotations
@@ -29,10 +30,16 @@ from typing import Any
 import numpy as np
 
 from topomerge.io.atomic import replacing
-from topomerge.types import TopometricMap
+from topomerge.types import ROOM_ODDS, TopometricMap
 
 LISTING_FORMAT = 1
 DIGITS = 6  # micrometres: the digits behind are noise
+
+
+def room_words(room: Any) -> list[str]:
+    """What is said of a row of ROOM_DTYPE: `outside`, `glimpsed` (only looked into), `doubtful` (probably no room)."""
+    words = (("outside", room["outside"] > 0.5), ("glimpsed", room["glimpsed"]), ("doubtful", room["confidence"] < 0.5))
+    return [word for word, so in words if so]
 
 
 def plain(value: Any) -> Any:
@@ -65,6 +72,7 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
             "cells": room["cells"],
             "completeness": room["completeness"],
             "glimpsed": room["glimpsed"],
+            **{name: room[name] for name in ROOM_ODDS},
         }
         for i, room in enumerate(map.rooms)
     ]
@@ -152,7 +160,7 @@ def _room_rows(map: TopometricMap) -> Iterable[Sequence[str]]:
             _number(room["height"], 2, room["height"] == 0),
             str(room["cells"]),
             str(doors[i]),
-            ", ".join(beside) + ("  glimpsed" if room["glimpsed"] else ""),
+            "  ".join([", ".join(beside), *room_words(room)]),
         )
 
 

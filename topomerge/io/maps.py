@@ -31,7 +31,17 @@ from topomerge.io import archive
 from topomerge.io.listing import map_to_json, plain, save_json
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.kernels import morton
-from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
+from topomerge.types import (
+    AREA_DTYPE,
+    EDGE_DTYPE,
+    ROOM_DTYPE,
+    ROOM_ODDS,
+    STOREY_DTYPE,
+    Array,
+    TopometricMap,
+    VoxelGrid,
+    with_outline_odds,
+)
 
 __all__ = ["TMAP_FORMAT", "load_map", "map_to_json", "save_json", "save_map", "save_rooms_ply"]
 
@@ -45,6 +55,7 @@ EDGES_PER_ROOM, AREAS_PER_ROOM = 20, 20  # on average
 COORDINATE_LIMIT = 1e9  # m, either way: beyond, float64 is coarser than 0.1 micrometres
 AREA_LIMIT = 1e12  # m2, and m3 for volumes
 SHORTEST_CELL_EDGE, LONGEST_CELL_EDGE = 0.001, 10.0  # m
+OLDER_ROOMS = np.dtype([(n, ROOM_DTYPE[n]) for n in ROOM_DTYPE.names or () if n not in ROOM_ODDS])  # before there were odds
 WARNING_LIMIT, LONGEST_WARNING = 20, 500  # warnings of a map, characters of one
 
 
@@ -171,6 +182,21 @@ def _table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
     return table.astype(dtype, copy=False)
 
 
+def _rooms(arrays: dict[str, Array]) -> Array:
+    """The table of rooms. Files of earlier versions say no probabilities: there a glimpsed room was not entered."""
+    if arrays["rooms"].dtype == OLDER_ROOMS:
+        older = _table(arrays, "rooms", OLDER_ROOMS)
+        rooms = np.zeros(len(older), ROOM_DTYPE)
+        for name in OLDER_ROOMS.names or ():
+            rooms[name] = older[name]
+        return with_outline_odds(rooms)
+    rooms = _table(arrays, "rooms", ROOM_DTYPE)
+    for name in ROOM_ODDS:
+        if not ((rooms[name] >= 0) & (rooms[name] <= 1)).all():
+            raise ValueError(f"rooms has a {name} that is not from 0 to 1")
+    return rooms
+
+
 def _require_sane_counts(arrays: dict[str, Array]) -> None:
     """Refuses tables longer than the cells of the map can fill, before anything is done for each of their rows.
 
@@ -241,7 +267,7 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
         room=_typed(arrays, "room", "i", 1).astype(np.int32),
         navigable=navigable,
         navigable_room=navigable_room,
-        rooms=_table(arrays, "rooms", ROOM_DTYPE),
+        rooms=_rooms(arrays),
         edges=edges,
         storeys=_table(arrays, "storeys", STOREY_DTYPE),
         areas=_table(arrays, "areas", AREA_DTYPE),

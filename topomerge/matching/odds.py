@@ -10,7 +10,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.weight_files import read_weights_json
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, TopometricMap, mostly_unseen
 
 CONFLICT = 2.0  # weight of a metre that disagrees against one that agrees
 FLOOR = 0.1  # m of wall that a m2 of floor in common is worth
@@ -47,17 +47,17 @@ def hypothesis_probability(evidence: Array) -> Array:
 
 
 def match_features(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array) -> Array:
-    """(M, 5) 1, how well two rooms fit, log m2 of the smaller one, how many of both are glimpsed, and whether one of both is in
-    several matches.
+    """(M, 5) 1, how well two rooms fit, log m2 of the smaller one, how many of both are mostly unseen, and whether one of
+    both is in several matches.
 
     Args:
         rooms, fit: (M, 2), (M,) of `consistency.matches_under`.
     """
     i, j = rooms.T
     smaller = np.maximum(np.minimum(a.rooms["area"][i], b.rooms["area"][j]), SCRAP)
-    glimpsed = a.rooms["glimpsed"][i].astype(float) + b.rooms["glimpsed"][j]
+    unseen = mostly_unseen(a.rooms)[i].astype(float) + mostly_unseen(b.rooms)[j]
     several = (np.bincount(i, minlength=1)[i] > 1) | (np.bincount(j, minlength=1)[j] > 1)
-    return np.stack([np.ones(len(fit)), fit, np.log(smaller), glimpsed, several], axis=1)
+    return np.stack([np.ones(len(fit)), fit, np.log(smaller), unseen, several], axis=1)
 
 
 def match_probability(a: TopometricMap, b: TopometricMap, rooms: Array, fit: Array) -> Array:

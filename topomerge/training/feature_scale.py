@@ -23,7 +23,7 @@ from topomerge.training.closed_form import Fitted, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.match_odds import map_pairs
 from topomerge.training.task_settings import FeatureScale
-from topomerge.types import Array
+from topomerge.types import Array, mostly_unseen
 
 CLIPPED = 4.0  # standard deviations that a difference counts for at most
 FOLDS = 5  # of buildings, for the scores
@@ -79,7 +79,7 @@ def features_of(path: Path) -> dict[str, Array]:
     pair = load_evaluation_pair(path)
     maps = pair.maps()
     a, b = (raw_features(m) for m in maps)
-    glimpsed = [np.asarray(m.rooms["glimpsed"], bool) for m in maps]
+    glimpsed = [mostly_unseen(m.rooms) for m in maps]
     i, j = pair.matches.T
     clear = pair.one[0][i] & pair.one[1][j] & ~glimpsed[0][i] & ~glimpsed[1][j]
     building = np.array(str(pair.about["building"]))

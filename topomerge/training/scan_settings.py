@@ -136,3 +136,19 @@ class DoorClassification(NetworkTask):
     networks: int = 5
     noise: float = 0.1
     watch: str = "auc"
+
+
+@dataclass
+class RoomOdds(TaskSettings):
+    """Args:
+    pull: to 0, of all weights but the constant.
+    folds: of scans, for the scores.
+    """
+
+    task: str = "room_odds"
+    name: str = "room_odds"
+    data: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    pull: float = 1.0
+    folds: int = 8
+    watch: str = "entered_auc"

@@ -8,12 +8,22 @@ from topomerge.types.arrays import Array
 from topomerge.types.cloud import PointCloud, TrueRoom
 from topomerge.types.grid import VoxelGrid
 from topomerge.types.similarity import Sim3
-from topomerge.types.topometric_map import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, TopometricMap
+from topomerge.types.topometric_map import (
+    AREA_DTYPE,
+    EDGE_DTYPE,
+    ROOM_DTYPE,
+    ROOM_ODDS,
+    STOREY_DTYPE,
+    TopometricMap,
+    mostly_unseen,
+    with_outline_odds,
+)
 
 __all__ = [
     "AREA_DTYPE",
     "EDGE_DTYPE",
     "ROOM_DTYPE",
+    "ROOM_ODDS",
     "STOREY_DTYPE",
     "Array",
     "PointCloud",
@@ -21,4 +31,6 @@ __all__ = [
     "TopometricMap",
     "TrueRoom",
     "VoxelGrid",
+    "mostly_unseen",
+    "with_outline_odds",
 ]

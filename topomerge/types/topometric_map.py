@@ -22,9 +22,15 @@ ROOM_DTYPE = np.dtype(
         ("hi", "f8", 3),
         ("cells", "i8"),  # occupied cells
         ("completeness", "f8"),  # share of the floor's outline at which a wall or another room was seen
-        ("glimpsed", "?"),  # most of the outline was not seen: looked into through a door or a window
+        ("glimpsed", "?"),  # only looked into, through a door or a window: `entered` is below a half
+        ("confidence", "f8"),  # that it is one room: 0..1, as all that follow
+        ("whole", "f8"),  # that most of its floor was seen
+        ("entered", "f8"),  # that the sensor was in it
+        ("outside", "f8"),  # that it lies out of doors: a terrace, a street seen through a window
     ]
 )
+ROOM_ODDS = ("confidence", "whole", "entered", "outside")  # columns of ROOM_DTYPE that are probabilities
+GLIMPSED_SHARE = 0.6  # of its outline, of which less was seen of a room that is mostly unseen
 EDGE_DTYPE = np.dtype(
     [
         ("rooms", "i4", 2),
@@ -47,6 +53,29 @@ AREA_DTYPE = np.dtype(
     ]
 )
 STOREY_DTYPE = np.dtype([("floor", "f8"), ("ceiling", "f8"), ("area", "f8")])  # m, m (nan: not seen), m2
+
+
+def mostly_unseen(rooms: Array) -> Array:
+    """(R,) bool: was less of a room's outline seen than `GLIMPSED_SHARE`? What learned parts were trained with.
+
+    Args:
+        rooms: (R,) ROOM_DTYPE.
+    """
+    return np.asarray(rooms["completeness"] < GLIMPSED_SHARE)
+
+
+def with_outline_odds(rooms: Array) -> Array:
+    """Rooms with what the outline alone says of them, for maps of which nothing better is known: those that are mostly unseen
+    were only looked into, all are rooms, and none is outside.
+
+    Args:
+        rooms: (R,) ROOM_DTYPE; stays as it is.
+    """
+    rooms = rooms.copy()
+    rooms["glimpsed"] = mostly_unseen(rooms)
+    rooms["confidence"], rooms["outside"] = 1.0, 0.0
+    rooms["entered"] = rooms["whole"] = ~rooms["glimpsed"]
+    return rooms
 
 
 @dataclass(frozen=True, eq=False)

@@ -164,6 +164,9 @@ def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], col
     for layer, name, on in layers:
         box = element("input", type="checkbox", checked=on, data_layer=layer)
         boxes.append(element("label", box, f" {name}"))
+    if len(map.rooms):
+        slider = element("input", type="range", min=0, max=90, step=10, value=0, data_sure="")
+        boxes.append(element("label", "rooms listed from this confidence on: ", slider))
     groups = [("choices", choices), ("layers", boxes), ("zoom", zoom_buttons())]
     bar = element("div", *(element("div", *parts, class_=name) for name, parts in groups if parts), class_="controls")
     figures = [
@@ -191,7 +194,7 @@ def legend(map: TopometricMap) -> Markup:
         ("shut", "shut door", bool((way & ~map.edges["open"]).any())),
         ("opening", "opening", bool((map.edges["kind"] == "opening").any())),
         ("stairs", "stairs or ramp", bool((~way).any())),
-        ("glimpsed", "glimpsed: mostly unseen", bool(map.rooms["glimpsed"].any())),
+        ("glimpsed", "glimpsed: only looked into", bool(map.rooms["glimpsed"].any())),
         ("narrow", "narrowing within a room", len(map.narrows) > 0),
         ("wall", "wall, cut at 1 to 1.9 m", True),
         ("seen", "seen, no room", True),

@@ -8,12 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.io.listing import plain
+from topomerge.io.listing import plain, room_words
 from topomerge.io.palette import room_colours
 from topomerge.types import TopometricMap
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.scene import hex_colour
 
+ROOM_WORDS = {  # of `room_words`, and why
+    "outside": "probably out of doors",
+    "glimpsed": "probably only looked into, through a door or a window",
+    "doubtful": "probably no room, or a part of one",
+}
 Column = tuple[str, str]  # heading; "number" or "text"
 
 
@@ -51,7 +56,7 @@ def share_bar(share: float) -> Markup:
 
 def rooms_table(map: TopometricMap, key: str = "") -> Markup:
     """All rooms; rows carry `data-room` and `data-storey`."""
-    names = ("room", "storey", "area m²", "height m", "seen", "doors")
+    names = ("room", "storey", "area m²", "height m", "seen", "entered", "confidence", "doors")
     columns = [*((name, "number") for name in names), ("leads to", "text")]
     several_storeys = len(map.storeys) > 1
     columns = [column for column in columns if several_storeys or column[0] != "storey"]
@@ -62,7 +67,7 @@ def rooms_table(map: TopometricMap, key: str = "") -> Markup:
         swatch = element("span", class_="swatch glimpsed" if room["glimpsed"] else "swatch",
                          style=f"background-color:{hex_colour(colours[i])}")  # fmt: skip
         seen = share_bar(room["completeness"])
-        words = [element("em", "glimpsed", title="most of its outline was not seen")] if room["glimpsed"] else []
+        words = [element("em", word, title=ROOM_WORDS[word]) for word in room_words(room)]
         leads = join([*words, *(room_link(key, other) for other in beside)], " ")
         cells = [
             cell(join([swatch, str(i)]), i),
@@ -70,10 +75,12 @@ def rooms_table(map: TopometricMap, key: str = "") -> Markup:
             measure(room["area"], 1),
             measure(room["height"], 2, room["height"] > 0),
             cell(seen, float(room["completeness"])),
+            *(cell(f"{100 * room[name]:.0f} %", float(room[name])) for name in ("entered", "confidence")),
             cell(str(doors[i]), int(doors[i])),
             cell(leads, kind="text"),
         ]
-        rows.append(element("tr", *cells, data_room=f"{key}{i}", data_storey=int(room["storey"]), tabindex=0))
+        place = {"data_room": f"{key}{i}", "data_storey": int(room["storey"]), "data_sure": f"{room['confidence']:.3f}"}
+        rows.append(element("tr", *cells, **place, tabindex=0))
     return table(columns, rows, "Rooms")
 
 

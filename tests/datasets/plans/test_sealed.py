@@ -85,6 +85,7 @@ def test_an_item_of_a_cache_that_names_a_sealed_seed_is_refused() -> None:
         ("merge_belief", "grids"),
         ("plan_segmentation", "plan_scans"),
         ("door_classification", "door_scans"),
+        ("room_odds", "room_scans"),
         ("match_odds", "matching_train"),
         ("feature_scale", "matching_train"),
     ],

@@ -19,6 +19,7 @@ from topomerge.datasets.simulation.floor_truth import (
     said,
     truth_of,
 )
+from topomerge.datasets.simulation.room_truth import room_truth
 
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, Sim3, TopometricMap, VoxelGrid
 
@@ -115,6 +116,24 @@ def test_only_visited_rooms_are_expected(building, floor, truth) -> None:
     assert judge(replace(whole, rooms=rooms), replace(turned, visited=visited)).rooms.precision == 1
     rooms["glimpsed"] = True  # those that the surveyor stood in count all the same
     assert judge(replace(whole, rooms=rooms), turned).found_rooms == count
+
+
+def test_what_is_true_about_each_room(building, floor, truth) -> None:
+    whole, turned = drawn(building, floor), in_frame(truth, FRAME)
+    about, count = room_truth(whole, turned, building.rooms), len(building.rooms)
+    assert all(v.shape == (count,) and v.dtype == bool for v in vars(about).values())
+    assert about.one.all() and about.whole.all() and about.entered.all() and about.judged.all() and not about.outside.any()
+    visited = truth.visited.copy()
+    visited[2] = False
+    assert (~room_truth(whole, replace(turned, visited=visited), building.rooms).entered).nonzero()[0].tolist() == [2]
+    astray = room_truth(drawn(building, floor, shift=500.0), turned, building.rooms)  # beyond the raster nothing is judged
+    assert not astray.judged.any() and not astray.one.any() and not astray.whole.any()
+    middle = FRAME.inverse().apply(whole.navigable.centroids())[:, 0]
+    left = np.where(
+        (whole.navigable_room == 0) & (middle > np.median(middle[whole.navigable_room == 0])), -1, whole.navigable_room
+    )
+    half = room_truth(replace(whole, room=left.astype(np.int32), navigable_room=left.astype(np.int32)), turned, building.rooms)
+    assert not half.whole[0] and half.entered[0] and half.whole[1:].all()
 
 
 def test_what_was_not_seen_is_not_judged(building, floor, truth) -> None:

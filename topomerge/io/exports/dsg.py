@@ -18,7 +18,7 @@ import shapely
 from topomerge.io.atomic import replacing
 from topomerge.io.palette import room_colours
 from topomerge.structure.floors import floor_polygons, inside
-from topomerge.types import Array, TopometricMap
+from topomerge.types import ROOM_ODDS, Array, TopometricMap
 
 VERSION = {"major": 1, "minor": 1, "patch": 3}
 PLACE_LAYER, ROOM_LAYER, BUILDING_LAYER = 3, 4, 5
@@ -26,6 +26,7 @@ LAYERS = {"AGENTS": 2, "OBJECTS": 2, "PLACES": PLACE_LAYER, "ROOMS": ROOM_LAYER,
 NO_LABEL = 2**32 - 1
 NO_ROTATION = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
 GREY = (128, 128, 128)
+ROOM_METADATA = ("storey", "area", "height", "volume", "completeness", "glimpsed", *ROOM_ODDS)  # columns of ROOM_DTYPE
 Json = dict[str, Any]
 
 
@@ -97,7 +98,7 @@ def _building(map: TopometricMap) -> Iterator[Json]:
 
 def _rooms(map: TopometricMap) -> Iterator[Json]:
     for r, (room, colour) in enumerate(zip(map.rooms, room_colours(map), strict=True)):
-        properties = {name: room[name].tolist() for name in ("storey", "area", "height", "volume", "completeness", "glimpsed")}
+        properties = {name: room[name].tolist() for name in ROOM_METADATA}
         more = {"metadata": properties, "bounding_box": _box(room["lo"], room["hi"]), "semantic_class_probabilities": {}}
         yield _node(ROOM_LAYER, symbol("R", r), "RoomNodeAttributes", f"room {r}", room["centroid"], colour, **more)
 

@@ -21,7 +21,7 @@ from topomerge.io.atomic import replacing
 from topomerge.structure.floors import is_flight, jambs, room_levels
 from topomerge.structure.plan_structure import plan_structure
 from topomerge.structure.walls import wall_part
-from topomerge.types import Array, TopometricMap
+from topomerge.types import ROOM_ODDS, Array, TopometricMap
 
 SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563  # m; the ellipsoid of WGS84
 ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
@@ -107,6 +107,7 @@ def _rooms(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dic
         properties["height"] = round(float(room["height"]), 3) if seen[r] else None
         properties |= {"floor": round(float(levels[r, 0]), 3), "completeness": round(float(room["completeness"]), 3)}
         properties["glimpsed"] = bool(room["glimpsed"])
+        properties |= {name: round(float(room[name]), 3) for name in ROOM_ODDS}
         yield _feature(f"room {r}", _polygons(floor, float(levels[r, 0]), place), properties)
 
 

@@ -19,7 +19,7 @@ from topomerge.io.exports.ifc_model import Model
 from topomerge.structure.floors import is_flight, room_levels
 from topomerge.structure.plan_structure import plan_structure
 from topomerge.structure.walls import wall_part
-from topomerge.types import Array, TopometricMap
+from topomerge.types import ROOM_ODDS, Array, TopometricMap
 
 LEAF_THICKNESS, IFC_SLAB, CEILING_THICKNESS = 0.1, 0.1, 0.05  # m, thickness
 IFC_LINTEL = 2.0  # m, of doors without anything seen above
@@ -87,6 +87,7 @@ class _Building(Model):
             quantities.append(self.new("IfcQuantityVolume", Name="GrossVolume", VolumeValue=float(room["volume"])))
         self._define(space, self._set("IfcElementQuantity", "Qto_SpaceBaseQuantities", r, Quantities=quantities))
         facts = {"Completeness": ("IfcReal", float(room["completeness"])), "Glimpsed": ("IfcBoolean", bool(room["glimpsed"]))}
+        facts |= {name.title(): ("IfcReal", float(room[name])) for name in ROOM_ODDS}
         properties = [self._fact(name, kind, value) for name, (kind, value) in facts.items()]
         self._define(space, self._set("IfcPropertySet", "Topomerge_Room", r, HasProperties=properties))
         return space

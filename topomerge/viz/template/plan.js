@@ -124,10 +124,11 @@ function startPlan(view) {
 
   function filterRows() {
     const all = view.querySelector('input[data-layer="all"]');
+    const least = Number(view.querySelector("input[data-sure]")?.value ?? 0) / 100;
     for (const label of view.querySelectorAll(".label")) {
       const away = !(all && all.checked) && !figures[shown].contains(label);
       for (const element of places.get(placeOf(label)) || []) {
-        if (element.matches("tr")) element.classList.toggle("off", away);
+        if (element.matches("tr")) element.classList.toggle("off", away || Number(element.dataset.sure ?? 1) < least);
       }
     }
   }
@@ -156,7 +157,7 @@ function startPlan(view) {
   });
   view.addEventListener("change", (event) => {
     if (event.target.dataset.layer) sheet.classList.toggle("hide-" + event.target.dataset.layer, !event.target.checked);
-    if (event.target.dataset.layer === "all") filterRows();
+    if (event.target.dataset.layer === "all" || event.target.dataset.sure !== undefined) filterRows();
   });
   sheet.addEventListener("wheel", (event) => {
     if (!sheet.contains(document.activeElement) && !event.ctrlKey) return; // the page scrolls until one has clicked here

@@ -1,0 +1,86 @@
+"""Rooms of simulated scans with what is true about them: what the odds of rooms are fitted to (`extraction.room_odds`).
+
+The scans are drawn as those of `plan_examples` are (`scan_items`). Each is extracted with the sensor's places and as if they were
+unknown. A file holds the rooms of one scan.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+from topomerge.datasets.core.builder import Row, Say, Sharing, build_set, check_sharing, make_item
+from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, VOXEL_SIZES, PlanRecipe, check_plans, real_plans
+from topomerge.datasets.pairs.scan_items import PlanItem, draw_item, scan_of_item
+from topomerge.datasets.plans import splits
+from topomerge.datasets.simulation.floor_truth import in_frame, truth_of
+from topomerge.datasets.simulation.room_truth import room_truth
+from topomerge.datasets.simulation.scanner import moved
+
+from topomerge.extraction.extract import extract
+from topomerge.extraction.room_features import POSE_FEATURES, pose_features, room_features
+from topomerge.extraction.scan import read_scan
+from topomerge.io import archive
+from topomerge.types import Array
+
+ROOM_EXAMPLE_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
+ANSWERS = ("one", "whole", "entered", "outside")
+
+
+def build_rooms(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> list[Path]:
+    """The files of a set, made where they are missing, in the order of the seeds."""
+    check_plans(recipe)
+    check_sharing(sharing)
+    plans = real_plans(recipe)
+    first = splits.seeds(recipe.split)[0] + recipe.seed
+    items = {item.named(ROOM_EXAMPLE_FORMAT): item for item in (draw_item(first + n, plans) for n in range(recipe.scans))}
+    named = {(source, name): plan for source, entries in plans.items() for name, plan in entries}
+    folder = Path(sharing.cache).resolve() / "rooms"
+    tasks = [(item, named.get((item.source, item.plan)), str(folder)) for item in items.values()]
+    begin, step = sharing.part
+    build_set(folder.parent / f"{recipe.name}.jsonl", tasks[begin - 1 :: step], make_room_file, sharing, say, unit="scans")
+    return [path for name in items if (path := folder / f"{name}.npz").exists()]
+
+
+def make_room_file(item: PlanItem, plan: Plan | None, folder: str) -> Row:
+    """Make an item's file."""
+    return make_item(item.named(ROOM_EXAMPLE_FORMAT), folder, lambda: room_rows(item, plan), LONGEST_SCAN)
+
+
+def room_rows(item: PlanItem, plan: Plan | None) -> Mapping[str, Array]:
+    """Features and answers of the rooms of a scan: `x` and answers without poses; `posed.x`, `posed.p` and answers with them."""
+    made = scan_of_item(item, plan)
+    visited = np.isin(np.arange(len(made.building.rooms)), made.visited)
+    anchors, drift = made.shift or (None, None)
+    points = made.cloud.points.astype(np.float64) + made.cloud.shift
+    truth = in_frame(truth_of(made.building, visited, points, anchors, drift), made.frame)
+    cloud, voxel = moved(made.cloud, made.frame), VOXEL_SIZES[item.seed % len(VOXEL_SIZES)]
+    arrays: dict[str, Array] = {}
+    for prefix, source in (("", replace(cloud, poses=None, pose_of=None)), ("posed.", cloud)):
+        if source.poses is None and prefix:
+            continue
+        map = extract(source, voxel_size=voxel, carve=False)
+        answers = room_truth(map, truth, made.building.rooms)
+        rows = answers.judged
+        arrays |= {f"{prefix}{name}": getattr(answers, name)[rows] for name in ANSWERS}
+        arrays[f"{prefix}x"] = room_features(map)[rows]
+        if prefix:
+            poses = pose_features(map, read_scan(cloud, voxel).rays)
+            arrays["posed.p"] = (np.full((len(rows), len(POSE_FEATURES)), np.nan) if poses is None else poses)[rows]
+    about = {"file": f"{item.named(ROOM_EXAMPLE_FORMAT)}.npz", **asdict(item), "sensor": made.sensor}
+    return {**arrays, "about": np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)}
+
+
+def read_room_rows(path: Path) -> dict[str, Array]:
+    """The arrays of a file, and its sensor.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    arrays = archive.read(path, "cached rooms")
+    arrays["sensor"] = np.array(json.loads(arrays.pop("about").tobytes())["sensor"])
+    return arrays

@@ -1,0 +1,160 @@
+"""Odds of rooms: who was where, by the sensor's places or by what was seen; probabilities that do not depend on order or turn."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests import scenes
+from topomerge.errors import InputError
+from topomerge.extraction.extract import extract
+from topomerge.extraction.room_features import POSE_FEATURES, ROOM_FEATURES, pose_features, room_features
+from topomerge.extraction.room_odds import ROOM_ODDS_FILE, with_room_odds
+from topomerge.io.weight_files import VARIABLE, weights_file
+from topomerge.kernels.sight import seen_from
+from topomerge.types import ROOM_ODDS, Array, PointCloud, Sim3, TopometricMap, mostly_unseen, with_outline_odds
+
+LEFT, RIGHT = (2.0, 2.0, 1.4), (6.0, 2.0, 1.4)  # places of a sensor in both rooms
+
+
+@pytest.fixture(scope="module")
+def points() -> Array:
+    return scenes.two_rooms().points(0.01)
+
+
+@pytest.fixture(scope="module")
+def glimpse(points: Array) -> Array:
+    """A scanner at LEFT looks through the door, which is narrower than the room behind it."""
+    beyond = points[:, 0] > 4.2
+    slope = (points[:, 1] - 2) / np.maximum(points[:, 0] - 2.0, 0.1)
+    rise = (points[:, 2] - 1.4) / np.maximum(points[:, 0] - 2.0, 0.1)
+    return points[~beyond | ((np.abs(slope) < scenes.DOOR[0] / 2 / 2.0) & (rise < (scenes.DOOR[1] - 1.4) / 2.0))]
+
+
+def scan(points: Array, *places: tuple[float, float, float]) -> PointCloud:
+    """A cloud of which every place of the sensor saw an equal part."""
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
+    return PointCloud(points.astype(np.float32), poses=poses, pose_of=np.arange(len(points), dtype=np.int32) % len(places))
+
+
+def side_rooms(map: TopometricMap) -> tuple[int, int]:
+    """The left and the right room."""
+    order = np.argsort(map.rooms["centroid"][:, 0])
+    assert len(order) == 2
+    return int(order[0]), int(order[1])
+
+
+def test_a_room_without_a_place_of_the_sensor_was_looked_into(points: Array, glimpse: Array) -> None:
+    one = extract(scan(points, LEFT), carve=False)
+    left, right = side_rooms(one)
+    assert one.rooms["entered"][left] > 0.9 and not one.rooms["glimpsed"][left]
+    assert one.rooms["entered"][right] < one.rooms["entered"][left]
+    both = extract(scan(points, LEFT, RIGHT), carve=False)
+    assert (both.rooms["entered"] > 0.9).all() and not both.rooms["glimpsed"].any()
+    seen = extract(scan(glimpse, LEFT), carve=False)
+    assert seen.rooms["glimpsed"].tolist() == [room == side_rooms(seen)[1] for room in range(2)]
+    assert (one.rooms["glimpsed"] == (one.rooms["entered"] < 0.5)).all()
+    assert np.array_equal(one.rooms["completeness"], both.rooms["completeness"])
+
+
+def test_without_places_a_cone_through_the_door_was_looked_into(points: Array, glimpse: Array) -> None:
+    map = extract(glimpse, carve=False)
+    left, right = side_rooms(map)
+    assert map.rooms["glimpsed"].tolist() == [room == right for room in range(2)]
+    assert map.rooms["entered"][left] > map.rooms["entered"][right] + 0.3
+    whole = extract(points, carve=False)
+    assert not whole.rooms["glimpsed"].any() and (whole.rooms["outside"] < 0.2).all()
+
+
+def test_features_of_a_cone(points: Array, glimpse: Array) -> None:
+    """The looker sees no wall that the door is in; a corner beside the door is seen from within only."""
+    both = [room_features(extract(p, carve=False)) for p in (points, glimpse)]
+    column = {name: k for k, name in enumerate(ROOM_FEATURES)}
+    assert all(x.shape == (2, len(ROOM_FEATURES)) and np.isfinite(x).all() for x in both)
+    whole, cone = (x[np.argsort(-x[:, column["log_area"]])][-1] for x in both)
+    assert whole[column["walls_hidden"]] > cone[column["walls_hidden"]] + 0.05
+    assert cone[column["walls_hidden"]] < 0.1
+    assert whole[column["ceiling"]] > cone[column["ceiling"]] + 0.2
+
+
+def test_rays_tell_who_was_where(points: Array) -> None:
+    map = extract(points, carve=False)
+    left, right = side_rooms(map)
+    starts = np.where(np.arange(len(points))[:, None] % 4 > 0, LEFT, RIGHT)
+    poses = pose_features(map, (starts, points))
+    assert poses is not None and poses.shape == (2, len(POSE_FEATURES)) and (poses[:, 0] == 1).all()
+    assert poses[left, 1] == pytest.approx(0.75, abs=0.01) and poses[right, 1] == pytest.approx(0.25, abs=0.01)
+    alone = pose_features(map, (np.tile(LEFT, (len(points), 1)), points))
+    assert alone is not None and alone[right].tolist() == [0, 0] and alone[left].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    "place", [(np.nan, 0.0, 0.0), (2.0, np.inf, 1.4), (500.0, 500.0, 1.4), (2.0, 2.0, 60.0)], ids=["nan", "inf", "far", "high"]
+)
+def test_places_over_no_room_say_nothing(points: Array, place: tuple[float, float, float]) -> None:
+    """Poses that are no numbers, of another frame or of another building: the map is judged by what was seen of it."""
+    map = extract(points, carve=False)
+    starts = np.tile(place, (len(points), 1))
+    assert pose_features(map, (starts, points)) is None
+    assert np.array_equal(with_room_odds(map, (starts, points)).rooms, with_room_odds(map).rooms)
+    assert pose_features(map, (np.zeros((0, 3)), np.zeros((0, 3)))) is None and pose_features(map, None) is None
+    some = np.where(np.arange(len(points))[:, None] % 3 > 0, LEFT, place)  # most are good ones: those count
+    assert pose_features(map, (some, points)) is not None
+
+
+def test_odds_are_probabilities_whatever_the_order_and_the_turn(glimpse: Array) -> None:
+    plain = extract(glimpse, carve=False).rooms
+    assert all(((plain[name] >= 0) & (plain[name] <= 1)).all() for name in ROOM_ODDS)
+    shuffled = extract(np.random.default_rng(0).permutation(glimpse), carve=False).rooms
+    assert np.array_equal(plain, shuffled)
+    turned = extract(Sim3(np.pi / 2).apply(glimpse), carve=False).rooms
+    order, other = np.argsort(plain["area"]), np.argsort(turned["area"])
+    assert turned["glimpsed"][other].tolist() == plain["glimpsed"][order].tolist()
+    for name in ROOM_ODDS:
+        assert turned[name][other] == pytest.approx(plain[name][order], abs=0.15)
+
+
+def test_no_rooms_no_odds(points: Array) -> None:
+    map = extract(points, carve=False)
+    none = np.full(len(map.navigable), -1, np.int32)
+    empty = replace(
+        map,
+        room=np.full(len(map.grid), -1, np.int32), navigable_room=none, navigable_area=none, rooms=map.rooms[:0],
+        edges=map.edges[:0], areas=map.areas[:0], narrows=map.narrows[:0],
+    )  # fmt: skip
+    assert len(with_room_odds(empty).rooms) == 0 and room_features(empty).shape == (0, len(ROOM_FEATURES))
+
+
+def test_by_the_outline_alone(points: Array) -> None:
+    """Maps of the thesis' preset, and of earlier files."""
+    rooms = extract(points, carve=False).rooms
+    rooms["completeness"] = (0.59, 0.6)
+    odds = with_outline_odds(rooms)
+    assert mostly_unseen(rooms).tolist() == odds["glimpsed"].tolist() == [True, False]
+    assert odds["entered"].tolist() == [0, 1] and odds["whole"].tolist() == [0, 1]
+    thesis = extract(points, preset="thesis").rooms
+    assert np.array_equal(thesis["glimpsed"], mostly_unseen(thesis))
+
+
+@pytest.mark.parametrize("change", [{"features": ["none"]}, {"entered": [1.0]}, {"scale": [float("nan")] * 13}])
+def test_damaged_weights_are_named(points: Array, change: dict[str, object], tmp_path, monkeypatch) -> None:
+    values = json.loads(weights_file("topomerge.extraction", ROOM_ODDS_FILE).read_text())
+    (tmp_path / ROOM_ODDS_FILE).write_text(json.dumps({**values, **change}))
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    with pytest.raises(InputError, match="room_odds.json: .*task=room_odds"):
+        extract(points, carve=False)
+
+
+def test_sight_ends_at_what_is_not_free() -> None:
+    free = np.ones((9, 9), bool)
+    free[4] = False
+    free[4, 4] = True  # a door
+    targets = np.array([[6, 4], [6, 8], [8, 6], [5, 0]])
+    assert seen_from(free, targets, np.array([[0, 4]]), 20.0).tolist() == [True, False, False, False]
+    assert seen_from(free, targets, np.array([[0, 4], [2, 3]]), 20.0).tolist() == [True, False, True, False]
+    assert not seen_from(free, targets, np.array([[0, 4]]), 5.0).any()
+    assert not seen_from(free, targets, np.zeros((0, 2), np.int64), 20.0).any()

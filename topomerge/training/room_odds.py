@@ -1,0 +1,142 @@
+"""Task `room_odds`: is a room of a map one, whole, entered, outside (`extraction.room_odds`)?
+
+Simulated scans are extracted with and without the sensor's places; what is true about their rooms answers. Each scan counts
+alike per root of its rooms, so that hospitals do not outweigh flats.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import rankdata
+
+from topomerge.datasets.pairs.plan_examples import PlanRecipe
+from topomerge.datasets.pairs.room_examples import build_rooms, read_room_rows
+from topomerge.errors import InputError
+from topomerge.extraction.room_features import POSE_FEATURES, ROOM_FEATURES
+from topomerge.extraction.room_odds import ENTERED_BY_POSES, MODEL_LENGTHS, model_inputs
+from topomerge.numpy_nn import sigmoid
+from topomerge.training.closed_form import Fitted, calibration_error, run_fit
+from topomerge.training.loop import Say
+from topomerge.training.scan_settings import RoomOdds
+from topomerge.types import Array
+
+CLIPPED = (0.005, 0.995)  # quantiles that features are clipped to
+ANSWER_OF = {"confidence": "one", "whole": "whole", "entered": "entered", "outside": "outside", ENTERED_BY_POSES: "posed.entered"}
+Rows = Mapping[str, Array]  # of one scan, as `room_examples.room_rows` makes them
+
+
+def fit(settings: RoomOdds, say: Say) -> dict[str, float]:
+    """Fit all models; the scores of left-out scans."""
+    return run_fit(settings, fit_room_odds, say)
+
+
+def fit_room_odds(settings: RoomOdds, say: Say) -> Fitted:
+    """Weights from all scans, and scores of those that were fitted without each fold of them."""
+    scans = room_scans(settings.data, settings, say)
+    origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(scans)}
+    fold = np.arange(len(scans)) % settings.folds
+    guesses: dict[str, list[Array]] = {name: [] for name in MODEL_LENGTHS}
+    for k in range(settings.folds):
+        rest = [scan for scan, at in zip(scans, fold, strict=True) if at != k]
+        if len(rest) < len(scans):
+            weights = fitted_weights(rest, settings.pull)
+            _guess(weights, [scan for scan, at in zip(scans, fold, strict=True) if at == k], guesses)
+    return Fitted(fitted_weights(scans, settings.pull), _scores(guesses), origin)
+
+
+def room_scans(recipe: PlanRecipe, settings: RoomOdds, say: Say) -> list[Rows]:
+    """The rooms of each scan of a set that has any, cached.
+
+    Raises:
+        InputError: no scan could be made.
+    """
+    scans: list[Rows] = [read_room_rows(path) for path in build_rooms(recipe, settings, say)]
+    scans = [scan for scan in scans if len(scan["x"])]
+    if not scans:
+        raise InputError(f"{recipe.name}: no scan could be made; see the reasons above")
+    return scans
+
+
+def fitted_weights(scans: Sequence[Rows], pull: float) -> dict[str, Any]:
+    """What `room_odds.json` holds."""
+    x = np.concatenate([scan["x"] for scan in scans])
+    low, high = np.quantile(x, CLIPPED, axis=0)
+    clipped = np.clip(x, low, high)
+    standard = {"low": low, "high": high, "mean": clipped.mean(axis=0), "scale": clipped.std(axis=0) + 1e-3}
+    weights: dict[str, Any] = {"features": [*ROOM_FEATURES, *POSE_FEATURES]}
+    weights |= {name: np.round(values, 4).tolist() for name, values in standard.items()}
+    for name in MODEL_LENGTHS:
+        tables = [table for scan in scans if len(table := _table(weights, scan, name)[0])]
+        answers = [answer for scan in scans if len(answer := _table(weights, scan, name)[1])]
+        if not tables:
+            raise InputError("data.scans: too few scans: none has poses")
+        weights[name] = np.round(_logistic(tables, answers, pull), 4).tolist()
+    return weights
+
+
+def _table(weights: dict[str, Any], scan: Rows, name: str) -> tuple[Array, Array]:
+    """Inputs of a model and answers, of the rooms of a scan; none where the model needs poses and the scan has none."""
+    if name != ENTERED_BY_POSES:
+        return model_inputs(weights, scan["x"]), scan[ANSWER_OF[name]]
+    if "posed.x" not in scan or not np.isfinite(scan["posed.p"]).all():
+        return np.zeros((0, MODEL_LENGTHS[name])), np.zeros(0, bool)
+    return model_inputs(weights, scan["posed.x"], scan["posed.p"]), scan[ANSWER_OF[name]]
+
+
+def _logistic(tables: Sequence[Array], answers: Sequence[Array], pull: float) -> Array:
+    """Weights of the most likely logistic model, pulled to 0 but for the constant."""
+    x, y = np.concatenate(tables), np.concatenate(answers)
+    share = np.concatenate([np.full(len(table), 1 / np.sqrt(len(table))) for table in tables])
+    share *= len(share) / share.sum()
+    sign = np.where(y, -1.0, 1.0)
+
+    def loss(w: Array) -> tuple[float, Array]:
+        odds = sign * (x @ w)
+        slope = x.T @ (share * sign * sigmoid(np.clip(odds, -50, 50)))
+        slope[1:] += 2 * pull * w[1:]
+        return float(share @ np.logaddexp(0, odds)) + pull * float(w[1:] @ w[1:]), slope
+
+    weights: Array = minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B").x
+    return weights
+
+
+def _guess(weights: dict[str, Any], scans: Sequence[Rows], guesses: dict[str, list[Array]]) -> None:
+    """Add to each model's guesses (n, 2): probability and whether it is so."""
+    for name in MODEL_LENGTHS:
+        for scan in scans:
+            table, answer = _table(weights, scan, name)
+            p = sigmoid(np.clip(table @ np.array(weights[name]), -30, 30))
+            guesses[name].append(np.column_stack([p, answer]))
+
+
+def _scores(guesses: Mapping[str, Sequence[Array]]) -> dict[str, float]:
+    scores: dict[str, float] = {}
+    for name, parts in guesses.items():
+        rows = np.concatenate([np.zeros((0, 2)), *parts])
+        if len(rows):
+            scores |= {f"{name}_{score}": value for score, value in guess_scores(rows[:, 0], rows[:, 1] > 0).items()}
+    return scores
+
+
+def guess_scores(p: Array, y: Array) -> dict[str, float]:
+    """Area under the ROC curve (a half where all answers are alike), calibration error, log loss and share of answers that are
+    yes, of probabilities (n,) and answers (n,) bool."""
+    yes, no = int(y.sum()), int((~y).sum())
+    above = (rankdata(p)[y].sum() - yes * (yes + 1) / 2) / (yes * no) if yes and no else 0.5
+    p = np.clip(p, 1e-6, 1 - 1e-6)
+    loss = -np.mean(np.log(np.where(y, p, 1 - p)))
+    return {"auc": float(above), "calibration_error": calibration_error(p, y), "log_loss": float(loss), "share": yes / len(y)}
+
+
+def judge(settings: RoomOdds, file: Path, say: Say) -> dict[str, Any]:
+    """Scores of weights on scans of buildings that trained nothing."""
+    weights = json.loads(file.read_text(encoding="utf-8"))
+    guesses: dict[str, list[Array]] = {name: [] for name in MODEL_LENGTHS}
+    _guess(weights, room_scans(settings.heldout, settings, say), guesses)
+    return _scores(guesses)
