@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.extraction.elevations.doors import SHUT_DOOR, extracted, niche, three_doors
+from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
 from topomerge.errors import InputError
 from topomerge.extraction.elevations import wall_doors
@@ -12,6 +14,7 @@ from topomerge.extraction.elevations.doorways import doorways
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, Elevations
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
 from topomerge.extraction.elevations.wall_network import read_network
+from topomerge.types import Sim3
 
 STEP = 2 * ALONG
 
@@ -110,3 +113,30 @@ def test_damaged_weights_are_refused(tmp_path):
     np.savez(path, **{"a.w": np.zeros((9, 4)), "a.b": np.zeros(4)})
     with pytest.raises(InputError, match="walls"):
         read_network(path)
+
+
+def test_a_wide_opening_of_the_plan_stays_though_walls_show_no_door():
+    map = two_doors(0)[0]
+    map.edges["width"], map.edges["kind"] = 2.4, "opening"
+    candidates = seen(chances(8), map)
+    assert door_chance(candidates).tolist() == [pytest.approx(0.9)]
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_a_shut_door_between_two_rooms_is_an_edge_and_an_open_one_lies_in_its_wall(turn):
+    map = extracted(three_doors().points(0.003), turn)
+    back = Sim3(turn).inverse().apply(map.edges["centre"])
+    doors = {round(float(y), 1): edge for (_, y, _), edge in zip(back, map.edges, strict=True)}
+    places = sorted(doors)
+    assert places == pytest.approx([SHUT_DOOR, 4.0], abs=0.15) and back[:, 0] == pytest.approx(4.0, abs=0.15)
+    assert [bool(doors[y]["open"]) for y in places] == [False, True]
+    assert all(0.7 < doors[y]["width"] < 1.1 and doors[y]["rooms"].tolist() == [0, 1] for y in places)
+
+
+def test_without_a_look_at_walls_the_shut_door_is_none():
+    assert extracted(three_doors().points(0.003), walls=False).edges["open"].tolist() == [True]
+
+
+def test_a_cupboard_and_a_board_are_no_doors():
+    map = extracted(niche(two_rooms()).points(0.003))
+    assert len(map.edges) == 1 and map.edges["open"].all()

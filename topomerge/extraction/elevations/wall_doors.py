@@ -75,7 +75,8 @@ def with_wall_doors(map: TopometricMap, cells: VoxelGrid) -> TopometricMap:
 
 
 def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]] | None = None) -> Array:
-    """(n,) probability that each is a door.
+    """(n,) probability that each is a door. Wide openings that the plan alone shows are as likely as the plan says: walls show
+    doors, and without the opening two rooms between which one walks would not be joined.
 
     Args:
         models: of each of `SOURCES` a constant and the weights of `WALL_DOOR_FEATURES`; None: those that ship.
@@ -86,7 +87,10 @@ def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]
     models = read_weights_json("topomerge.extraction.elevations", WALL_DOORS_FILE) if models is None else models
     table = np.array([models.get(name, ()) for name in SOURCES], float)
     weights = table[candidates.source]
-    return sigmoid((weights[:, 1:] * candidates.features).sum(axis=1) + weights[:, 0])
+    chance = sigmoid((weights[:, 1:] * candidates.features).sum(axis=1) + weights[:, 0])
+    plan, wide = (WALL_DOOR_FEATURES.index(name) for name in ("plan", "wide"))
+    opening = (candidates.source == SOURCES.index("plan")) & (candidates.features[:, wide] > 0)
+    return np.where(opening, candidates.features[:, plan], chance)
 
 
 def door_candidates(map: TopometricMap, walls: Elevations) -> DoorCandidates:
