@@ -97,8 +97,8 @@ class WallJob(NetworkJob):
 
 def answers(truth: Array, strips: Array) -> tuple[Array, Array]:
     """(n / 2,) class of each answer, that of its first element, and was anything seen there?"""
-    there = strips.reshape(len(strips), -1).any(axis=1)
-    return truth[::PLACES].astype(np.int64), there.reshape(-1, PLACES).any(axis=1)
+    there: Array = np.asarray(strips.reshape(len(strips) // PLACES, -1).any(axis=1))
+    return truth[::PLACES].astype(np.int64), there
 
 
 def stretch(scan: WallExample, middle: int, options: WallSegmentation, rng: np.random.Generator) -> Stretch:
