@@ -138,7 +138,7 @@ def judged(truth: Truth, columns: Array, count: int) -> Verdict:
     every = (truth.raster != NOT_JUDGED) & (columns >= 0)
     glimpsed = 2 * np.bincount(columns[foreign], minlength=count) > np.bincount(columns[every], minlength=count)
     edges = np.zeros(0, [("rooms", "<i4", 2), ("kind", "<U8"), ("centre", "<f8", 3)])
-    rooms = np.zeros(count, [("glimpsed", bool)])
+    rooms = np.zeros(count, [("glimpsed", bool), ("outside", float)])
     rooms["glimpsed"] = glimpsed
     storeys = np.zeros(0, [("floor", "<f8")])
     return judge(SimpleNamespace(rooms=rooms, edges=edges, storeys=storeys), truth, columns)
