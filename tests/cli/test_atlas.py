@@ -74,7 +74,7 @@ REGISTRATIONS = [[], {"features": []}, {"yaw": 10**400}, {"translation": 3}, {"s
 @pytest.mark.parametrize("strange", REGISTRATIONS)
 def test_strange_registrations_are_made_anew(run: Run, folder: Path, strange: object) -> None:
     from topomerge.fusion.atlas.registration_cache import read_registrations
-    from topomerge.fusion.atlas.store import read_atlas
+    from topomerge.fusion.atlas.stored import read_atlas
 
     path = folder / "house" / "pairs.json"
     before = path.read_text()

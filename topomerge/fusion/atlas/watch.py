@@ -1,0 +1,257 @@
+"""A folder that is watched: what lies or appears in it becomes maps of an atlas.
+
+Each look at the folder compares sizes and times with those of the last one; what has not changed for a while is taken as written.
+Maps and what is noted of their files are written in one change of the atlas: whenever a watch is stopped, the next one goes on.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from topomerge.errors import InputError
+from topomerge.fusion.atlas.memory import Memory
+from topomerge.fusion.atlas.replacement import Longer, longer_version, replaced
+from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.atlas.sources import SOURCES_FILE, Source, digest_of, read_sources, sources_to_json, stamp_of
+from topomerge.fusion.atlas.store import Change, Report, change, entry_of
+from topomerge.fusion.atlas.stored import Stored, check_folder
+from topomerge.fusion.inputs import check_cells, check_units
+from topomerge.io.maps import load_map
+from topomerge.io.points import suffixes
+from topomerge.types import TopometricMap
+
+MAPS_AT_ONCE, SECONDS_AT_ONCE = 8, 10.0  # that are read before they are written: a stop costs no more
+NAMED_AT_MOST = 6  # maps, in a line
+PICTURES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """How the files of a folder are read.
+
+    Args:
+        read: gives the map of a file or a folder of scans.
+        options: all that it depends on beside the file; with others all files are read again.
+        failure: one line of an error, or None for one that ends the watch.
+    """
+
+    read: Callable[[Path], TopometricMap]
+    options: str
+    failure: Callable[[Exception, Path], str | None]
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """A file that was looked at; a map only where it is a new one."""
+
+    path: Path
+    source: Source
+    map: TopometricMap | None = None
+
+
+@dataclass(eq=False)
+class Watch:
+    """A folder and the atlas of its maps.
+
+    Args:
+        folder: that is watched; what lies right in it is one map each.
+        atlas: its folder, which may lie in the other one.
+        reader: of the files.
+        report: as of `store.add`.
+        tell: takes a line, and whether it is a warning.
+        settle: s that a file must not have changed, before it is read.
+        replacing: may a file that was changed give a longer version of its map, which then takes that one's place?
+        settings: of the atlas, those that are not the usual ones.
+        counts: "added", "replaced" and "unreadable" so far.
+    """
+
+    folder: Path
+    atlas: Path
+    reader: Reader
+    report: Report
+    tell: Callable[[str, bool], None]
+    settle: float = 2.0
+    replacing: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        if not self.folder.is_dir():
+            raise InputError(f"{self.folder}: no such folder; name the folder in which scans or maps appear")
+        if self.folder.resolve() == self.atlas.resolve():
+            raise InputError(f"{self.folder}: is watched and can't be the atlas, too; give another folder for it")
+        check_folder(self.atlas)
+        self._since: dict[str, tuple[str, float]] = {}
+        self.memory = Memory()
+
+    def look(self) -> bool:
+        """Put what is new or changed, and written, into the atlas; is there anything that is just being written?
+
+        Raises:
+            InputError: the folder is gone, or the atlas can't be written.
+        """
+        check_folder(self.atlas)
+        sources, now = read_sources(self.atlas), time.monotonic()
+        stamps = {str(p): stamp_of(p) for p in self._inputs()}
+        stamps = {p: stamp for p, stamp in stamps.items() if stamp and stamp != sources.get(p, Source("", "")).stamp}
+        before, self._since = self._since, {}
+        for path, stamp in stamps.items():
+            seen, since = before.get(path, ("", now))
+            self._since[path] = (stamp, since if seen == stamp else now)
+        settled = [p for p, (_, since) in self._since.items() if now - since >= self.settle]
+        for batch in self._batches(sorted(settled)):
+            self._write(batch)
+        return len(settled) < len(stamps)
+
+    def _inputs(self) -> list[Path]:
+        """What may be a map."""
+        try:
+            there = sorted(p for p in self.folder.resolve().iterdir() if not p.name.startswith("."))
+        except OSError as error:
+            raise InputError(f"{self.folder}: can't be read ({error.strerror or error}); is it there?") from error
+        described = {p.stem for p in there if p.suffix.lower() in (".yaml", ".yml")}  # their pictures are no maps of their own
+        kinds = {*suffixes(), ".tmap"}
+        own = [p for p in there if not (p.suffix.lower() in PICTURES and p.stem in described)]
+        return [p for p in own if (p.is_dir() and p != self.atlas.resolve()) or (p.is_file() and p.suffix.lower() in kinds)]
+
+    def _batches(self, paths: list[str]) -> Iterator[list[_Looked]]:
+        """Read files, as many as are written at once."""
+        batch, began = list[_Looked](), time.monotonic()
+        for path in paths:
+            looked = self._looked(Path(path))
+            if looked is not None:
+                batch.append(looked)
+            maps = sum(one.map is not None for one in batch)
+            if maps >= MAPS_AT_ONCE or (batch and time.monotonic() - began > SECONDS_AT_ONCE):
+                yield batch
+                batch, began = [], time.monotonic()
+        if batch:
+            yield batch
+
+    def _looked(self, path: Path) -> _Looked | None:
+        """What a file gives; None where it changes meanwhile."""
+        stamp, sources = stamp_of(path), read_sources(self.atlas)
+        try:
+            digest = digest_of(path, self.reader.options)
+            same = next((s for s in sources.values() if s.digest == digest and s.map), None)
+            if same is not None:
+                return _Looked(path, replace(same, stamp=stamp))
+            map = self.reader.read(path)
+            check_cells(len(map.grid), str(path))
+        except Exception as error:
+            told = self.reader.failure(error, path)
+            if told is None:
+                raise
+            return _Looked(path, Source(stamp, "", error=told)) if stamp == stamp_of(path) else None
+        return _Looked(path, Source(stamp, digest), map) if stamp == stamp_of(path) else None
+
+    def _write(self, batch: list[_Looked]) -> None:
+        """Put what was read into the atlas, and say what came of it."""
+        plan = _Plan(self, batch)
+        result = change(self.atlas, plan, self.report, self.memory)
+        for line, is_warning in plan.told:
+            self.tell(line, is_warning)
+        self.counts.update(plan.counts)
+        if plan.names:
+            for line in outcome(result, plan):
+                self.tell(line, False)
+
+
+class _Plan:
+    """What a batch changes of an atlas, found out when nobody else can change it."""
+
+    def __init__(self, watch: Watch, batch: list[_Looked]) -> None:
+        self.watch, self.batch = watch, batch
+        self.told: list[tuple[str, bool]] = []
+        self.counts: Counter[str] = Counter()
+        self.names: dict[str, str] = {}  # of the new maps -> what they are
+        self.before: dict[str, int] = {}  # name -> component
+
+    def __call__(self, stored: Stored) -> Change:
+        self.before = {name: n for name, (n, _) in stored.poses().items()}
+        sources = read_sources(stored.folder)
+        wanted = Change(replace(stored, settings={**stored.settings, **self.watch.settings}))
+        for looked in self.batch:
+            source = looked.source
+            if source.error:
+                self.told.append((source.error, True))
+                self.counts["unreadable"] += 1
+            elif looked.map is not None:
+                wanted, source = self._with_map(wanted, looked, looked.map, sources.get(str(looked.path)))
+            sources[str(looked.path)] = source
+        return replace(wanted, files={SOURCES_FILE: sources_to_json(sources)})
+
+    def _with_map(self, wanted: Change, looked: _Looked, map: TopometricMap, before: Source | None) -> tuple[Change, Source]:
+        """The change with one more map."""
+        stored, name = wanted.stored, looked.path.name
+        entry = entry_of(looked.path.stem, map, stored)
+        same = stored.named(entry.key)
+        if same is not None:
+            self.told.append((f"{name}: is in the atlas already, as {same}", False))
+            return wanted, replace(looked.source, map=same)
+        old = next((e for e in stored.entries if before is not None and e.name == before.map and e.name not in wanted.new), None)
+        first = next(iter(stored.entries), None)
+        if first is not None and stored.settings["scale"] == "fixed":
+            try:
+                check_units(wanted.new.get(first.name) or self.watch.memory.facts(stored.folder / first.file).extent, map)
+            except InputError as error:
+                self.told.append((f"{name}: {error}", True))
+                self.counts["unreadable"] += 1
+                return wanted, replace(looked.source, error=f"{name}: {error}")
+        longer = None
+        if old is not None and self.watch.replacing:
+            longer = longer_version(old.name, load_map(stored.folder / old.file), map, stored)
+        if longer is not None:
+            stored, proposed = replaced(stored, longer, entry)
+            entry, wanted = replace(entry, name=longer.name), replace(wanted, proposed={**wanted.proposed, **proposed})
+        else:
+            stored = replace(stored, entries=(*stored.entries, entry))
+        self.counts["replaced" if longer else "added"] += 1
+        self.names[entry.name] = described(name, entry.name, map, longer, old.name if old else "")
+        return replace(wanted, stored=stored, new={**wanted.new, entry.name: map}), replace(looked.source, map=entry.name)
+
+
+def described(file: str, name: str, map: TopometricMap, longer: Longer | None, old: str) -> str:
+    """What a file gave, in words.
+
+    Args:
+        old: name of the map that the file gave before; empty: none.
+    """
+    rooms = f"{len(map.rooms)} room{'' if len(map.rooms) == 1 else 's'}"
+    if longer is not None:
+        return f"{file} -> {name}: {rooms}, takes the place of the map before: has {longer.rooms} of its {longer.of} rooms"
+    if old:
+        return f"{file} -> {name}: {rooms}, no longer version of {old}, which stays"
+    return f"{file} -> {name}: {rooms}"
+
+
+def outcome(result: AtlasResult, plan: _Plan) -> Iterator[str]:
+    """Where the new maps lie, and which of the others were joined and taken apart."""
+    names = [str(name) for name in result.names]
+    for name, words in plan.names.items():
+        n = result.component_of(names.index(name))
+        others = [names[k] for k in result.components[n] if names[k] != name]
+        yield f"{words}; lies with {_listed(others)} ({result.probability(n):.2f})" if others else f"{words}; stands apart"
+    after = {names[k]: n for n, members in enumerate(result.components) for k in members}
+    both = [name for name in names if name in plan.before]
+    for one, two, words, between in ((plan.before, after, "taken apart", " | "), (after, plan.before, "joined now", " + ")):
+        for group in _groups(both, one):
+            parts = list(_groups(group, two))
+            if len(parts) > 1:
+                yield f"{words}: {between.join(map(_listed, parts))}"
+
+
+def _groups(names: list[str], component: Mapping[str, int]) -> Iterator[list[str]]:
+    """Names by their component."""
+    for n in dict.fromkeys(component[name] for name in names):
+        yield [name for name in names if component[name] == n]
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - NAMED_AT_MOST
+    return ", ".join(names[:NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")
