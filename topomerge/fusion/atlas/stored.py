@@ -64,6 +64,23 @@ class Stored:
         """The name of the map with this content, None if there is none."""
         return next((e.name for e in self.entries if e.key == key), None)
 
+    def linked(self) -> list[tuple[int, int]]:
+        """Pairs of maps, by their numbers, that hold the components together.
+
+        Raises:
+            InputError: atlas.json is damaged.
+        """
+        try:
+            pairs = [(int(i), int(j)) for i, j in (link["maps"] for link in (self.listing or {}).get("links", []))]
+            if any(not 0 <= k < len(self.entries) for pair in pairs for k in pair):
+                raise IndexError(pairs)
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+            raise self._damaged() from error
+        return pairs
+
+    def _damaged(self) -> InputError:
+        return InputError(f"{self.folder / 'atlas.json'}: damaged; make the atlas again from its maps")
+
     def poses(self) -> dict[str, tuple[int, Sim3]]:
         """Name of each map -> its component and its pose there.
 
@@ -78,7 +95,7 @@ class Stored:
                 for k in component["maps"]:
                     out[self.entries[k].name] = (n, similarity(matrices[k]) if k in matrices else Sim3())
         except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-            raise InputError(f"{self.folder / 'atlas.json'}: damaged; make the atlas again from its maps") from error
+            raise self._damaged() from error
         return out
 
 

@@ -171,9 +171,11 @@ class _Plan:
         self.counts: Counter[str] = Counter()
         self.names: dict[str, str] = {}  # of the new maps -> what they are
         self.before: dict[str, int] = {}  # name -> component
+        self.links: list[set[str]] = []  # of two maps each, that were believed
 
     def __call__(self, stored: Stored) -> Change:
         self.before = {name: n for name, (n, _) in stored.poses().items()}
+        self.links = [{stored.entries[k].name for k in pair} for pair in stored.linked()]
         sources = read_sources(stored.folder)
         wanted = Change(replace(stored, settings={**stored.settings, **self.watch.settings}))
         for looked in self.batch:
@@ -237,9 +239,26 @@ def outcome(result: AtlasResult, plan: _Plan) -> Iterator[str]:
         n = result.component_of(names.index(name))
         others = [names[k] for k in result.components[n] if names[k] != name]
         yield f"{words}; lies with {_listed(others)} ({result.probability(n):.2f})" if others else f"{words}; stands apart"
-    after = {names[k]: n for n, members in enumerate(result.components) for k in members}
-    both = [name for name in names if name in plan.before]
-    for one, two, words, between in ((plan.before, after, "taken apart", " | "), (after, plan.before, "joined now", " + ")):
+    for link in result.rejected:
+        pair = [names[k] for k in link.maps]
+        if set(pair) in plan.links:
+            against = (
+                "other maps contradict it"
+                if link.against is None
+                else f"{_listed([names[k] for k in link.against])} contradict it"
+            )
+            yield f"no longer believed: {_listed(sorted(pair))}: {against}"
+    yield from changes({names[k]: n for n, members in enumerate(result.components) for k in members}, plan.before)
+
+
+def changes(after: Mapping[str, int], before: Mapping[str, int]) -> Iterator[str]:
+    """Which maps were taken apart, and which joined, in words; of those that were there before.
+
+    Args:
+        after, before: name -> component.
+    """
+    both = [name for name in after if name in before]
+    for one, two, words, between in ((before, after, "taken apart", " | "), (after, before, "joined now", " + ")):
         for group in _groups(both, one):
             parts = list(_groups(group, two))
             if len(parts) > 1:
