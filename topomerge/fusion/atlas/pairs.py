@@ -84,10 +84,6 @@ def _room_poses(maps: Maps, i: int, j: int, scale: str) -> list[Sim3]:
 
 def promise(maps: Maps, i: int, j: int) -> float:
     """How promising it is to register two maps: floor area of the smaller one, times how alike the rooms of both look."""
-    return maps.answer(("promise", maps.embedder), (i, j), lambda: _promise(maps, i, j))
-
-
-def _promise(maps: Maps, i: int, j: int) -> float:
     a, b = maps.rows(i), maps.rows(j)
     area = min(maps.area(i), maps.area(j))
     if not len(a) or not len(b):

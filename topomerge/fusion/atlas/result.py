@@ -30,6 +30,7 @@ class AtlasResult:
         registered: pairs that were searched in each other, of all.
         seconds: of the whole.
         warnings: what the user should know.
+        complete: was everything registered that could change it?
     """
 
     maps: Maps
@@ -43,6 +44,7 @@ class AtlasResult:
     registered: tuple[int, int] = (0, 0)
     seconds: float = 0.0
     warnings: tuple[str, ...] = ()
+    complete: bool = True
 
     @property
     def alone(self) -> tuple[int, ...]:

@@ -28,7 +28,7 @@ from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.inputs import check_cells, check_scale, check_units, link_threshold, without_rooms
 from topomerge.fusion.posterior import check_same
 from topomerge.matching.poses import PoseHypothesis
-from topomerge.types import Sim3, TopometricMap
+from topomerge.types import Array, Sim3, TopometricMap
 
 SURE_LINK = 4.0  # log odds of a link, above which no further ones are looked for within its component
 ENOUGH_REGISTRATIONS = 3  # of a map, after which none within its component is made
@@ -87,6 +87,7 @@ def solve(
     keys: Sequence[str] | None = None,
     proposed: Proposed | None = None,
     memory: Memory | None = None,
+    seconds: float = np.inf,
 ) -> AtlasResult:
     """As `atlas`, of any number of maps, one or none, too.
 
@@ -95,6 +96,7 @@ def solve(
         keys: what `map_key` should give for each map.
         proposed: poses of pairs that are tried beside those that are looked for.
         memory: of maps that were put together before; it changes how long it takes, not what comes out.
+        seconds: after which no more pairs are registered; `AtlasResult.complete` says whether some are left.
 
     Raises:
         InputError: as `atlas`; and a map has another key.
@@ -108,7 +110,7 @@ def solve(
     order = sorted(range(len(maps)), key=lambda k: map_keys[k])
     ordered = Maps([maps[k] for k in order], settings.embedder, memory, [map_keys[k] for k in order])
     explorer = _Explorer(ordered, settings, threshold, {} if registrations is None else registrations, proposed or {})
-    assembly = explorer.explored()
+    assembly = explorer.explored(began + seconds)
     result = _result(assembly, explorer, names, order, settings.rigid)
     return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=(*warnings, *result.warnings))
 
@@ -163,23 +165,27 @@ class _Explorer:
         self.registrations, scaled = registrations, settings.scale == "free"
         self.proposed = {**proposed, **{(j, i): pose.inverse() for (i, j), pose in proposed.items()}}
         self.tried: dict[tuple[int, int], tuple[PoseHypothesis, ...]] = {}
+        self.complete = True
         self.checks = Checks(maps, scaled)
         self.assembler = Assembler(len(maps), self.tried, self.checks, threshold, scaled)
         self.partners = partners_of(maps)
 
-    def explored(self) -> Assembly:
-        """The assembly that more registrations would not change."""
+    def explored(self, end: float = np.inf) -> Assembly:
+        """The assembly that more registrations would not change, or what there is at the end of the time."""
         while True:
             assembly = self.assembler.build()
-            pairs = sorted(set(self._next_pairs(assembly)))
-            for i, j in pairs:
-                self.tried[i, j] = self._registered(i, j)
-            if not pairs:
+            counts = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
+            pairs = set(self._next_pairs(assembly, counts))
+            made = False
+            for i, j in sorted(pairs, key=lambda pair: (counts[list(pair)].min(), pair)):  # what nothing is known of comes first
+                if self._is_registered(i, j) or time.perf_counter() < end:
+                    self.tried[i, j], made = self._registered(i, j), True
+            if not made:
+                self.complete = not pairs
                 return assembly
 
-    def _next_pairs(self, assembly: Assembly) -> Iterator[tuple[int, int]]:
+    def _next_pairs(self, assembly: Assembly, counts: Array) -> Iterator[tuple[int, int]]:
         """For each map its most promising partner in another component, and where it is not surely connected one in its own."""
-        counts = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
         for k in range(len(self.maps)):
             component = assembly.of(k)
             sure = any(link.log_odds >= SURE_LINK for link in assembly.links if k in link.maps)
@@ -188,6 +194,9 @@ class _Explorer:
             inside = [m for m in partners if m in component and not sure and counts[k] < ENOUGH_REGISTRATIONS]
             for m in (*outside[:1], *inside[:1]):
                 yield min(k, m), max(k, m)
+
+    def _is_registered(self, i: int, j: int) -> bool:
+        return (self.maps.keys[i], self.maps.keys[j]) in self.registrations
 
     def _registered(self, i: int, j: int) -> tuple[PoseHypothesis, ...]:
         pair = (self.maps.keys[i], self.maps.keys[j])
@@ -246,6 +255,7 @@ def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order
         bends,
         (len(explorer.tried), len(names) * (len(names) - 1) // 2),
         warnings=tuple(warnings),
+        complete=explorer.complete,
     )
 
 

@@ -23,7 +23,7 @@ class Source:
     """A file, or a folder of scans, that was read.
 
     Args:
-        stamp: hash of the sizes and times of its files.
+        stamp: hash of the sizes and times of its files, and of the options that they were read with.
         digest: hash of their contents, and of the options that they were read with.
         map: name of the map that it gave; empty where it gave none.
         error: why it gave none.
@@ -58,13 +58,14 @@ def sources_to_json(sources: Mapping[str, Source]) -> str:
     return json_text({"format": SOURCES_FORMAT, "files": {path: asdict(sources[path]) for path in sorted(sources)}})
 
 
-def stamp_of(path: Path) -> str:
-    """Hash of the names, sizes and times of change of a file, or of all files of a folder; empty where it is gone."""
+def stamp_of(path: Path, options: str) -> str:
+    """Hash of the names, sizes and times of change of a file, or of all files of a folder, and of the options that it is read
+    with; empty where it is gone."""
     try:
         of = [(str(p.relative_to(path)), p.stat().st_size, p.stat().st_mtime_ns) for p in files_of(path)]
     except OSError:
         return ""
-    return hashlib.sha256(repr(of).encode()).hexdigest()[:16] if of else ""
+    return hashlib.sha256(repr((of, options)).encode()).hexdigest()[:16] if of else ""
 
 
 def digest_of(path: Path, options: str) -> str:

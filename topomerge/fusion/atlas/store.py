@@ -52,12 +52,14 @@ class Change:
         new: those that it does not hold yet, by their names.
         proposed: poses of pairs of maps, which are tried beside those that are looked for.
         files: others that are written with it, name -> text.
+        seconds: after which no more pairs are registered: what is left is for the next change.
     """
 
     stored: Stored
     new: Mapping[str, TopometricMap] = field(default_factory=dict)
     proposed: Proposed = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
+    seconds: float = float("inf")
 
 
 def add(folder: str | Path, maps: Sequence[tuple[str, TopometricMap]], report: Report, **settings: Any) -> AtlasResult:
@@ -122,13 +124,20 @@ def _free_name(name: str, entries: Iterable[Entry]) -> str:
     return next(n for n in numbered if n.lower() not in taken)
 
 
-def change(folder: str | Path, make: Callable[[Stored], Change], report: Report, memory: Memory | None = None) -> AtlasResult:
+def change(
+    folder: str | Path,
+    make: Callable[[Stored], Change],
+    report: Report,
+    memory: Memory | None = None,
+    solved: Callable[[AtlasResult], None] | None = None,
+) -> AtlasResult:
     """Put everything together and write it, all or nothing; what others changed before is in it.
 
     Args:
         make: called with what the atlas holds when no other process can change it any more.
         report: as of `add`.
         memory: of what was made of its maps before.
+        solved: is told where the maps lie, before joined maps and report are made.
 
     Raises:
         InputError: what `make` says, or `atlas` of the maps; or the folder can't be written.
@@ -146,8 +155,11 @@ def change(folder: str | Path, make: Callable[[Stored], Change], report: Report,
         files = [place / e.file if e.name in wanted.new else folder / e.file for e in stored.entries]
         names, keys = [e.name for e in stored.entries], [e.key for e in stored.entries]
         registrations = read_registrations(folder, stored.settings)
-        atlas = solve(files, AtlasSettings(**stored.settings), registrations, names, keys, wanted.proposed, memory)
+        choices = AtlasSettings(**stored.settings)
+        atlas = solve(files, choices, registrations, names, keys, wanted.proposed, memory, wanted.seconds)
         atlas = atlas.in_frames({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
+        if solved is not None:
+            solved(atlas)
         joined, components = {}, []
         for n, members in enumerate(atlas.components):
             component = _component(atlas, stored, n)
@@ -218,7 +230,7 @@ def _listing(atlas: AtlasResult, stored: Stored, components: Sequence[Mapping[st
         "transforms": poses,
         "links": [_link(link) | {"probability": round(link.probability, 4)} for link in atlas.links],
         "thrown_out": [_link(link) | {"against": link.against} for link in atlas.rejected],
-        "registered": {"pairs": atlas.registered[0], "of": atlas.registered[1]},
+        "registered": {"pairs": atlas.registered[0], "of": atlas.registered[1], "complete": atlas.complete},
         "seconds": round(atlas.seconds, 3),
     }
     plain_listing: dict[str, Any] = plain(listing)

@@ -64,6 +64,12 @@ class Stored:
         """The name of the map with this content, None if there is none."""
         return next((e.name for e in self.entries if e.key == key), None)
 
+    @property
+    def complete(self) -> bool:
+        """Was everything registered that could change where maps lie?"""
+        registered = (self.listing or {}).get("registered")
+        return not isinstance(registered, dict) or registered.get("complete", True) is not False
+
     def linked(self) -> list[tuple[int, int]]:
         """Pairs of maps, by their numbers, that hold the components together.
 

@@ -14,18 +14,21 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.errors import InputError
+from topomerge.fusion.atlas.folder import changing
 from topomerge.fusion.atlas.memory import Memory
 from topomerge.fusion.atlas.replacement import Longer, longer_version, replaced
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.sources import SOURCES_FILE, Source, digest_of, read_sources, sources_to_json, stamp_of
 from topomerge.fusion.atlas.store import Change, Report, change, entry_of
-from topomerge.fusion.atlas.stored import Stored, check_folder
+from topomerge.fusion.atlas.stored import Stored, check_folder, held_by
 from topomerge.fusion.inputs import check_cells, check_units
 from topomerge.io.maps import load_map
 from topomerge.io.points import suffixes
 from topomerge.types import TopometricMap
 
 MAPS_AT_ONCE, SECONDS_AT_ONCE = 8, 10.0  # that are read before they are written: a stop costs no more
+SECONDS_TO_ANSWER = 5.0  # of registering, before it is said where new maps lie; the rest follows when nothing new is there
+SECONDS_BETWEEN = 60.0  # … before that is written, and new files are looked for
 NAMED_AT_MOST = 6  # maps, in a line
 PICTURES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
@@ -79,15 +82,15 @@ class Watch:
     replacing: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
+    memory: Memory = field(default_factory=Memory)
 
     def __post_init__(self) -> None:
         if not self.folder.is_dir():
             raise InputError(f"{self.folder}: no such folder; name the folder in which scans or maps appear")
         if self.folder.resolve() == self.atlas.resolve():
             raise InputError(f"{self.folder}: is watched and can't be the atlas, too; give another folder for it")
-        check_folder(self.atlas)
+        self._complete = check_folder(self.atlas).complete
         self._since: dict[str, tuple[str, float]] = {}
-        self.memory = Memory()
 
     def look(self) -> bool:
         """Put what is new or changed, and written, into the atlas; is there anything that is just being written?
@@ -97,7 +100,7 @@ class Watch:
         """
         check_folder(self.atlas)
         sources, now = read_sources(self.atlas), time.monotonic()
-        stamps = {str(p): stamp_of(p) for p in self._inputs()}
+        stamps = {str(p): self._stamp(p) for p in self._inputs()}
         stamps = {p: stamp for p, stamp in stamps.items() if stamp and stamp != sources.get(p, Source("", "")).stamp}
         before, self._since = self._since, {}
         for path, stamp in stamps.items():
@@ -106,7 +109,12 @@ class Watch:
         settled = [p for p, (_, since) in self._since.items() if now - since >= self.settle]
         for batch in self._batches(sorted(settled)):
             self._write(batch)
-        return len(settled) < len(stamps)
+        if not settled and not self._complete:
+            self._write([])
+        return len(settled) < len(stamps) or not self._complete
+
+    def _stamp(self, path: Path) -> str:
+        return stamp_of(path, self.reader.options)
 
     def _inputs(self) -> list[Path]:
         """What may be a map."""
@@ -135,7 +143,7 @@ class Watch:
 
     def _looked(self, path: Path) -> _Looked | None:
         """What a file gives; None where it changes meanwhile."""
-        stamp, sources = stamp_of(path), read_sources(self.atlas)
+        stamp, sources = self._stamp(path), read_sources(self.atlas)
         try:
             digest = digest_of(path, self.reader.options)
             same = next((s for s in sources.values() if s.digest == digest and s.map), None)
@@ -147,19 +155,20 @@ class Watch:
             told = self.reader.failure(error, path)
             if told is None:
                 raise
-            return _Looked(path, Source(stamp, "", error=told)) if stamp == stamp_of(path) else None
-        return _Looked(path, Source(stamp, digest), map) if stamp == stamp_of(path) else None
+            return _Looked(path, Source(stamp, "", error=told)) if stamp == self._stamp(path) else None
+        return _Looked(path, Source(stamp, digest), map) if stamp == self._stamp(path) else None
 
     def _write(self, batch: list[_Looked]) -> None:
-        """Put what was read into the atlas, and say what came of it."""
+        """Put what was read into the atlas, or go on with registering if nothing was, and say what came of it."""
         plan = _Plan(self, batch)
-        result = change(self.atlas, plan, self.report, self.memory)
-        for line, is_warning in plan.told:
-            self.tell(line, is_warning)
+        if batch and all(looked.map is None for looked in batch) and (self.atlas / "atlas.json").exists():
+            with changing(self.atlas, []) as place:  # notes only
+                for name, text in plan(held_by(self.atlas)).files.items():
+                    (place / name).write_text(text, encoding="utf-8")
+        else:
+            self._complete = change(self.atlas, plan, self.report, self.memory, plan.say).complete
+        plan.say(None)
         self.counts.update(plan.counts)
-        if plan.names:
-            for line in outcome(result, plan):
-                self.tell(line, False)
 
 
 class _Plan:
@@ -186,7 +195,15 @@ class _Plan:
             elif looked.map is not None:
                 wanted, source = self._with_map(wanted, looked, looked.map, sources.get(str(looked.path)))
             sources[str(looked.path)] = source
-        return replace(wanted, files={SOURCES_FILE: sources_to_json(sources)})
+        seconds = SECONDS_TO_ANSWER if self.batch else SECONDS_BETWEEN
+        return replace(wanted, files={SOURCES_FILE: sources_to_json(sources)}, seconds=seconds)
+
+    def say(self, result: AtlasResult | None) -> None:
+        """Say what was found out, once: as soon as it is known where the maps lie, if it will be."""
+        lines = self.told + [(line, False) for line in (outcome(result, self) if result is not None else ())]
+        self.told = []
+        for line, is_warning in lines:
+            self.watch.tell(line, is_warning)
 
     def _with_map(self, wanted: Change, looked: _Looked, map: TopometricMap, before: Source | None) -> tuple[Change, Source]:
         """The change with one more map."""
@@ -242,12 +259,8 @@ def outcome(result: AtlasResult, plan: _Plan) -> Iterator[str]:
     for link in result.rejected:
         pair = [names[k] for k in link.maps]
         if set(pair) in plan.links:
-            against = (
-                "other maps contradict it"
-                if link.against is None
-                else f"{_listed([names[k] for k in link.against])} contradict it"
-            )
-            yield f"no longer believed: {_listed(sorted(pair))}: {against}"
+            against = _listed([names[k] for k in link.against]) if link.against else "other maps"
+            yield f"no longer believed: {_listed(sorted(pair))}: {against} contradict it"
     yield from changes({names[k]: n for n, members in enumerate(result.components) for k in members}, plan.before)
 
 
