@@ -33,8 +33,8 @@ from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 from topomerge.viz.atlas_report import atlas_html
 
-KINDS = ("office", "school", "hospital", "lab", "hotel")
-SENSORS = ("depth", "tablet", "depth", "depth", "tablet")
+LIVE_KINDS = ("office", "school", "hospital", "lab", "hotel")
+LIVE_SENSORS = ("depth", "tablet", "depth", "depth", "tablet")
 ROOMS_WALKED, ROOMS_WALKED_FIRST = 4, 7  # of a map, and of those of the first building; more are seen through doors
 TRIES = 5
 TRUE_LINK = 0.97  # probability of the registrations that are taken from the truth
@@ -44,25 +44,25 @@ def make(folder: Path, buildings: int) -> list[list[Path]]:
     """Maps of each building, unless they are there."""
     folder.mkdir(parents=True, exist_ok=True)
     for b in range(buildings):
-        files = [folder / f"b{b}_m{k}.tmap" for k in range(len(SENSORS))]
+        files = [folder / f"b{b}_m{k}.tmap" for k in range(len(LIVE_SENSORS))]
         for number in range(TRIES):
             if all(f.exists() for f in files):
                 break
             try:
                 with one_thread():
-                    building = make_building(KINDS[b % len(KINDS)], 7000 + 10 * b + number)
+                    building = make_building(LIVE_KINDS[b % len(LIVE_KINDS)], 7000 + 10 * b + number)
                     rng = np.random.default_rng([b, 1])
-                    made = make_atlas(building, SENSORS, rng, ROOMS_WALKED if b else ROOMS_WALKED_FIRST)
+                    made = make_atlas(building, LIVE_SENSORS, rng, ROOMS_WALKED if b else ROOMS_WALKED_FIRST)
                     for path, cloud in zip(files, made.maps, strict=True):
                         save_map(replace(extract(cloud), source=path.stem), path)
             except InputError:
                 continue
-    return [[folder / f"b{b}_m{k}.tmap" for k in range(len(SENSORS))] for b in range(buildings)]
+    return [[folder / f"b{b}_m{k}.tmap" for k in range(len(LIVE_SENSORS))] for b in range(buildings)]
 
 
 def truth(b: int) -> list[Sim3]:
     """T_0k of each map of a building: what `make` drew first."""
-    frames = draw_frames(len(SENSORS), False, np.random.default_rng([b, 1]))
+    frames = draw_frames(len(LIVE_SENSORS), False, np.random.default_rng([b, 1]))
     return [frames[0] @ frame.inverse() for frame in frames]
 
 
@@ -78,15 +78,15 @@ class Answers:
 
 def prepared_atlas(folder: Path, maps: list[list[Path]]) -> Path:
     """An atlas of all maps but the new ones, registered by the truth."""
-    atlas, known_as = folder / "atlas", dict[str, tuple[int, int]]()
+    atlas = folder / "atlas"
     if (atlas / "atlas.json").exists():
         return atlas
-    held = [(b, k) for b in range(len(maps) - 1) for k in range(len(SENSORS)) if (b, k) != (0, len(SENSORS) - 1)]
+    held = [(b, k) for b in range(len(maps) - 1) for k in range(len(LIVE_SENSORS)) if (b, k) != (0, len(LIVE_SENSORS) - 1)]
     loaded = {(b, k): load_map(maps[b][k]) for b, k in held}
-    known_as = {map_key(m): place for place, m in loaded.items()}
+    places = {map_key(m): place for place, m in loaded.items()}
 
     def of_truth(maps: Maps, i: int, j: int, *_: object) -> tuple[PoseHypothesis, ...]:
-        (b, k), (c, m) = known_as[maps.keys[i]], known_as[maps.keys[j]]
+        (b, k), (c, m) = places[maps.keys[i]], places[maps.keys[j]]
         return (PoseHypothesis(truth(b)[k].inverse() @ truth(b)[m], probability=TRUE_LINK),) if b == c else ()
 
     usual, solver.hypotheses = solver.hypotheses, of_truth
@@ -124,13 +124,13 @@ def main(folder: Path, buildings: int) -> None:
         began, cpu = time.perf_counter(), time.process_time()
         more = watch.look()
         written = time.perf_counter() - began
-        said, line = answers.lines[0][0] - began, answers.lines[0][1]
+        said = answers.lines[0][0] - began
         spent = time.process_time() - cpu
         while more:
             more = watch.look()
         ended, all_spent = time.perf_counter() - began, time.process_time() - cpu
-        print(f"{line}: said {said:.1f} s, written {written:.1f} s ({spent:.1f} s of a core), nothing left {ended:.1f} s "
-              f"({all_spent:.1f} s of a core)", flush=True)  # fmt: skip
+        took = f"said {said:.1f} s, written {written:.1f} s ({spent:.1f} s of a core), nothing left {ended:.1f} s"
+        print(f"{took} ({all_spent:.1f} s of a core)", *(line for _, line in answers.lines), sep="\n  ", flush=True)
 
 
 if __name__ == "__main__":

@@ -51,6 +51,7 @@ def watch_command(args: argparse.Namespace) -> int:
         settle=args.settle,
         replacing=args.replace == "longer",
         settings=atlas_choices(args),
+        warm=not args.once,
     )
     began = time.monotonic()
     try:

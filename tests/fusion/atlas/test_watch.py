@@ -152,7 +152,8 @@ def test_each_file_is_read_once_and_a_copy_not_at_all(scans, apart, tmp_path):
     lines = seen(scans, tmp_path / "site")
     assert lines.read == [] and lines.told == [] and len(read_atlas(tmp_path / "site").entries) == 4
     sources = read_sources(tmp_path / "site")
-    assert sources[str(scans / "again.tmap")].map == "2" and sources[str(scans / "1.tmap")].stamp == stamp_of(scans / "1.tmap", "")
+    assert sources[str(scans / "again.tmap")].map == "2"
+    assert sources[str(scans / "1.tmap")].stamp == stamp_of(scans / "1.tmap", "")
     (tmp_path / "site" / SOURCES_FILE).unlink()  # all are read again, and only noted
     before = (tmp_path / "site" / "report_stamp.css").read_text()
     lines = seen(scans, tmp_path / "site")
@@ -264,6 +265,25 @@ def test_a_wrong_link_is_given_up_when_a_third_map_contradicts_it(tmp_path, monk
     assert lines.told[1].startswith("no longer believed: east, west: ")
     (east, west) = (read_atlas(tmp_path / "site").poses()[name][1] for name in ("east", "west"))
     assert np.linalg.norm((east.inverse() @ west @ truth(0, 2)).translation) < 0.3
+
+
+def test_what_is_left_to_be_registered_follows_when_nothing_new_is_there(scans, tmp_path, monkeypatch):
+    """No time at all is left for the answer: the maps are there first, and joined by the next looks."""
+    made: list[tuple[int, int]] = []
+
+    def claimed(maps: Maps, i: int, j: int, *_: object) -> tuple[PoseHypothesis, ...]:
+        made.append((i, j))
+        return ()
+
+    monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", claimed)
+    monkeypatch.setattr("topomerge.fusion.atlas.watch.SECONDS_TO_ANSWER", -1.0)
+    lines = Lines()
+    one = watch(scans, tmp_path / "site", lines)
+    assert one.look() and not made and len(read_atlas(tmp_path / "site").entries) == 4
+    assert lines.told[0] == "0.tmap -> 0: 1 room; stands apart so far, there is more to be tried"
+    assert not read_atlas(tmp_path / "site").complete
+    assert not one.look() and len(made) == 6 and read_atlas(tmp_path / "site").complete
+    assert not watch(scans, tmp_path / "site").look() and len(made) == 6
 
 
 def test_words_of_what_is_taken_apart_and_joined():

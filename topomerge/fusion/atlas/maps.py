@@ -18,7 +18,7 @@ from topomerge.fusion.refine import surface
 from topomerge.matching.match import checked
 from topomerge.types import TopometricMap
 
-T = TypeVar("T")
+Made = TypeVar("Made")
 
 
 class Maps:
@@ -60,7 +60,7 @@ class Maps:
 
         return memory.answer(("prepared", key), make)
 
-    def answer(self, question: tuple[Hashable, ...], maps: Iterable[int], make: Callable[[], T]) -> T:
+    def answer(self, question: tuple[Hashable, ...], maps: Iterable[int], make: Callable[[], Made]) -> Made:
         """`Memory.answer` to a question about some of the maps."""
         return self.memory.answer((*question, *(self.keys[k] for k in maps)), make)
 

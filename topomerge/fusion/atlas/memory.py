@@ -20,7 +20,7 @@ from topomerge.types import TopometricMap
 
 LOADED_AT_ONCE = 3  # maps in memory, of those that are files
 SURFACES_AT_ONCE = 8  # surfaces in memory, for the fine registration
-T = TypeVar("T")
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -84,12 +84,12 @@ class Memory:
             return source
         return _recent(self._loaded, key, LOADED_AT_ONCE, lambda: load_map(source))
 
-    def surface(self, key: str, make: Callable[[], T]) -> T:
+    def surface(self, key: str, make: Callable[[], Made]) -> Made:
         """The surface of a map, one of the last that were asked for or made now."""
-        out: T = _recent(self._surfaces, key, SURFACES_AT_ONCE, make)
+        out: Made = _recent(self._surfaces, key, SURFACES_AT_ONCE, make)
         return out
 
-    def answer(self, question: tuple[Hashable, ...], make: Callable[[], T]) -> T:
+    def answer(self, question: tuple[Hashable, ...], make: Callable[[], Made]) -> Made:
         """What was answered before to a question, or is answered now.
 
         Args:
@@ -97,7 +97,7 @@ class Memory:
         """
         if question not in self._answers:
             self._answers[question] = self._before.pop(question) if question in self._before else make()
-        out: T = self._answers[question]
+        out: Made = self._answers[question]
         return out
 
 
@@ -115,7 +115,7 @@ def map_key(map: TopometricMap) -> str:
     return digest.hexdigest()[:16]
 
 
-def _recent(memory: OrderedDict[str, T], key: str, capacity: int, make: Callable[[], T]) -> T:
+def _recent(memory: OrderedDict[str, Made], key: str, capacity: int, make: Callable[[], Made]) -> Made:
     """What was made of a map, from the memory of those that were used last."""
     if key not in memory:
         memory[key] = make()

@@ -51,17 +51,17 @@ def longer_version(name: str, old: TopometricMap, new: TopometricMap, stored: St
 
 
 def replaced(stored: Stored, longer: Longer, new: Entry) -> tuple[Stored, Proposed]:
-    """An atlas in which the new map stands where the one before stood, and where it may lie in the others: where that one lay.
+    """An atlas in which the new map stands where the one before stood, and where it may lie in those that were linked with it.
 
     Args:
         new: entry of the new map, under any name.
     """
     old = next(e for e in stored.entries if e.name == longer.name)
     entry = replace(new, name=old.name, frame=old.frame @ longer.pose)
-    poses, keys = stored.poses(), {e.name: e.key for e in stored.entries}
-    component, here = poses.get(old.name, (-1, Sim3()))
     proposed = {}
-    for name, (other, pose) in poses.items():
-        if other == component and name != old.name:
-            proposed[new.key, keys[name]] = (here @ longer.pose).inverse() @ pose
+    for (a, b), pose in stored.lying().items():
+        if a == old.key:
+            proposed[new.key, b] = longer.pose.inverse() @ pose
+        elif b == old.key:
+            proposed[a, new.key] = pose @ longer.pose
     return replace(stored, entries=tuple(entry if e is old else e for e in stored.entries)), proposed

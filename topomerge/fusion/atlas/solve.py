@@ -94,7 +94,8 @@ def solve(
     Args:
         names: of the maps, for messages; their sources if None.
         keys: what `map_key` should give for each map.
-        proposed: poses of pairs that are tried beside those that are looked for.
+        proposed: poses of pairs, tried beside those that are looked for; these pairs may be registered in any case, so that no
+            link is given up only as other maps look more alike.
         memory: of maps that were put together before; it changes how long it takes, not what comes out.
         seconds: after which no more pairs are registered; `AtlasResult.complete` says whether some are left.
 
@@ -168,32 +169,37 @@ class _Explorer:
         self.complete = True
         self.checks = Checks(maps, scaled)
         self.assembler = Assembler(len(maps), self.tried, self.checks, threshold, scaled)
-        self.partners = partners_of(maps)
+        place = {key: k for k, key in enumerate(maps.keys)}
+        self.partners = partners_of(maps, [(place[a], place[b]) for a, b in proposed if a in place and b in place])
 
     def explored(self, end: float = np.inf) -> Assembly:
-        """The assembly that more registrations would not change, or what there is at the end of the time."""
+        """The assembly that more registrations would not change; after the end of the time that of those that were made."""
         while True:
             assembly = self.assembler.build()
             counts = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
-            pairs = set(self._next_pairs(assembly, counts))
-            made = False
+            pairs = set(self._next_pairs(assembly, counts, time.perf_counter() >= end))
+            if not pairs:
+                self.complete = not any(self._next_pairs(assembly, counts))
+                return assembly
             for i, j in sorted(pairs, key=lambda pair: (counts[list(pair)].min(), pair)):  # what nothing is known of comes first
                 if self._is_registered(i, j) or time.perf_counter() < end:
-                    self.tried[i, j], made = self._registered(i, j), True
-            if not made:
-                self.complete = not pairs
-                return assembly
+                    self.tried[i, j] = self._registered(i, j)
 
-    def _next_pairs(self, assembly: Assembly, counts: Array) -> Iterator[tuple[int, int]]:
-        """For each map its most promising partner in another component, and where it is not surely connected one in its own."""
+    def _next_pairs(self, assembly: Assembly, counts: Array, late: bool = False) -> Iterator[tuple[int, int]]:
+        """For each map its most promising partner in another component, and where it is not surely connected one in its own.
+
+        Args:
+            counts: pairs that were tried, of each map.
+            late: only pairs that are registered already.
+        """
         for k in range(len(self.maps)):
             component = assembly.of(k)
             sure = any(link.log_odds >= SURE_LINK for link in assembly.links if k in link.maps)
-            partners = [m for m in self.partners[k] if (min(k, m), max(k, m)) not in self.tried]
-            outside = [m for m in partners if m not in component]
-            inside = [m for m in partners if m in component and not sure and counts[k] < ENOUGH_REGISTRATIONS]
-            for m in (*outside[:1], *inside[:1]):
-                yield min(k, m), max(k, m)
+            pairs = [((min(k, m), max(k, m)), m in component) for m in self.partners[k]]
+            pairs = [p for p in pairs if p[0] not in self.tried and not (late and not self._is_registered(*p[0]))]
+            outside = [pair for pair, within in pairs if not within]
+            inside = [pair for pair, within in pairs if within and not sure and counts[k] < ENOUGH_REGISTRATIONS]
+            yield from (*outside[:1], *inside[:1])
 
     def _is_registered(self, i: int, j: int) -> bool:
         return (self.maps.keys[i], self.maps.keys[j]) in self.registrations
@@ -206,9 +212,13 @@ class _Explorer:
         return self.registrations[pair]
 
 
-def partners_of(maps: Maps) -> list[list[int]]:
+def partners_of(maps: Maps, linked: Iterable[tuple[int, int]] = ()) -> list[list[int]]:
     """For each map those that it may be searched in, most promising first: all others where they are few, else the ten that its
-    rooms look most like, and those that name it. A map without rooms names the largest ones."""
+    rooms look most like, and those that name it. A map without rooms names the largest ones.
+
+    Args:
+        linked: pairs that may be searched in each other in any case.
+    """
     count = len(maps)
     if count <= MOST_PARTNERS + 1:
         pairs = {(i, j) for j in range(count) for i in range(j)}
@@ -216,6 +226,7 @@ def partners_of(maps: Maps) -> list[list[int]]:
         by_area = sorted(range(count), key=lambda k: -maps.area(k))
         named = enumerate(most_alike([maps.rows(k) for k in range(count)], MOST_PARTNERS))
         pairs = {(min(k, m), max(k, m)) for k, of in named for m in of or [m for m in by_area if m != k][:MOST_PARTNERS]}
+    pairs |= {(min(pair), max(pair)) for pair in linked}
     partners: list[dict[int, float]] = [{} for _ in range(count)]
     for i, j in sorted(pairs):
         partners[i][j] = partners[j][i] = promise(maps, i, j)

@@ -50,7 +50,7 @@ class Change:
     Args:
         stored: its maps and settings.
         new: those that it does not hold yet, by their names.
-        proposed: poses of pairs of maps, which are tried beside those that are looked for.
+        proposed: as of `solve`, beside those of the links that there are.
         files: others that are written with it, name -> text.
         seconds: after which no more pairs are registered: what is left is for the next change.
     """
@@ -155,8 +155,8 @@ def change(
         files = [place / e.file if e.name in wanted.new else folder / e.file for e in stored.entries]
         names, keys = [e.name for e in stored.entries], [e.key for e in stored.entries]
         registrations = read_registrations(folder, stored.settings)
-        choices = AtlasSettings(**stored.settings)
-        atlas = solve(files, choices, registrations, names, keys, wanted.proposed, memory, wanted.seconds)
+        choices, proposed = AtlasSettings(**stored.settings), {**before.lying(), **wanted.proposed}
+        atlas = solve(files, choices, registrations, names, keys, proposed, memory, wanted.seconds)
         atlas = atlas.in_frames({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
         if solved is not None:
             solved(atlas)

@@ -84,6 +84,17 @@ class Stored:
             raise self._damaged() from error
         return pairs
 
+    def lying(self) -> dict[tuple[str, str], Sim3]:
+        """T_ij of the pairs that hold the components together, as they lie now, by the keys of both maps.
+
+        Raises:
+            InputError: atlas.json is damaged.
+        """
+        poses = self.poses()
+        pairs = ((self.entries[i], self.entries[j]) for i, j in self.linked())
+        there = ((a, b) for a, b in pairs if a.name in poses and b.name in poses)
+        return {(a.key, b.key): poses[a.name][1].inverse() @ poses[b.name][1] for a, b in there}
+
     def _damaged(self) -> InputError:
         return InputError(f"{self.folder / 'atlas.json'}: damaged; make the atlas again from its maps")
 

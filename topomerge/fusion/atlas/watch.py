@@ -70,6 +70,7 @@ class Watch:
         settle: s that a file must not have changed, before it is read.
         replacing: may a file that was changed give a longer version of its map, which then takes that one's place?
         settings: of the atlas, those that are not the usual ones.
+        warm: look at all maps of the atlas at first, so that the answer to a new one comes at once?
         counts: "added", "replaced" and "unreadable" so far.
     """
 
@@ -81,6 +82,7 @@ class Watch:
     settle: float = 2.0
     replacing: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
+    warm: bool = False
     counts: Counter[str] = field(default_factory=Counter)
     memory: Memory = field(default_factory=Memory)
 
@@ -89,7 +91,8 @@ class Watch:
             raise InputError(f"{self.folder}: no such folder; name the folder in which scans or maps appear")
         if self.folder.resolve() == self.atlas.resolve():
             raise InputError(f"{self.folder}: is watched and can't be the atlas, too; give another folder for it")
-        self._complete = check_folder(self.atlas).complete
+        held = check_folder(self.atlas)
+        self._complete = held.complete and not (self.warm and held.entries)
         self._since: dict[str, tuple[str, float]] = {}
 
     def look(self) -> bool:
@@ -152,10 +155,10 @@ class Watch:
             map = self.reader.read(path)
             check_cells(len(map.grid), str(path))
         except Exception as error:
-            told = self.reader.failure(error, path)
-            if told is None:
+            line = self.reader.failure(error, path)
+            if line is None:
                 raise
-            return _Looked(path, Source(stamp, "", error=told)) if stamp == self._stamp(path) else None
+            return _Looked(path, Source(stamp, "", error=line)) if stamp == self._stamp(path) else None
         return _Looked(path, Source(stamp, digest), map) if stamp == self._stamp(path) else None
 
     def _write(self, batch: list[_Looked]) -> None:
@@ -176,7 +179,7 @@ class _Plan:
 
     def __init__(self, watch: Watch, batch: list[_Looked]) -> None:
         self.watch, self.batch = watch, batch
-        self.told: list[tuple[str, bool]] = []
+        self.lines: list[tuple[str, bool]] = []
         self.counts: Counter[str] = Counter()
         self.names: dict[str, str] = {}  # of the new maps -> what they are
         self.before: dict[str, int] = {}  # name -> component
@@ -190,7 +193,7 @@ class _Plan:
         for looked in self.batch:
             source = looked.source
             if source.error:
-                self.told.append((source.error, True))
+                self.lines.append((source.error, True))
                 self.counts["unreadable"] += 1
             elif looked.map is not None:
                 wanted, source = self._with_map(wanted, looked, looked.map, sources.get(str(looked.path)))
@@ -200,8 +203,8 @@ class _Plan:
 
     def say(self, result: AtlasResult | None) -> None:
         """Say what was found out, once: as soon as it is known where the maps lie, if it will be."""
-        lines = self.told + [(line, False) for line in (outcome(result, self) if result is not None else ())]
-        self.told = []
+        lines = self.lines + [(line, False) for line in (outcome(result, self) if result is not None else ())]
+        self.lines = []
         for line, is_warning in lines:
             self.watch.tell(line, is_warning)
 
@@ -211,7 +214,7 @@ class _Plan:
         entry = entry_of(looked.path.stem, map, stored)
         same = stored.named(entry.key)
         if same is not None:
-            self.told.append((f"{name}: is in the atlas already, as {same}", False))
+            self.lines.append((f"{name}: is in the atlas already, as {same}", False))
             return wanted, replace(looked.source, map=same)
         old = next((e for e in stored.entries if before is not None and e.name == before.map and e.name not in wanted.new), None)
         first = next(iter(stored.entries), None)
@@ -219,7 +222,7 @@ class _Plan:
             try:
                 check_units(wanted.new.get(first.name) or self.watch.memory.facts(stored.folder / first.file).extent, map)
             except InputError as error:
-                self.told.append((f"{name}: {error}", True))
+                self.lines.append((f"{name}: {error}", True))
                 self.counts["unreadable"] += 1
                 return wanted, replace(looked.source, error=f"{name}: {error}")
         longer = None
@@ -255,7 +258,8 @@ def outcome(result: AtlasResult, plan: _Plan) -> Iterator[str]:
     for name, words in plan.names.items():
         n = result.component_of(names.index(name))
         others = [names[k] for k in result.components[n] if names[k] != name]
-        yield f"{words}; lies with {_listed(others)} ({result.probability(n):.2f})" if others else f"{words}; stands apart"
+        apart = "stands apart" if result.complete else "stands apart so far, there is more to be tried"
+        yield f"{words}; lies with {_listed(others)} ({result.probability(n):.2f})" if others else f"{words}; {apart}"
     for link in result.rejected:
         pair = [names[k] for k in link.maps]
         if set(pair) in plan.links:
