@@ -6,12 +6,13 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import failure_line, say, signal_behind, warn
+from topomerge.cli.console import check_outputs, failure_line, say, signal_behind, warn
 from topomerge.cli.options import (
     ATLAS_OPTIONS,
     CLOUD_OPTIONS,
@@ -24,8 +25,10 @@ from topomerge.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from topomerge.fusion.atlas.result import AtlasResult
     from topomerge.fusion.atlas.watch import Reader, Watch
     from topomerge.types import TopometricMap
+    from topomerge.viz.rerun_log import RerunLog
 
 EVERY, SETTLE = 2.0, 2.0  # s
 
@@ -42,11 +45,18 @@ def watch_command(args: argparse.Namespace) -> int:
             say(line)
             sys.stdout.flush()
 
+    log = _rerun_log(args)
+
+    def report(result: AtlasResult, joined: Mapping[int, TopometricMap], title: str, stamp: str) -> str:
+        if log is not None:
+            log.log(result, joined)
+        return atlas_html(result, joined, title, stamp=stamp)
+
     watch = Watch(
         Path(args.folder),
         Path(args.output),
         _reader(args),
-        atlas_html,
+        report,
         tell,
         settle=args.settle,
         replacing=args.replace == "longer",
@@ -67,6 +77,16 @@ def watch_command(args: argparse.Namespace) -> int:
         return 130 if args.once else 0
     tell(_summary(watch), False)
     return 0
+
+
+def _rerun_log(args: argparse.Namespace) -> RerunLog | None:
+    if not hasattr(args, "rerun"):
+        return None
+    from topomerge.viz.rerun_log import RerunLog
+
+    if args.rerun is not None:
+        check_outputs([args.rerun])
+    return RerunLog(args.rerun)
 
 
 def _summary(watch: Watch) -> str:
@@ -116,9 +136,15 @@ WATCH = Command(
         ),
         *ATLAS_OPTIONS,
         *CLOUD_OPTIONS,
+        option(
+            "--rerun",
+            nargs="?",
+            metavar="A.rrd",
+            help="log cells, rooms, graph and links to Rerun: into a file, or without a name to a viewer that is opened",
+        ),
         quiet("print nothing but warnings"),
     ),
-    paths=("folder", "output"),
+    paths=("folder", "output", "rerun"),
     description="Watch a folder: scans and maps that appear in it, or change, become maps of an atlas. It may be stopped at any "
     "moment (Ctrl-C) and started again; report.html of the atlas loads itself anew in an open browser. A file that can't be "
     "read is named once, and tried again when it changes.",
