@@ -14,7 +14,7 @@ from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
 from topomerge.cli.main import main as cli
 from topomerge.fusion.atlas.registration_cache import read_registrations
 from topomerge.fusion.atlas.solve import solve
-from topomerge.fusion.atlas.store import read_atlas
+from topomerge.fusion.atlas.stored import read_atlas
 
 Run = Callable[..., tuple[int, str, str]]
 

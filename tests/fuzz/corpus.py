@@ -81,7 +81,7 @@ def read_plans(path: Path) -> int:
 
 def read_atlas(path: Path) -> int:
     """Read the listing of an atlas."""
-    from topomerge.fusion.atlas.store import read_atlas
+    from topomerge.fusion.atlas.stored import read_atlas
 
     return len(read_atlas(path.parent).entries)
 

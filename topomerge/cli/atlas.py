@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, say, warn
-from topomerge.cli.options import BELIEF_OPTIONS, CLOUD_OPTIONS, belief_choices, given, json_option, map_from, quiet
+from topomerge.cli.options import ATLAS_OPTIONS, CLOUD_OPTIONS, atlas_choices, json_option, map_from, quiet
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,20 +31,22 @@ def atlas_command(args: argparse.Namespace) -> int:
 
 
 def _add(args: argparse.Namespace) -> int:
-    from topomerge.fusion.atlas.store import add, check_folder
+    from topomerge.fusion.atlas.store import add
+    from topomerge.fusion.atlas.stored import check_folder
     from topomerge.viz.atlas_report import atlas_html
 
     if not args.items:
         raise InputError(f"{args.folder}: name the maps or clouds to add: topomerge atlas add {args.folder} MAP ...")
     check_folder(args.folder)
-    choices = belief_choices(args)
+    choices = atlas_choices(args)
     check_inputs(args.items)
     maps = [(Path(path).stem, replace(map_from(path, args), source=path)) for path in args.items]
-    return _report(add(args.folder, maps, atlas_html, **given(args, "scale", "embedder"), **choices), args)
+    return _report(add(args.folder, maps, atlas_html, **choices), args)
 
 
 def _remove(args: argparse.Namespace) -> int:
-    from topomerge.fusion.atlas.store import read_atlas, remove
+    from topomerge.fusion.atlas.store import remove
+    from topomerge.fusion.atlas.stored import read_atlas
     from topomerge.viz.atlas_report import atlas_html
 
     if not args.items:
@@ -82,7 +84,7 @@ def _report(result: AtlasResult, args: argparse.Namespace) -> int:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from topomerge.fusion.atlas.store import read_atlas
+    from topomerge.fusion.atlas.stored import read_atlas
 
     if args.items:
         raise InputError(f"{args.items[0]}: list takes the folder only")
@@ -125,14 +127,7 @@ ATLAS = Command(
         option("folder", metavar="DIR", help="the atlas"),
         option("items", nargs="*", metavar="MAP", help="of add, find: clouds or .tmap; of remove: names, as `list` prints them"),
         option("--first", type=int, default=5, metavar="N", help="of find: maps that are named (default 5)"),
-        option("--scale", choices=("fixed", "free"), help="free: the scales of the maps differ (default fixed)"),
-        *BELIEF_OPTIONS,
-        option(
-            "--descriptor",
-            dest="embedder",
-            choices=("learned", "engineered", "shapedna", "feather"),
-            help="let matched rooms propose places, too; takes twice as long (default: geometry only)",
-        ),
+        *ATLAS_OPTIONS,
         *CLOUD_OPTIONS,
         json_option("of list: print atlas.json; of find: the maps and rooms"),
         quiet("print nothing but warnings and what stands apart"),

@@ -90,6 +90,31 @@ def warn(messages: Iterable[str]) -> None:
         say(f"topomerge: warning: {' '.join(message.split())}", sys.stderr)
 
 
+def failure_line(error: BaseException, paths: Sequence[str]) -> str:
+    """One line about an error that names the file it is about."""
+    if isinstance(error, MemoryError):
+        text = "not enough memory; take larger voxels or a part of the input"
+    elif isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    elif isinstance(error, ImportError):
+        text = f"this needs the Python package {error.name or error}, which is not installed"
+    elif isinstance(error, ValueError):
+        text = str(error)
+    else:
+        text = f"unexpected {type(error).__name__}: {error} (a fault in topomerge: run again with -v -v and report it)"
+    text = " ".join(text.split()) or type(error).__name__
+    if paths and not text.startswith("--") and not any(path in text for path in paths):  # an option is no file's fault
+        text = f"{paths[0]}: {text}"
+    return text
+
+
+def signal_behind(error: BaseException | None) -> BaseException | None:
+    """The Ctrl-C or SIGTERM that an error comes from, if any: one during compiled code comes out as a SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
+        error = error.__cause__ or error.__context__
+    return error
+
+
 class _Probe(Exception):
     """Ends a trial of writing."""
 

@@ -19,6 +19,7 @@ from topomerge import __version__
 from topomerge.cli.atlas import ATLAS
 from topomerge.cli.command import Command
 from topomerge.cli.completion import COMPLETION
+from topomerge.cli.console import failure_line, signal_behind
 from topomerge.cli.embed import EMBED
 from topomerge.cli.export import EXPORT
 from topomerge.cli.export_embedder import EXPORT_EMBEDDER
@@ -28,9 +29,10 @@ from topomerge.cli.match import MATCH
 from topomerge.cli.merge import MERGE
 from topomerge.cli.simulate import SIMULATE
 from topomerge.cli.view import VIEW
+from topomerge.cli.watch import WATCH
 from topomerge.errors import printable
 
-COMMANDS = (EXTRACT, INFO, EMBED, MATCH, MERGE, SIMULATE, COMPLETION, ATLAS, EXPORT, EXPORT_EMBEDDER, VIEW)
+COMMANDS = (EXTRACT, INFO, EMBED, MATCH, MERGE, SIMULATE, COMPLETION, ATLAS, WATCH, EXPORT, EXPORT_EMBEDDER, VIEW)
 
 EXIT_STATUSES = """\
 exit status:
@@ -84,35 +86,10 @@ def _add(commands: Any, command: Command) -> None:
     parser.set_defaults(run=command.run, paths=command.paths)
 
 
-def _failure(error: BaseException, paths: Sequence[str]) -> str:
-    """One line about an error that names the file it is about."""
-    if isinstance(error, MemoryError):
-        text = "not enough memory; take larger voxels or a part of the input"
-    elif isinstance(error, OSError) and error.strerror:
-        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    elif isinstance(error, ImportError):
-        text = f"this needs the Python package {error.name or error}, which is not installed"
-    elif isinstance(error, ValueError):
-        text = str(error)
-    else:
-        text = f"unexpected {type(error).__name__}: {error} (a fault in topomerge: run again with -v -v and report it)"
-    text = " ".join(text.split()) or type(error).__name__
-    if paths and not text.startswith("--") and not any(path in text for path in paths):  # an option is no file's fault
-        text = f"{paths[0]}: {text}"
-    return printable(f"topomerge: {text}")
-
-
 def _named_paths(args: argparse.Namespace) -> list[str]:
     """The files that the user named, the input first."""
     values = [getattr(args, name) for name in args.paths if getattr(args, name, None)]
     return [str(path) for value in values for path in (value if isinstance(value, list) else [value])]
-
-
-def _signal_behind(error: BaseException | None) -> BaseException | None:
-    """The Ctrl-C or SIGTERM that an error comes from, if any: one during compiled code comes out as a SystemError."""
-    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
-        error = error.__cause__ or error.__context__
-    return error
 
 
 def _refuse_empty_names(args: argparse.Namespace) -> None:
@@ -148,7 +125,7 @@ def _run(args: argparse.Namespace) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except (KeyboardInterrupt, Exception) as error:
-        signalled = _signal_behind(error)
+        signalled = signal_behind(error)
         if isinstance(signalled, SystemExit):
             raise signalled from None
         if signalled is not None:
@@ -156,7 +133,7 @@ def _run(args: argparse.Namespace) -> int:
             return 130
         if debug:
             traceback.print_exc()
-        print(_failure(error, _named_paths(args)), file=sys.stderr)
+        print(printable(f"topomerge: {failure_line(error, _named_paths(args))}"), file=sys.stderr)
         return 1
 
 

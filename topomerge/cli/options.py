@@ -67,6 +67,15 @@ def belief_choices(args: argparse.Namespace) -> dict[str, Any]:
     return choices
 
 
+def atlas_choices(args: argparse.Namespace) -> dict[str, Any]:
+    """What `ATLAS_OPTIONS` say, as settings of an atlas.
+
+    Raises:
+        InputError: as `belief_choices`.
+    """
+    return {**given(args, "scale", "embedder"), **belief_choices(args)}
+
+
 def output(metavar: str, help: str) -> Argument:
     """Where to write what a command is for."""
     return option("-o", "--output", required=True, metavar=metavar, default=None, help=help)
@@ -106,6 +115,16 @@ BELIEF_OPTIONS = (
     ),
     option(
         "--threshold", type=share, metavar="P", help="probability from which to believe (default 0.65, links of an atlas 0.8)"
+    ),
+)
+ATLAS_OPTIONS = (
+    option("--scale", choices=("fixed", "free"), help="free: the scales of the maps differ (default fixed)"),
+    *BELIEF_OPTIONS,
+    option(
+        "--descriptor",
+        dest="embedder",
+        choices=("learned", "engineered", "shapedna", "feather"),
+        help="let matched rooms propose places, too; takes twice as long (default: geometry only)",
     ),
 )
 SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of fusion/bend/drift.json

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -66,9 +67,32 @@ def check_poses(poses: str, count: int, scale: str) -> None:
         raise InputError("poses of rooms alone are for two maps of one scale; leave them out (--poses search)")
 
 
-def check_cells(map: TopometricMap, name: str) -> None:
+@dataclass(frozen=True)
+class Extent:
+    """How large a map is.
+
+    Args:
+        source: of the map.
+        cells: that are occupied.
+        span: their diagonal seen from above, m.
+        edge: of a cell, m.
+    """
+
+    source: str
+    cells: int
+    span: float
+    edge: float
+
+    @classmethod
+    def of(cls, map: TopometricMap) -> Extent:
+        """That of a map."""
+        cells, edge = map.grid.cells, map.grid.edge
+        return cls(map.source, len(cells), float(np.hypot(*np.ptp(cells[:, :2], axis=0))) * edge if len(cells) else 0.0, edge)
+
+
+def check_cells(cells: int, name: str) -> None:
     """Raise InputError for a map without cells."""
-    if not len(map.grid):
+    if not cells:
         raise InputError(f"{name}: has no occupied cells, nothing can be merged; extract it from another scan")
 
 
@@ -80,11 +104,12 @@ def check_different(a: TopometricMap, b: TopometricMap) -> None:
         raise InputError(f"{name}: is the same map as {a.source or 'the first'}; give two different maps")
 
 
-def check_units(a: TopometricMap, b: TopometricMap) -> None:
+def check_units(one: TopometricMap | Extent, other: TopometricMap | Extent) -> None:
     """Raise InputError where a map is far larger than any neighbour of the other: it is in centimetres or millimetres."""
-    spans = [float(np.hypot(*np.ptp(m.grid.cells[:, :2], axis=0))) * m.grid.edge for m in (a, b)]
-    large, small = (a, b) if spans[0] >= spans[1] else (b, a)
-    ratio = max(spans) / max(min(spans), small.grid.edge)
+    a, b = (m if isinstance(m, Extent) else Extent.of(m) for m in (one, other))
+    spans = [a.span, b.span]
+    large, small = (a, b) if a.span >= b.span else (b, a)
+    ratio = max(spans) / max(min(spans), small.edge)
     if max(spans) > UNIT_SPAN and ratio > UNIT_RATIO:
         unit = "mm" if ratio > UNIT_RATIO_MM else "cm"
         wide = f"{large.source or 'one map'}: spans {max(spans):,.0f} m, {small.source or 'the other'} {min(spans):,.0f} m"
@@ -98,7 +123,7 @@ def check_pair(a: TopometricMap, b: TopometricMap, scale: str) -> None:
         InputError: a map without cells, one map twice, maps in different units.
     """
     for map, name in ((a, "the first map"), (b, "the second map")):
-        check_cells(map, map.source or name)
+        check_cells(len(map.grid), map.source or name)
     check_different(a, b)
     if scale == "fixed":
         check_units(a, b)

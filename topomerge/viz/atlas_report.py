@@ -22,7 +22,11 @@ SEEN_BY_NAMES = ("assumed", "seen by one map", "seen by two maps", "seen by thre
 
 
 def atlas_html(
-    result: AtlasResult, joined: Mapping[int, TopometricMap], title: str = "Atlas", more: Sequence[Markup] = ()
+    result: AtlasResult,
+    joined: Mapping[int, TopometricMap],
+    title: str = "Atlas",
+    more: Sequence[Markup] = (),
+    stamp: str = "",
 ) -> str:
     """The report as HTML.
 
@@ -31,6 +35,7 @@ def atlas_html(
         joined: component -> its joined map; of those that are left out there is no plan.
         title: what it is called.
         more: sections that stand behind the list of the maps.
+        stamp: as of `report.page`.
     """
     sections = [_verdict(result), warnings(result.warnings)]
     data: dict[str, Any] = {}
@@ -44,7 +49,7 @@ def atlas_html(
                 data["scene-data"] = _scene(joined[n], sheet.turn)
                 sections.append(_space(joined[n]))
     sections += [_maps(result), *more, _links(result)]
-    return page(title, f"Atlas of {len(result.names)} maps", sections, data)
+    return page(title, f"Atlas of {len(result.names)} maps", sections, data, stamp)
 
 
 def _verdict(result: AtlasResult) -> Markup:

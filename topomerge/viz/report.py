@@ -28,7 +28,8 @@ from topomerge.viz.sheet import Sheet, lay_out
 from topomerge.viz.svg import plan_svgs
 from topomerge.viz.tables import doors_table, facts, rooms_table, seconds_table, storeys_table
 
-SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "merge.js", "places.js", "page.js")
+SCRIPTS = ("plan.js", "tables.js", "camera.js", "cells.js", "scene.js", "merge.js", "places.js", "stamp.js", "page.js")
+BESIDE = " 'self' file:"  # what a page that looks for a newer one may read: a style sheet that lies beside it, never a script
 
 
 def save_report(map: TopometricMap, path: str | Path) -> None:
@@ -59,7 +60,7 @@ def report_html(map: TopometricMap) -> str:
     return page(title, "Topometric map", sections, {"scene-data": scene_data(map, turn=sheet.turn)})
 
 
-def page(title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, Any]) -> str:
+def page(title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, Any], stamp: str = "") -> str:
     """A whole page from the template.
 
     Args:
@@ -67,6 +68,7 @@ def page(title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, A
         kind: what kind of report it is; escaped.
         sections: its content.
         data: id -> a JSON value that the scripts read, as `scene_data`.
+        stamp: of the page; an open one loads itself anew when `report_stamp.css` beside it holds another one. Empty: never.
     """
     script = "".join(_template(name) for name in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
@@ -75,7 +77,8 @@ def page(title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, A
         "heading": join([element("p", kind, class_="kind"), element("h1", title)]),
         "style": element("style", Markup(_template("report.css"))),
         "hash": Markup(digest),
-        "content": join(sections),
+        "styles": Markup(BESIDE if stamp else ""),
+        "content": join([*sections, *([element("i", id="stamp", data_stamp=stamp, hidden=True)] if stamp else [])]),
         "data": join(json_data(value, id) for id, value in data.items()),
         "script": element("script", Markup(script)),
         "version": Markup(__version__),

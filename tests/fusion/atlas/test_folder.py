@@ -72,5 +72,5 @@ def test_one_change_at_a_time(tmp_path):
     fcntl = pytest.importorskip("fcntl")
     with (tmp_path / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(InputError, match="is being changed by another process"), changing(tmp_path, []):
+        with pytest.raises(InputError, match="is being changed by another process"), changing(tmp_path, [], 0):
             pass

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from tests.fusion.atlas.atlas_scenes import office_map, stranger
-from topomerge.fusion.atlas.maps import map_key
+from topomerge.fusion.atlas.memory import map_key
 
 
 def test_keys_tell_maps_by_what_they_hold():

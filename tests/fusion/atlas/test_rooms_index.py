@@ -20,7 +20,7 @@ from topomerge.fusion.atlas.index_check import check_graph
 from topomerge.fusion.atlas.neighbours import nearest
 from topomerge.fusion.atlas.room_rows import ROOMS_FILE, embedder_signature, signed
 from topomerge.fusion.atlas.rooms_index import INDEX_FILE, LINKS, RoomsIndex
-from topomerge.fusion.atlas.store import read_atlas
+from topomerge.fusion.atlas.stored import read_atlas
 from topomerge.io import archive
 from topomerge.types import Array
 

@@ -10,7 +10,8 @@ import pytest
 import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import FRAMES, NAMES, REGISTRATIONS, office_map, stranger, truth
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.maps import LOADED_AT_ONCE, Maps, map_key
+from topomerge.fusion.atlas.maps import Maps
+from topomerge.fusion.atlas.memory import LOADED_AT_ONCE, map_key
 from topomerge.fusion.atlas.pairs import promise
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import partners_of
@@ -98,7 +99,9 @@ def test_a_claim_against_two_surer_ones_is_not_believed(maps, registrations):
     sure = poisoned(maps, poisoned(maps, registrations, 0, 1, Sim3(), 0.99), 1, 2, Sim3(), 0.99)  # by their true poses
     result = tm.atlas(maps[:3], registrations=poisoned(maps, sure, 0, 2, SHIFTED, 0.95))
     assert (0, 2) not in [link.maps for link in result.links]
-    assert all(right(result, {k: k for k in component}) for component in result.components)  # never at the wrong place
+    assert all(
+        right(result, {k: k for k in component}, component[0]) for component in result.components
+    )  # never at the wrong place
 
 
 def test_a_poisoned_map_is_not_let_in(maps, registrations):
@@ -135,7 +138,7 @@ def test_files_are_read_when_needed(maps, atlas, registrations, tmp_path):
     assert result.components == atlas.components and result.names == atlas.names
     assert all(np.allclose(result.transforms[k].matrix, atlas.transforms[k].matrix, atol=1e-9) for k in range(4))
     inner = Maps(paths)
-    assert [len(inner[k].rooms) for k in range(5)] == [len(m.rooms) for m in maps] and len(inner._loaded) == LOADED_AT_ONCE
+    assert [len(inner[k].rooms) for k in range(5)] == [len(m.rooms) for m in maps] and len(inner.memory._loaded) == LOADED_AT_ONCE
     assert promise(inner, 0, 2) > promise(inner, 0, 4)
 
 

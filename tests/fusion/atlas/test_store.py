@@ -44,7 +44,7 @@ def names(folder: Path) -> list[str]:
 
 
 MAPS = ["maps/east.tmap", "maps/stranger.tmap", "maps/west.tmap"]
-WHOLE = ["atlas.json", "map_0.tmap", *MAPS, "merged_0.ply", "pairs.json", "report.html"]
+WHOLE = ["atlas.json", "map_0.tmap", *MAPS, "merged_0.ply", "pairs.json", "report.html", "report_stamp.css"]
 
 
 def test_what_is_written(built):
@@ -78,14 +78,14 @@ def test_taking_out_takes_back(folder, built):
     before = listing_of(built)
     registered = (folder / "pairs.json").read_bytes()
     remove(folder, ["east"], tm.atlas_html)
-    assert names(folder) == ["atlas.json", "maps/stranger.tmap", "maps/west.tmap", "pairs.json", "report.html"]
+    assert names(folder) == ["atlas.json", "maps/stranger.tmap", "maps/west.tmap", *WHOLE[-3:]]
     assert listing_of(folder)["status"] == "abstained" and not listing_of(folder)["transforms"]
     assert len((folder / "pairs.json").read_bytes()) < len(registered)
     add(folder, named(2), tm.atlas_html)
     assert [c["names"] for c in listing_of(folder)["components"]] == [["west", "east"], ["stranger"]]
     assert listing_of(folder)["components"][0]["made_of"] == before["components"][0]["made_of"]
     remove(folder, ["west", "east", "stranger"], tm.atlas_html)
-    assert names(folder) == ["atlas.json", "pairs.json", "report.html"] and listing_of(folder)["reason"] == "no map"
+    assert names(folder) == ["atlas.json", *WHOLE[-3:]] and listing_of(folder)["reason"] == "no map"
 
 
 def test_registrations_are_made_once(folder, monkeypatch):

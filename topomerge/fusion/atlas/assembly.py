@@ -7,7 +7,7 @@ rejected, and named.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -74,6 +74,7 @@ class Assembler:
 
     def __init__(self, count: int, hypotheses: Hypotheses, checks: Checks, limit: float, scaled: bool = False) -> None:
         self.count, self.hypotheses, self.checks, self.limit, self.scaled = count, hypotheses, checks, limit, scaled
+        self._settled: dict[tuple[Hashable, ...], tuple[dict[int, Sim3], list[Measured]]] = {}
 
     def build(self) -> Assembly:
         """The most probable assembly without contradictions."""
@@ -241,8 +242,15 @@ class Assembler:
 
     def settled(self, poses: Poses, links: Sequence[Link], fine: bool = False) -> tuple[dict[int, Sim3], list[Measured]]:
         """Poses of a component that agree best with all that is measured between its maps, and that."""
-        edges = list(self._measured(poses, links, fine))
-        return optimise(poses, edges, self.scaled, min(poses)), edges
+        within = tuple((link.maps, link.hypothesis.transform) for link in links if link.maps[0] in poses)
+        best = ((p, h) for p, of in self.hypotheses.items() for h in of[:1] if p[0] in poses and p[1] in poses)
+        claims = tuple((pair, h.transform, h.probability) for pair, h in best)
+        question = (tuple(poses.items()), within, claims, fine)
+        if question not in self._settled:  # the same is asked again whenever one more pair was registered
+            edges = list(self._measured(poses, links, fine))
+            self._settled[question] = optimise(poses, edges, self.scaled, min(poses)), edges
+        solved, edges = self._settled[question]
+        return dict(solved), edges
 
     def _measured(self, poses: Poses, links: Sequence[Link], fine: bool) -> Iterator[Measured]:
         link_poses = {link.maps: link.hypothesis.transform for link in links}

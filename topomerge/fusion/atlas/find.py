@@ -23,7 +23,7 @@ from topomerge.errors import InputError
 from topomerge.fusion.atlas.neighbours import VOTE_SHARPNESS, nearest, owners, queries, votes
 from topomerge.fusion.atlas.room_rows import RoomRows, embedder_signature
 from topomerge.fusion.atlas.rooms_index import rooms_index
-from topomerge.fusion.atlas.store import Stored, read_atlas
+from topomerge.fusion.atlas.stored import Stored, read_atlas
 from topomerge.matching.match import checked
 from topomerge.types import Array, TopometricMap
 

@@ -50,9 +50,15 @@ class Check:
     features: Mapping[str, float]
 
 
-def hypotheses(maps: Maps, i: int, j: int, scale: str = "fixed", same: str = "nothing") -> tuple[PoseHypothesis, ...]:
-    """Where map j may lie in map i, most probable first; each with its share of the probability that one of them is right."""
-    poses = _room_poses(maps, i, j, scale) if maps.matched else []
+def hypotheses(
+    maps: Maps, i: int, j: int, scale: str = "fixed", same: str = "nothing", proposed: Sequence[Sim3] = ()
+) -> tuple[PoseHypothesis, ...]:
+    """Where map j may lie in map i, most probable first; each with its share of the probability that one of them is right.
+
+    Args:
+        proposed: poses T_ij that are tried beside those that are looked for.
+    """
+    poses = [*(_room_poses(maps, i, j, scale) if maps.matched else []), *proposed]
     registration = register(maps.prepared(i), maps.prepared(j), scale=scale, proposed=poses, same=same)
     if registration.transform is None or not registration.alternatives:
         return ()
@@ -98,21 +104,33 @@ class Checks:
     def place(self, i: int, j: int, pose: Sim3) -> Array:
         """`place` of maps i and j (i < j) under T_ij."""
         a, b = self.maps.prepared(i), self.maps.prepared(j)
-        return _once(self._places, (i, j), pose, b.middle, lambda: place(a.storeys, b.storeys, pose))
+
+        def make() -> Array:
+            return self.maps.answer(("place", pose), (i, j), lambda: place(a.storeys, b.storeys, pose))
+
+        return _once(self._places, (i, j), pose, b.middle, make)
 
     def fine(self, i: int, j: int, pose: Sim3) -> Sim3:
         """T_ij after the fine registration (i < j); as it was where a map is a slice, which has no planes."""
         a, b = self.maps.prepared(i), self.maps.prepared(j)
         if any(v.plan.sliced for v in (*a.storeys, *b.storeys)):
             return pose
-        return _once(self._fine, (i, j), pose, b.middle, lambda: fine(a, b, pose, self.scaled)[0])
+
+        def make() -> Sim3:
+            return self.maps.answer(("fine", pose, self.scaled), (i, j), lambda: fine(a, b, pose, self.scaled)[0])
+
+        return _once(self._fine, (i, j), pose, b.middle, make)
 
     def __call__(self, i: int, j: int, pose: Sim3) -> Check:
         """What maps i and j say to T_ij."""
         if j < i:
             turned = self(j, i, pose.inverse())
             return Check(turned.pose.inverse(), turned.log_odds, turned.overlap, turned.features)
-        return _once(self._checks, (i, j), pose, self.maps.prepared(j).middle, lambda: self._judged(i, j, pose))
+
+        def make() -> Check:
+            return self.maps.answer(("check", pose, self.scaled), (i, j), lambda: self._judged(i, j, pose))
+
+        return _once(self._checks, (i, j), pose, self.maps.prepared(j).middle, make)
 
     def _judged(self, i: int, j: int, pose: Sim3) -> Check:
         a, b = self.maps.prepared(i).storeys, self.maps.prepared(j).storeys

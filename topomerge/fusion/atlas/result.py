@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from topomerge.fusion.atlas.assembly import Link
@@ -21,8 +21,8 @@ class AtlasResult:
         maps: what was put in.
         names: of the maps, for messages.
         components: maps that lie in one frame, by their place in `maps`, each ascending; those with more than one map first. The
-            frame is that of the first map.
-        transforms: k -> T_0k into the first map of its component; of all maps, the first ones' is the identity.
+            frame is that of the first map, or of the one that the first map replaced (`in_frames`).
+        transforms: k -> its pose in the frame of its component; of all maps, the first ones' is the identity as a rule.
         links: hypotheses that hold the components together.
         rejected: hypotheses that were believed by themselves and thrown out, as others contradict them.
         bends: k -> how map k is bent in its own frame, before it is posed; rigid ones are left out.
@@ -30,6 +30,7 @@ class AtlasResult:
         registered: pairs that were searched in each other, of all.
         seconds: of the whole.
         warnings: what the user should know.
+        complete: was everything registered that could change it?
     """
 
     maps: Maps
@@ -43,6 +44,7 @@ class AtlasResult:
     registered: tuple[int, int] = (0, 0)
     seconds: float = 0.0
     warnings: tuple[str, ...] = ()
+    complete: bool = True
 
     @property
     def alone(self) -> tuple[int, ...]:
@@ -65,8 +67,18 @@ class AtlasResult:
         probabilities = [link.probability for link in self.links if link.maps[0] in self.components[component]]
         return min(probabilities, default=0.0)
 
+    def in_frames(self, frames: Mapping[int, Sim3]) -> AtlasResult:
+        """The same where components lie in other frames.
+
+        Args:
+            frames: k -> pose of map k in the frame of its component, where it is the first map of one; identities are left out.
+        """
+        first = {k: members[0] for members in self.components for k in members}
+        moved = {k: frames[first[k]] @ pose for k, pose in self.transforms.items() if first[k] in frames}
+        return replace(self, transforms=self.transforms | moved)
+
     def joined(self, component: int) -> TopometricMap:
-        """The joined map of a component in the frame of its first map; made anew at each call.
+        """The joined map of a component in its frame; made anew at each call.
 
         Raises:
             InputError: more maps together than provenance can tell apart.

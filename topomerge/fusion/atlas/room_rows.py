@@ -17,7 +17,7 @@ from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.turns import Rows, TurnedRows, numbers
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.neighbours import vectors
-from topomerge.fusion.atlas.store import Entry, Stored
+from topomerge.fusion.atlas.stored import Entry, Stored
 from topomerge.io import archive
 from topomerge.io.maps import load_map
 from topomerge.matching.match import checked

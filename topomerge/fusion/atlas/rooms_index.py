@@ -20,7 +20,7 @@ from topomerge.errors import InputError
 from topomerge.fusion.atlas.index_check import check_graph
 from topomerge.fusion.atlas.neighbours import ROOM_NEIGHBOURS, owners
 from topomerge.fusion.atlas.room_rows import ADVICE, RoomRows, check_made_for, signed
-from topomerge.fusion.atlas.store import Stored
+from topomerge.fusion.atlas.stored import Stored
 from topomerge.io import archive
 from topomerge.types import Array
 

@@ -8,7 +8,7 @@ Of more than eleven maps each is only searched in the ten that its rooms look mo
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, MutableMapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,8 @@ import numpy as np
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.assembly import Assembler, Assembly, Link
-from topomerge.fusion.atlas.maps import Maps, map_key
+from topomerge.fusion.atlas.maps import Maps
+from topomerge.fusion.atlas.memory import Facts, Memory
 from topomerge.fusion.atlas.neighbours import most_alike
 from topomerge.fusion.atlas.pairs import Checks, hypotheses, promise
 from topomerge.fusion.atlas.pose_graph import residual
@@ -26,14 +27,14 @@ from topomerge.fusion.bend.bend import NEITHER_BENDS, bend_together
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.inputs import check_cells, check_scale, check_units, link_threshold, without_rooms
 from topomerge.fusion.posterior import check_same
-from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
-from topomerge.types import Sim3, TopometricMap
+from topomerge.types import Array, Sim3, TopometricMap
 
 SURE_LINK = 4.0  # log odds of a link, above which no further ones are looked for within its component
 ENOUGH_REGISTRATIONS = 3  # of a map, after which none within its component is made
 MOST_PARTNERS = 10  # maps that a map names to be searched in
 RegistrationsByPair = MutableMapping[tuple[str, str], tuple[PoseHypothesis, ...]]  # by the keys of both maps
+Proposed = Mapping[tuple[str, str], Sim3]  # T_ij by the keys of both maps, in any order
 
 
 @dataclass(frozen=True)
@@ -84,12 +85,19 @@ def solve(
     registrations: RegistrationsByPair | None = None,
     names: Sequence[str] | None = None,
     keys: Sequence[str] | None = None,
+    proposed: Proposed | None = None,
+    memory: Memory | None = None,
+    seconds: float = np.inf,
 ) -> AtlasResult:
     """As `atlas`, of any number of maps, one or none, too.
 
     Args:
         names: of the maps, for messages; their sources if None.
         keys: what `map_key` should give for each map.
+        proposed: poses of pairs, tried beside those that are looked for; these pairs may be registered in any case, so that no
+            link is given up only as other maps look more alike.
+        memory: of maps that were put together before; it changes how long it takes, not what comes out.
+        seconds: after which no more pairs are registered; `AtlasResult.complete` says whether some are left.
 
     Raises:
         InputError: as `atlas`; and a map has another key.
@@ -98,40 +106,44 @@ def solve(
     check_scale(settings.scale)
     check_same(settings.same)
     threshold = _log_odds(link_threshold(settings.threshold))
-    names, map_keys, warnings = _checked(maps, names, keys, settings.scale)
+    memory = Memory() if memory is None else memory
+    names, map_keys, warnings = _checked(maps, names, keys, settings.scale, memory)
     order = sorted(range(len(maps)), key=lambda k: map_keys[k])
-    ordered = Maps([maps[k] for k in order], settings.embedder)
-    registrations = {} if registrations is None else registrations
-    explorer = _Explorer(ordered, [map_keys[k] for k in order], settings, threshold, registrations)
-    assembly = explorer.explored()
+    ordered = Maps([maps[k] for k in order], settings.embedder, memory, [map_keys[k] for k in order])
+    explorer = _Explorer(ordered, settings, threshold, {} if registrations is None else registrations, proposed or {})
+    assembly = explorer.explored(began + seconds)
     result = _result(assembly, explorer, names, order, settings.rigid)
     return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=(*warnings, *result.warnings))
 
 
 def _checked(
-    maps: Sequence[TopometricMap | str | Path], names: Sequence[str] | None, keys: Sequence[str] | None, scale: str
+    maps: Sequence[TopometricMap | str | Path],
+    names: Sequence[str] | None,
+    keys: Sequence[str] | None,
+    scale: str,
+    memory: Memory,
 ) -> tuple[list[str], list[str], list[str]]:
     """Names, keys and warnings of the maps, which are looked at one after the other."""
     map_names: list[str] = []
     map_keys: list[str] = []
     warnings: list[str] = []
-    first: TopometricMap | None = None
+    first: Facts | None = None
     for k, source in enumerate(maps):
-        map = source if isinstance(source, TopometricMap) else load_map(source)
-        name, key = names[k] if names else map.source or f"map {k}", map_key(map)
-        if keys and keys[k] != key:
+        facts = memory.facts(source)
+        name = names[k] if names else facts.extent.source or f"map {k}"
+        if keys and keys[k] != facts.key:
             raise InputError(f"{source}: is not the map that was added as {name}; take it out with `topomerge atlas remove`")
-        check_cells(map, name)
-        if key in map_keys:
-            raise InputError(f"{name}: is the same map as {map_names[map_keys.index(key)]}; give it once")
+        check_cells(facts.extent.cells, name)
+        if facts.key in map_keys:
+            raise InputError(f"{name}: is the same map as {map_names[map_keys.index(facts.key)]}; give it once")
         if first is None:
-            first = map
+            first = facts
         elif scale == "fixed":
-            check_units(first, map)
-        if not len(map.rooms):
+            check_units(first.extent, facts.extent)
+        if not facts.rooms:
             warnings.append(without_rooms(name))
         map_names.append(name)
-        map_keys.append(key)
+        map_keys.append(facts.key)
     return map_names, map_keys, warnings
 
 
@@ -143,52 +155,70 @@ class _Explorer:
     """Registers pairs until each map is surely connected, or nothing is left to try.
 
     Args:
-        keys: of the maps, which are in their order.
+        maps: in the order of their keys.
         threshold: log odds from which a link is believed.
     """
 
     def __init__(
-        self, maps: Maps, keys: Sequence[str], settings: AtlasSettings, threshold: float, registrations: RegistrationsByPair
+        self, maps: Maps, settings: AtlasSettings, threshold: float, registrations: RegistrationsByPair, proposed: Proposed
     ) -> None:
-        self.maps, self.keys, self.scale, self.same = maps, keys, settings.scale, settings.same
+        self.maps, self.scale, self.same = maps, settings.scale, settings.same
         self.registrations, scaled = registrations, settings.scale == "free"
+        self.proposed = {**proposed, **{(j, i): pose.inverse() for (i, j), pose in proposed.items()}}
         self.tried: dict[tuple[int, int], tuple[PoseHypothesis, ...]] = {}
+        self.complete = True
         self.checks = Checks(maps, scaled)
         self.assembler = Assembler(len(maps), self.tried, self.checks, threshold, scaled)
-        self.partners = partners_of(maps)
+        place = {key: k for k, key in enumerate(maps.keys)}
+        self.partners = partners_of(maps, [(place[a], place[b]) for a, b in proposed if a in place and b in place])
 
-    def explored(self) -> Assembly:
-        """The assembly that more registrations would not change."""
+    def explored(self, end: float = np.inf) -> Assembly:
+        """The assembly that more registrations would not change; after the end of the time that of those that were made."""
         while True:
             assembly = self.assembler.build()
-            pairs = sorted(set(self._next_pairs(assembly)))
-            for i, j in pairs:
-                self.tried[i, j] = self._registered(i, j)
+            counts = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
+            pairs = set(self._next_pairs(assembly, counts, time.perf_counter() >= end))
             if not pairs:
+                self.complete = not any(self._next_pairs(assembly, counts))
                 return assembly
+            for i, j in sorted(pairs, key=lambda pair: (counts[list(pair)].min(), pair)):  # what nothing is known of comes first
+                if self._is_registered(i, j) or time.perf_counter() < end:
+                    self.tried[i, j] = self._registered(i, j)
 
-    def _next_pairs(self, assembly: Assembly) -> Iterator[tuple[int, int]]:
-        """For each map its most promising partner in another component, and where it is not surely connected one in its own."""
-        counts = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
+    def _next_pairs(self, assembly: Assembly, counts: Array, late: bool = False) -> Iterator[tuple[int, int]]:
+        """For each map its most promising partner in another component, and where it is not surely connected one in its own.
+
+        Args:
+            counts: pairs that were tried, of each map.
+            late: only pairs that are registered already.
+        """
         for k in range(len(self.maps)):
             component = assembly.of(k)
             sure = any(link.log_odds >= SURE_LINK for link in assembly.links if k in link.maps)
-            partners = [m for m in self.partners[k] if (min(k, m), max(k, m)) not in self.tried]
-            outside = [m for m in partners if m not in component]
-            inside = [m for m in partners if m in component and not sure and counts[k] < ENOUGH_REGISTRATIONS]
-            for m in (*outside[:1], *inside[:1]):
-                yield min(k, m), max(k, m)
+            pairs = [((min(k, m), max(k, m)), m in component) for m in self.partners[k]]
+            pairs = [p for p in pairs if p[0] not in self.tried and not (late and not self._is_registered(*p[0]))]
+            outside = [pair for pair, within in pairs if not within]
+            inside = [pair for pair, within in pairs if within and not sure and counts[k] < ENOUGH_REGISTRATIONS]
+            yield from (*outside[:1], *inside[:1])
+
+    def _is_registered(self, i: int, j: int) -> bool:
+        return (self.maps.keys[i], self.maps.keys[j]) in self.registrations
 
     def _registered(self, i: int, j: int) -> tuple[PoseHypothesis, ...]:
-        pair = (self.keys[i], self.keys[j])
+        pair = (self.maps.keys[i], self.maps.keys[j])
         if pair not in self.registrations:
-            self.registrations[pair] = hypotheses(self.maps, i, j, self.scale, self.same)
+            tried = [self.proposed[pair]] if pair in self.proposed else []
+            self.registrations[pair] = hypotheses(self.maps, i, j, self.scale, self.same, tried)
         return self.registrations[pair]
 
 
-def partners_of(maps: Maps) -> list[list[int]]:
+def partners_of(maps: Maps, linked: Iterable[tuple[int, int]] = ()) -> list[list[int]]:
     """For each map those that it may be searched in, most promising first: all others where they are few, else the ten that its
-    rooms look most like, and those that name it. A map without rooms names the largest ones."""
+    rooms look most like, and those that name it. A map without rooms names the largest ones.
+
+    Args:
+        linked: pairs that may be searched in each other in any case.
+    """
     count = len(maps)
     if count <= MOST_PARTNERS + 1:
         pairs = {(i, j) for j in range(count) for i in range(j)}
@@ -196,6 +226,7 @@ def partners_of(maps: Maps) -> list[list[int]]:
         by_area = sorted(range(count), key=lambda k: -maps.area(k))
         named = enumerate(most_alike([maps.rows(k) for k in range(count)], MOST_PARTNERS))
         pairs = {(min(k, m), max(k, m)) for k, of in named for m in of or [m for m in by_area if m != k][:MOST_PARTNERS]}
+    pairs |= {(min(pair), max(pair)) for pair in linked}
     partners: list[dict[int, float]] = [{} for _ in range(count)]
     for i, j in sorted(pairs):
         partners[i][j] = partners[j][i] = promise(maps, i, j)
@@ -212,8 +243,7 @@ def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order
         poses, edges = explorer.assembler.settled(component, assembly.links, fine=True)
         if not rigid and len(component) > 1:
             pairs = sorted({link.maps for link in assembly.links if link.maps[0] in component})
-            prepared = {k: explorer.maps.prepared(k) for k in component}
-            poses, deformations, reason = bend_together(prepared, poses, pairs, explorer.scale == "free")
+            poses, deformations, reason = _bent(explorer.maps, poses, pairs, explorer.scale == "free")
             if reason not in ("", NEITHER_BENDS):
                 warnings.append(f"{', '.join(names[order[k]] for k in sorted(component))} were not bent: {reason}")
             bends |= {order[k]: d for k, d in deformations.items()}
@@ -236,7 +266,23 @@ def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order
         bends,
         (len(explorer.tried), len(names) * (len(names) - 1) // 2),
         warnings=tuple(warnings),
+        complete=explorer.complete,
     )
+
+
+def _bent(
+    maps: Maps, poses: Mapping[int, Sim3], pairs: Sequence[tuple[int, int]], scaled: bool
+) -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
+    """`bend_together`, by the numbers of the maps."""
+    names = sorted(poses)
+    places = tuple((names.index(i), names.index(j)) for i, j in pairs)
+
+    def make() -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
+        return bend_together({n: maps.prepared(k) for n, k in enumerate(names)}, dict(enumerate(lying)), places, scaled)
+
+    lying = tuple(poses[k] for k in names)
+    moved, deformations, reason = maps.answer(("bent", lying, places, scaled), names, make)
+    return {names[n]: p for n, p in moved.items()}, {names[n]: d for n, d in deformations.items()}, reason
 
 
 def _reordered(links: Iterable[Link], order: Sequence[int]) -> tuple[Link, ...]:

@@ -7,8 +7,11 @@
 | pairs.json | registrations made so far, by the hashes of the maps; it may be deleted |
 | map_N.tmap, merged_N.ply | the joined map of component N |
 | report.html | everything to look at |
+| report_stamp.css | which report that is: an open page that has another one loads itself anew |
+| watch.json | which files gave which maps (`sources`) |
 
 Maps that are added later give what building all at once gives: all is put together anew, only registrations are remembered.
+What two processes change at once is changed one after the other: each reads the atlas when it is its turn.
 """
 
 from __future__ import annotations
@@ -16,94 +19,51 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from topomerge import __version__
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.assembly import Link
-from topomerge.fusion.atlas.folder import changing, finished, link_or_copy
-from topomerge.fusion.atlas.maps import Maps, map_key
+from topomerge.fusion.atlas.folder import changing, link_or_copy
+from topomerge.fusion.atlas.maps import Maps
+from topomerge.fusion.atlas.memory import Memory, map_key
 from topomerge.fusion.atlas.registration_cache import PAIRS_FILE, read_registrations, registrations_to_json
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.solve import AtlasSettings, solve
+from topomerge.fusion.atlas.solve import AtlasSettings, Proposed, solve
+from topomerge.fusion.atlas.stored import ATLAS_FORMAT, Entry, Stored, check_folder, held_by, read_atlas
 from topomerge.fusion.result import transform_to_json
 from topomerge.io.listing import json_text, plain
 from topomerge.io.maps import load_map, save_map
 from topomerge.io.rooms_ply import save_rooms_ply
-from topomerge.types import TopometricMap
+from topomerge.types import Sim3, TopometricMap
 
-ATLAS_FORMAT = 1
-Report = Callable[[AtlasResult, Mapping[int, TopometricMap], str], str]  # atlas, joined map of each component, title -> HTML
+Report = Callable[..., str]  # (atlas, joined map of each component, title, stamp=…) -> HTML
+STAMP_FILE = "report_stamp.css"
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A map of the atlas."""
+class Change:
+    """What an atlas shall hold.
 
-    name: str
-    key: str
-    source: str
-    rooms: int
-    storeys: int
-
-    @property
-    def file(self) -> str:
-        """Where its copy is, in the atlas."""
-        return f"maps/{self.name}.tmap"
-
-
-@dataclass(frozen=True, eq=False)
-class Stored:
-    """What atlas.json says."""
-
-    folder: Path
-    entries: tuple[Entry, ...] = ()
-    settings: Mapping[str, Any] = field(default_factory=lambda: asdict(AtlasSettings()))
-    listing: Mapping[str, Any] | None = None
-
-    def files(self) -> list[str]:
-        """All that belongs to the atlas but atlas.json."""
-        joined = [c[kind] for c in (self.listing or {}).get("components", []) for kind in ("map", "ply") if kind in c]
-        return [e.file for e in self.entries] + joined
-
-
-def read_atlas(folder: str | Path) -> Stored:
-    """What an atlas holds; a change that was interrupted is finished first.
-
-    Raises:
-        InputError: no such folder, no atlas, or damaged.
+    Args:
+        stored: its maps and settings.
+        new: those that it does not hold yet, by their names.
+        proposed: as of `solve`, beside those of the links that there are.
+        files: others that are written with it, name -> text.
+        seconds: after which no more pairs are registered: what is left is for the next change.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; make an atlas with `topomerge atlas add {folder} MAP ...`")
-    finished(folder)
-    path = folder / "atlas.json"
-    if not path.exists():
-        raise InputError(f"{folder}: is no atlas (atlas.json is missing); `topomerge atlas add` makes one in a new folder")
-    try:
-        listing = json.loads(path.read_text(encoding="utf-8"))
-        if listing["format"] != ATLAS_FORMAT:
-            written = f"is of format {listing['format']!r}, this topomerge reads format {ATLAS_FORMAT}"
-            raise InputError(f"{path}: {written}; update topomerge")
-        entries = tuple(Entry(m["name"], m["key"], m["source"], int(m["rooms"]), int(m["storeys"])) for m in listing["maps"])
-        settings = {name: listing["settings"].get(name, usual) for name, usual in asdict(AtlasSettings()).items()}
-        if any(Path(e.file).parent != Path("maps") or not isinstance(e.key, str) for e in entries):
-            raise ValueError("a map lies elsewhere")
-        stored = Stored(folder, entries, settings, listing)
-        if any(Path(name).is_absolute() or ".." in Path(name).parts for name in stored.files()):
-            raise ValueError("a file lies elsewhere")
-    except InputError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:120]
-        raise InputError(f"{path}: damaged ({reason}); make the atlas again from the maps in {folder / 'maps'}") from error
-    return stored
+
+    stored: Stored
+    new: Mapping[str, TopometricMap] = field(default_factory=dict)
+    proposed: Proposed = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
+    seconds: float = float("inf")
 
 
 def add(folder: str | Path, maps: Sequence[tuple[str, TopometricMap]], report: Report, **settings: Any) -> AtlasResult:
-    """Add maps to an atlas; a new one where there is none.
+    """Add maps to an atlas; a new one where there is none. Waits for other processes that change it.
 
     Args:
         folder: of the atlas.
@@ -114,22 +74,25 @@ def add(folder: str | Path, maps: Sequence[tuple[str, TopometricMap]], report: R
     Raises:
         InputError: the folder is no atlas, a map is in it already, or what `atlas` says of the maps.
     """
-    stored = check_folder(folder)
-    stored = replace(stored, settings={**stored.settings, **settings})
-    entries, new = list(stored.entries), {}
-    for name, m in maps:
-        key = map_key(m)
-        same = next((e.name for e in entries if e.key == key), None)
-        if same is not None:
-            raise InputError(f"{m.source or name}: is in the atlas already, as {same}; leave it out")
-        entry = Entry(_free_name(name, entries), key, m.source or name, len(m.rooms), len(m.storeys))
-        entries.append(entry)
-        new[entry.name] = m
-    return _written(replace(stored, entries=tuple(entries)), new, stored, report)
+    check_folder(folder)
+
+    def with_maps(stored: Stored) -> Change:
+        stored = replace(stored, settings={**stored.settings, **settings})
+        new = {}
+        for name, m in maps:
+            entry = entry_of(name, m, stored)
+            same = stored.named(entry.key)
+            if same is not None:
+                raise InputError(f"{m.source or name}: is in the atlas already, as {same}; leave it out")
+            stored = replace(stored, entries=(*stored.entries, entry))
+            new[entry.name] = m
+        return Change(stored, new)
+
+    return change(folder, with_maps, report)
 
 
 def remove(folder: str | Path, names: Sequence[str], report: Report) -> AtlasResult:
-    """Take maps back out, and what they brought with them.
+    """Take maps back out, and what they brought with them. Waits for other processes that change the atlas.
 
     Args:
         report: as of `add`.
@@ -137,28 +100,21 @@ def remove(folder: str | Path, names: Sequence[str], report: Report) -> AtlasRes
     Raises:
         InputError: the folder is no atlas, or it has no such map.
     """
-    stored = read_atlas(folder)
-    held = [e.name for e in stored.entries]
-    for name in names:
-        if name not in held:
-            raise InputError(f"{name}: is no map of {folder}; it holds {', '.join(held) or 'none'}")
-    remaining = tuple(e for e in stored.entries if e.name not in names)
-    return _written(replace(stored, entries=remaining), {}, stored, report)
+    read_atlas(folder)
+
+    def without_maps(stored: Stored) -> Change:
+        held = [e.name for e in stored.entries]
+        for name in names:
+            if name not in held:
+                raise InputError(f"{name}: is no map of {folder}; it holds {', '.join(held) or 'none'}")
+        return Change(replace(stored, entries=tuple(e for e in stored.entries if e.name not in names)))
+
+    return change(folder, without_maps, report)
 
 
-def check_folder(folder: str | Path) -> Stored:
-    """What an atlas holds, of a new one nothing.
-
-    Raises:
-        InputError: a file, or a folder with other things in it.
-    """
-    folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; give the name of a folder")
-    if folder.is_dir():
-        finished(folder)
-    there = folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir())
-    return read_atlas(folder) if there else Stored(folder)
+def entry_of(name: str, map: TopometricMap, stored: Stored) -> Entry:
+    """The entry of a map that an atlas does not hold yet, under its name or, where that is taken, under another one."""
+    return Entry(_free_name(name, stored.entries), map_key(map), map.source or name, len(map.rooms), len(map.storeys))
 
 
 def _free_name(name: str, entries: Iterable[Entry]) -> str:
@@ -168,18 +124,42 @@ def _free_name(name: str, entries: Iterable[Entry]) -> str:
     return next(n for n in numbered if n.lower() not in taken)
 
 
-def _written(stored: Stored, new: Mapping[str, TopometricMap], before: Stored, report: Report) -> AtlasResult:
-    """Put everything together and write it, all or nothing."""
-    folder, gone = stored.folder, list[str]()
-    registrations = read_registrations(folder, stored.settings)
+def change(
+    folder: str | Path,
+    make: Callable[[Stored], Change],
+    report: Report,
+    memory: Memory | None = None,
+    solved: Callable[[AtlasResult], None] | None = None,
+) -> AtlasResult:
+    """Put everything together and write it, all or nothing; what others changed before is in it.
+
+    Args:
+        make: called with what the atlas holds when no other process can change it any more.
+        report: as of `add`.
+        memory: of what was made of its maps before.
+        solved: is told where the maps lie, before joined maps and report are made.
+
+    Raises:
+        InputError: what `make` says, or `atlas` of the maps; or the folder can't be written.
+    """
+    folder = Path(folder)
+    gone: list[str] = []
     with changing(folder, gone) as place:
+        before = held_by(folder)
+        wanted = make(before)
+        stored = wanted.stored
         (place / "maps").mkdir()
         for entry in stored.entries:
-            if entry.name in new:
-                save_map(new[entry.name], place / entry.file)
-        files = [place / e.file if e.name in new else folder / e.file for e in stored.entries]
+            if entry.name in wanted.new:
+                save_map(wanted.new[entry.name], place / entry.file)
+        files = [place / e.file if e.name in wanted.new else folder / e.file for e in stored.entries]
         names, keys = [e.name for e in stored.entries], [e.key for e in stored.entries]
-        atlas = solve(files, AtlasSettings(**stored.settings), registrations, names, keys)
+        registrations = read_registrations(folder, stored.settings)
+        choices, proposed = AtlasSettings(**stored.settings), {**before.lying(), **wanted.proposed}
+        atlas = solve(files, choices, registrations, names, keys, proposed, memory, wanted.seconds)
+        atlas = atlas.in_frames({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
+        if solved is not None:
+            solved(atlas)
         joined, components = {}, []
         for n, members in enumerate(atlas.components):
             component = _component(atlas, stored, n)
@@ -188,9 +168,13 @@ def _written(stored: Stored, new: Mapping[str, TopometricMap], before: Stored, r
                 joined[n] = _joined(atlas, n, component, before, place)
             components.append(component)
         listing = _listing(atlas, stored, components)
-        _write(place / "report.html", report(atlas, joined, folder.resolve().name))
-        _write(place / PAIRS_FILE, json.dumps(registrations_to_json(registrations, keys, stored.settings)))
-        _write(place / "atlas.json", json_text(listing))
+        pairs = json.dumps(registrations_to_json(registrations, keys, stored.settings))
+        stamp = hashlib.sha256(json_text(listing | {"seconds": 0}).encode()).hexdigest()[:16]
+        page = report(atlas, joined, folder.resolve().name, stamp=stamp)
+        css = f':root {{ --stamp: "{stamp}"; }}\n'
+        texts = {PAIRS_FILE: pairs, "report.html": page, STAMP_FILE: css, "atlas.json": json_text(listing)}
+        for name, text in (texts | dict(wanted.files)).items():
+            _write(place / name, text)
         gone += sorted(set(before.files()) - set(replace(stored, listing=listing).files()))
     return replace(atlas, maps=Maps([folder / e.file for e in stored.entries]))
 
@@ -228,10 +212,12 @@ def _component(atlas: AtlasResult, stored: Stored, n: int) -> dict[str, Any]:
 
 def _listing(atlas: AtlasResult, stored: Stored, components: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """atlas.json, see docs/outputs.md."""
-    into = {k: members[0] for members in atlas.components for k in members[1:]}
-    poses = {str(k): transform_to_json(atlas.transforms[k], atlas.residuals[k], into[k]) for k in sorted(into)}
+    into = {k: members[0] for members in atlas.components for k in members}
+    moved = sorted(k for k, first in into.items() if k != first or atlas.transforms[k] != Sim3())
+    poses = {str(k): transform_to_json(atlas.transforms[k], atlas.residuals[k], into[k]) for k in moved}
     maps = [
         {"name": e.name, "file": e.file, "key": e.key, "source": e.source, "rooms": e.rooms, "storeys": e.storeys}
+        | ({} if e.frame == Sim3() else {"frame": e.frame.matrix.tolist()})
         for e in stored.entries
     ]
     listing = {
@@ -244,7 +230,7 @@ def _listing(atlas: AtlasResult, stored: Stored, components: Sequence[Mapping[st
         "transforms": poses,
         "links": [_link(link) | {"probability": round(link.probability, 4)} for link in atlas.links],
         "thrown_out": [_link(link) | {"against": link.against} for link in atlas.rejected],
-        "registered": {"pairs": atlas.registered[0], "of": atlas.registered[1]},
+        "registered": {"pairs": atlas.registered[0], "of": atlas.registered[1], "complete": atlas.complete},
         "seconds": round(atlas.seconds, 3),
     }
     plain_listing: dict[str, Any] = plain(listing)

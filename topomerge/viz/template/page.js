@@ -23,6 +23,7 @@ document.querySelectorAll("input[data-blend]").forEach(startBlend);
 document.querySelectorAll("input[data-bend]").forEach(startBend);
 startMates(document.getElementById("mates"));
 startPlaces(document.getElementById("places"));
+startStamp(document.getElementById("stamp"));
 // The page is shown before the cells are read; that there is no 3D is said only once it is known.
 document.querySelectorAll("[data-scene]").forEach((place) => place.classList.add("waiting"));
 setTimeout(() => document.querySelectorAll("[data-scene]").forEach(openScene), 50);

@@ -1,0 +1,151 @@
+"""The command `watch`: scans and maps that appear in a folder become maps of an atlas."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from topomerge.cli.command import Command, option
+from topomerge.cli.console import check_outputs, failure_line, say, signal_behind, warn
+from topomerge.cli.options import (
+    ATLAS_OPTIONS,
+    CLOUD_OPTIONS,
+    above_zero,
+    atlas_choices,
+    given,
+    map_from,
+    output,
+    quiet,
+)
+
+if TYPE_CHECKING:
+    from topomerge.fusion.atlas.result import AtlasResult
+    from topomerge.fusion.atlas.watch import Reader, Watch
+    from topomerge.types import TopometricMap
+    from topomerge.viz.rerun_log import RerunLog
+
+EVERY, SETTLE = 2.0, 2.0  # s
+
+
+def watch_command(args: argparse.Namespace) -> int:
+    """`topomerge watch`: until Ctrl-C, or with --once until all that is there is in the atlas."""
+    from topomerge.fusion.atlas.watch import Watch
+    from topomerge.viz.atlas_report import atlas_html
+
+    def tell(line: str, is_warning: bool) -> None:
+        if is_warning:
+            warn([line])
+        elif not args.quiet:
+            say(line)
+            sys.stdout.flush()
+
+    log = _rerun_log(args)
+
+    def report(result: AtlasResult, joined: Mapping[int, TopometricMap], title: str, stamp: str) -> str:
+        if log is not None:
+            log.log(result, joined)
+        return atlas_html(result, joined, title, stamp=stamp)
+
+    watch = Watch(
+        Path(args.folder),
+        Path(args.output),
+        _reader(args),
+        report,
+        tell,
+        settle=args.settle,
+        replacing=args.replace == "longer",
+        settings=atlas_choices(args),
+        warm=not args.once,
+    )
+    began = time.monotonic()
+    try:
+        busy = True
+        while busy or not args.once:
+            busy = watch.look()
+            if busy or not args.once:
+                time.sleep(args.every)
+    except (KeyboardInterrupt, SystemError) as stop:
+        if not isinstance(signal_behind(stop), KeyboardInterrupt):
+            raise
+        say(f"stopped after {time.monotonic() - began:.0f} s: {_summary(watch)}")
+        return 130 if args.once else 0
+    tell(_summary(watch), False)
+    return 0
+
+
+def _rerun_log(args: argparse.Namespace) -> RerunLog | None:
+    if not hasattr(args, "rerun"):
+        return None
+    from topomerge.viz.rerun_log import RerunLog
+
+    if args.rerun is not None:
+        check_outputs([args.rerun])
+    return RerunLog(args.rerun)
+
+
+def _summary(watch: Watch) -> str:
+    from topomerge.fusion.atlas.stored import check_folder
+
+    counts, held = watch.counts, len(check_folder(watch.atlas).entries)
+    parts = [f"{counts[what]} {what}" for what in ("added", "replaced", "unreadable") if counts[what]] or ["nothing new"]
+    return f"{', '.join(parts)}; {watch.atlas} holds {held} map{'s' * (held != 1)}"
+
+
+def _reader(args: argparse.Namespace) -> Reader:
+    from topomerge.fusion.atlas.watch import Reader
+
+    def read(path: Path) -> TopometricMap:
+        return replace(map_from(str(path), args), source=str(path))
+
+    def failure(error: Exception, path: Path) -> str | None:
+        return None if signal_behind(error) is not None else f"{failure_line(error, [str(path)])}; it is skipped until it changes"
+
+    names = ("voxel_size", "up", "unit", "sensor")
+    return Reader(read, json.dumps(given(args, *names), sort_keys=True), failure)
+
+
+WATCH = Command(
+    "watch",
+    watch_command,
+    "put scans and maps that appear in a folder into an atlas",
+    "topomerge watch scans/ -o site/",
+    (
+        option("folder", metavar="DIR", help="that is watched: each file or folder of scans right in it is one map"),
+        output("ATLAS", "the atlas; a new folder becomes one"),
+        option("--once", action="store_true", default=False, help="end when all that is there is in the atlas"),
+        option("--every", type=above_zero, default=EVERY, metavar="S", help="seconds between two looks (default 2)"),
+        option(
+            "--settle",
+            type=above_zero,
+            default=SETTLE,
+            metavar="S",
+            help="seconds without a change, after which a file is taken as written (default 2)",
+        ),
+        option(
+            "--replace",
+            choices=("longer", "never"),
+            default="longer",
+            help="longer (default): a file that was changed takes the place of its map before if it has most rooms of that one; "
+            "never: both stay",
+        ),
+        *ATLAS_OPTIONS,
+        *CLOUD_OPTIONS,
+        option(
+            "--rerun",
+            nargs="?",
+            metavar="A.rrd",
+            help="log cells, rooms, graph and links to Rerun: into a file, or without a name to a viewer that is opened",
+        ),
+        quiet("print nothing but warnings"),
+    ),
+    paths=("folder", "output", "rerun"),
+    description="Watch a folder: scans and maps that appear in it, or change, become maps of an atlas. It may be stopped at any "
+    "moment (Ctrl-C) and started again; report.html of the atlas loads itself anew in an open browser. A file that can't be "
+    "read is named once, and tried again when it changes.",
+)

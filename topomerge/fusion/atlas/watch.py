@@ -1,0 +1,293 @@
+"""A folder that is watched: what lies or appears in it becomes maps of an atlas.
+
+Each look at the folder compares sizes and times with those of the last one; what has not changed for a while is taken as written.
+Maps and what is noted of their files are written in one change of the atlas: whenever a watch is stopped, the next one goes on.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from topomerge.errors import InputError
+from topomerge.fusion.atlas.folder import changing
+from topomerge.fusion.atlas.memory import Memory
+from topomerge.fusion.atlas.replacement import Longer, longer_version, replaced
+from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.atlas.sources import SOURCES_FILE, Source, digest_of, read_sources, sources_to_json, stamp_of
+from topomerge.fusion.atlas.store import Change, Report, change, entry_of
+from topomerge.fusion.atlas.stored import Stored, check_folder, held_by
+from topomerge.fusion.inputs import check_cells, check_units
+from topomerge.io.maps import load_map
+from topomerge.io.points import suffixes
+from topomerge.types import TopometricMap
+
+MAPS_AT_ONCE, SECONDS_AT_ONCE = 8, 10.0  # that are read before they are written: a stop costs no more
+SECONDS_TO_ANSWER = 5.0  # of registering, before it is said where new maps lie; the rest follows when nothing new is there
+SECONDS_BETWEEN = 60.0  # … before that is written, and new files are looked for
+NAMED_AT_MOST = 6  # maps, in a line
+PICTURES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """How the files of a folder are read.
+
+    Args:
+        read: gives the map of a file or a folder of scans.
+        options: all that it depends on beside the file; with others all files are read again.
+        failure: one line of an error, or None for one that ends the watch.
+    """
+
+    read: Callable[[Path], TopometricMap]
+    options: str
+    failure: Callable[[Exception, Path], str | None]
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """A file that was looked at; a map only where it is a new one."""
+
+    path: Path
+    source: Source
+    map: TopometricMap | None = None
+
+
+@dataclass(eq=False)
+class Watch:
+    """A folder and the atlas of its maps.
+
+    Args:
+        folder: that is watched; what lies right in it is one map each.
+        atlas: its folder, which may lie in the other one.
+        reader: of the files.
+        report: as of `store.add`.
+        tell: takes a line, and whether it is a warning.
+        settle: s that a file must not have changed, before it is read.
+        replacing: may a file that was changed give a longer version of its map, which then takes that one's place?
+        settings: of the atlas, those that are not the usual ones.
+        warm: look at all maps of the atlas at first, so that the answer to a new one comes at once?
+        counts: "added", "replaced" and "unreadable" so far.
+    """
+
+    folder: Path
+    atlas: Path
+    reader: Reader
+    report: Report
+    tell: Callable[[str, bool], None]
+    settle: float = 2.0
+    replacing: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    warm: bool = False
+    counts: Counter[str] = field(default_factory=Counter)
+    memory: Memory = field(default_factory=Memory)
+
+    def __post_init__(self) -> None:
+        if not self.folder.is_dir():
+            raise InputError(f"{self.folder}: no such folder; name the folder in which scans or maps appear")
+        if self.folder.resolve() == self.atlas.resolve():
+            raise InputError(f"{self.folder}: is watched and can't be the atlas, too; give another folder for it")
+        held = check_folder(self.atlas)
+        self._complete = held.complete and not (self.warm and held.entries)
+        self._since: dict[str, tuple[str, float]] = {}
+
+    def look(self) -> bool:
+        """Put what is new or changed, and written, into the atlas; is there anything that is just being written?
+
+        Raises:
+            InputError: the folder is gone, or the atlas can't be written.
+        """
+        check_folder(self.atlas)
+        sources, now = read_sources(self.atlas), time.monotonic()
+        stamps = {str(p): self._stamp(p) for p in self._inputs()}
+        stamps = {p: stamp for p, stamp in stamps.items() if stamp and stamp != sources.get(p, Source("", "")).stamp}
+        before, self._since = self._since, {}
+        for path, stamp in stamps.items():
+            seen, since = before.get(path, ("", now))
+            self._since[path] = (stamp, since if seen == stamp else now)
+        settled = [p for p, (_, since) in self._since.items() if now - since >= self.settle]
+        for batch in self._batches(sorted(settled)):
+            self._write(batch)
+        if not settled and not self._complete:
+            self._write([])
+        return len(settled) < len(stamps) or not self._complete
+
+    def _stamp(self, path: Path) -> str:
+        return stamp_of(path, self.reader.options)
+
+    def _inputs(self) -> list[Path]:
+        """What may be a map."""
+        try:
+            there = sorted(p for p in self.folder.resolve().iterdir() if not p.name.startswith("."))
+        except OSError as error:
+            raise InputError(f"{self.folder}: can't be read ({error.strerror or error}); is it there?") from error
+        described = {p.stem for p in there if p.suffix.lower() in (".yaml", ".yml")}  # their pictures are no maps of their own
+        kinds = {*suffixes(), ".tmap"}
+        own = [p for p in there if not (p.suffix.lower() in PICTURES and p.stem in described)]
+        return [p for p in own if (p.is_dir() and p != self.atlas.resolve()) or (p.is_file() and p.suffix.lower() in kinds)]
+
+    def _batches(self, paths: list[str]) -> Iterator[list[_Looked]]:
+        """Read files, as many as are written at once."""
+        batch, began = list[_Looked](), time.monotonic()
+        for path in paths:
+            looked = self._looked(Path(path))
+            if looked is not None:
+                batch.append(looked)
+            maps = sum(one.map is not None for one in batch)
+            if maps >= MAPS_AT_ONCE or (batch and time.monotonic() - began > SECONDS_AT_ONCE):
+                yield batch
+                batch, began = [], time.monotonic()
+        if batch:
+            yield batch
+
+    def _looked(self, path: Path) -> _Looked | None:
+        """What a file gives; None where it changes meanwhile."""
+        stamp, sources = self._stamp(path), read_sources(self.atlas)
+        try:
+            digest = digest_of(path, self.reader.options)
+            same = next((s for s in sources.values() if s.digest == digest and s.map), None)
+            if same is not None:
+                return _Looked(path, replace(same, stamp=stamp))
+            map = self.reader.read(path)
+            check_cells(len(map.grid), str(path))
+        except Exception as error:
+            line = self.reader.failure(error, path)
+            if line is None:
+                raise
+            return _Looked(path, Source(stamp, "", error=line)) if stamp == self._stamp(path) else None
+        return _Looked(path, Source(stamp, digest), map) if stamp == self._stamp(path) else None
+
+    def _write(self, batch: list[_Looked]) -> None:
+        """Put what was read into the atlas, or go on with registering if nothing was, and say what came of it."""
+        plan = _Plan(self, batch)
+        if batch and all(looked.map is None for looked in batch) and (self.atlas / "atlas.json").exists():
+            with changing(self.atlas, []) as place:  # notes only
+                for name, text in plan(held_by(self.atlas)).files.items():
+                    (place / name).write_text(text, encoding="utf-8")
+        else:
+            self._complete = change(self.atlas, plan, self.report, self.memory, plan.say).complete
+        plan.say(None)
+        self.counts.update(plan.counts)
+
+
+class _Plan:
+    """What a batch changes of an atlas, found out when nobody else can change it."""
+
+    def __init__(self, watch: Watch, batch: list[_Looked]) -> None:
+        self.watch, self.batch = watch, batch
+        self.lines: list[tuple[str, bool]] = []
+        self.counts: Counter[str] = Counter()
+        self.names: dict[str, str] = {}  # of the new maps -> what they are
+        self.before: dict[str, int] = {}  # name -> component
+        self.links: list[set[str]] = []  # of two maps each, that were believed
+
+    def __call__(self, stored: Stored) -> Change:
+        self.before = {name: n for name, (n, _) in stored.poses().items()}
+        self.links = [{stored.entries[k].name for k in pair} for pair in stored.linked()]
+        sources = read_sources(stored.folder)
+        wanted = Change(replace(stored, settings={**stored.settings, **self.watch.settings}))
+        for looked in self.batch:
+            source = looked.source
+            if source.error:
+                self.lines.append((source.error, True))
+                self.counts["unreadable"] += 1
+            elif looked.map is not None:
+                wanted, source = self._with_map(wanted, looked, looked.map, sources.get(str(looked.path)))
+            sources[str(looked.path)] = source
+        seconds = SECONDS_TO_ANSWER if self.batch else SECONDS_BETWEEN
+        return replace(wanted, files={SOURCES_FILE: sources_to_json(sources)}, seconds=seconds)
+
+    def say(self, result: AtlasResult | None) -> None:
+        """Say what was found out, once: as soon as it is known where the maps lie, if it will be."""
+        lines = self.lines + [(line, False) for line in (outcome(result, self) if result is not None else ())]
+        self.lines = []
+        for line, is_warning in lines:
+            self.watch.tell(line, is_warning)
+
+    def _with_map(self, wanted: Change, looked: _Looked, map: TopometricMap, before: Source | None) -> tuple[Change, Source]:
+        """The change with one more map."""
+        stored, name = wanted.stored, looked.path.name
+        entry = entry_of(looked.path.stem, map, stored)
+        same = stored.named(entry.key)
+        if same is not None:
+            self.lines.append((f"{name}: is in the atlas already, as {same}", False))
+            return wanted, replace(looked.source, map=same)
+        old = next((e for e in stored.entries if before is not None and e.name == before.map and e.name not in wanted.new), None)
+        first = next(iter(stored.entries), None)
+        if first is not None and stored.settings["scale"] == "fixed":
+            try:
+                check_units(wanted.new.get(first.name) or self.watch.memory.facts(stored.folder / first.file).extent, map)
+            except InputError as error:
+                self.lines.append((f"{name}: {error}", True))
+                self.counts["unreadable"] += 1
+                return wanted, replace(looked.source, error=f"{name}: {error}")
+        longer = None
+        if old is not None and self.watch.replacing:
+            longer = longer_version(old.name, load_map(stored.folder / old.file), map, stored)
+        if longer is not None:
+            stored, proposed = replaced(stored, longer, entry)
+            entry, wanted = replace(entry, name=longer.name), replace(wanted, proposed={**wanted.proposed, **proposed})
+        else:
+            stored = replace(stored, entries=(*stored.entries, entry))
+        self.counts["replaced" if longer else "added"] += 1
+        self.names[entry.name] = described(name, entry.name, map, longer, old.name if old else "")
+        return replace(wanted, stored=stored, new={**wanted.new, entry.name: map}), replace(looked.source, map=entry.name)
+
+
+def described(file: str, name: str, map: TopometricMap, longer: Longer | None, old: str) -> str:
+    """What a file gave, in words.
+
+    Args:
+        old: name of the map that the file gave before; empty: none.
+    """
+    rooms = f"{len(map.rooms)} room{'' if len(map.rooms) == 1 else 's'}"
+    if longer is not None:
+        return f"{file} -> {name}: {rooms}, takes the place of the map before: has {longer.rooms} of its {longer.of} rooms"
+    if old:
+        return f"{file} -> {name}: {rooms}, no longer version of {old}, which stays"
+    return f"{file} -> {name}: {rooms}"
+
+
+def outcome(result: AtlasResult, plan: _Plan) -> Iterator[str]:
+    """Where the new maps lie, and which of the others were joined and taken apart."""
+    names = [str(name) for name in result.names]
+    for name, words in plan.names.items():
+        n = result.component_of(names.index(name))
+        others = [names[k] for k in result.components[n] if names[k] != name]
+        apart = "stands apart" if result.complete else "stands apart so far, there is more to be tried"
+        yield f"{words}; lies with {_listed(others)} ({result.probability(n):.2f})" if others else f"{words}; {apart}"
+    for link in result.rejected:
+        pair = [names[k] for k in link.maps]
+        if set(pair) in plan.links:
+            against = _listed([names[k] for k in link.against]) if link.against else "other maps"
+            yield f"no longer believed: {_listed(sorted(pair))}: {against} contradict it"
+    yield from changes({names[k]: n for n, members in enumerate(result.components) for k in members}, plan.before)
+
+
+def changes(after: Mapping[str, int], before: Mapping[str, int]) -> Iterator[str]:
+    """Which maps were taken apart, and which joined, in words; of those that were there before.
+
+    Args:
+        after, before: name -> component.
+    """
+    both = [name for name in after if name in before]
+    for one, two, words, between in ((before, after, "taken apart", " | "), (after, before, "joined now", " + ")):
+        for group in _groups(both, one):
+            parts = list(_groups(group, two))
+            if len(parts) > 1:
+                yield f"{words}: {between.join(map(_listed, parts))}"
+
+
+def _groups(names: list[str], component: Mapping[str, int]) -> Iterator[list[str]]:
+    """Names by their component."""
+    for n in dict.fromkeys(component[name] for name in names):
+        yield [name for name in names if component[name] == n]
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - NAMED_AT_MOST
+    return ", ".join(names[:NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")
