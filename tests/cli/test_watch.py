@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -62,7 +63,8 @@ def test_bad_input_is_told_in_one_line(run: Run, scans: Path, words: tuple[str, 
 
 def started(scans: Path, site: Path, *words: str) -> subprocess.Popen[str]:
     start = [sys.executable, "-m", "topomerge", "watch", str(scans), "-o", str(site), *QUICK, *words]
-    return subprocess.Popen(start, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores Ctrl-C
+    return subprocess.Popen(start, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heard)
 
 
 def test_a_ctrl_c_ends_it_with_a_line(scans: Path, tmp_path: Path) -> None:

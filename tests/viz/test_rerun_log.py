@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 import topomerge as tm
-from tests.cli.conftest import run  # noqa: F401
-from tests.cli.processes import Run
 from tests.fusion.atlas.test_watch import room
+from topomerge.cli.main import main
 from topomerge.errors import InputError
 from topomerge.viz.rerun_log import RerunLog
 
@@ -22,13 +21,13 @@ def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.M
         RerunLog(tmp_path / "a.rrd")
 
 
-def test_a_watch_writes_a_file_that_can_be_opened(run: Run) -> None:
+def test_a_watch_writes_a_file_that_can_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rerun")
+    monkeypatch.chdir(tmp_path)
     Path("scans").mkdir()
     for k in range(2):
         tm.save_map(room(k), Path("scans") / f"{k}.tmap")
-    status, _, err = run("watch", "scans", "-o", "site", "--once", "--rerun", "a.rrd", "--settle", "0.05", "--every", "0.05")
-    assert status == 0 and err == ""
+    assert main(["watch", "scans", "-o", "site", "--once", "--rerun", "a.rrd", "--settle", "0.05", "--every", "0.05"]) == 0
     words = [sys.executable, "-m", "rerun", "rrd", "print", "a.rrd"]
     printed = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True).stdout
     for n in range(2):

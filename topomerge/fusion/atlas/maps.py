@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,10 +13,12 @@ from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.turns import Rows
 from topomerge.fusion.atlas.memory import Memory
+from topomerge.fusion.bend.bend import bend_together
+from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.prepared import Prepared, prepare
 from topomerge.fusion.refine import surface
 from topomerge.matching.match import checked
-from topomerge.types import TopometricMap
+from topomerge.types import Sim3, TopometricMap
 
 Made = TypeVar("Made")
 
@@ -72,3 +74,18 @@ class Maps:
     def rows(self, k: int) -> Rows:
         """Descriptors of the rooms."""
         return self.memory.answer(("rows", self.embedder, self.keys[k]), lambda: checked(self._describe, self[k]))
+
+
+def bent_together(
+    maps: Maps, poses: Mapping[int, Sim3], pairs: Sequence[tuple[int, int]], scaled: bool
+) -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
+    """`bend_together` of some maps, by their numbers."""
+    names = sorted(poses)
+    places = tuple((names.index(i), names.index(j)) for i, j in pairs)
+
+    def make() -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
+        return bend_together({n: maps.prepared(k) for n, k in enumerate(names)}, dict(enumerate(lying)), places, scaled)
+
+    lying = tuple(poses[k] for k in names)
+    moved, deformations, reason = maps.answer(("bent", lying, places, scaled), names, make)
+    return {names[n]: p for n, p in moved.items()}, {names[n]: d for n, d in deformations.items()}, reason

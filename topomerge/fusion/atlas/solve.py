@@ -8,7 +8,7 @@ Of more than eleven maps each is only searched in the ten that its rooms look mo
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,13 +17,13 @@ import numpy as np
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.assembly import Assembler, Assembly, Link
-from topomerge.fusion.atlas.maps import Maps
+from topomerge.fusion.atlas.maps import Maps, bent_together
 from topomerge.fusion.atlas.memory import Facts, Memory
 from topomerge.fusion.atlas.neighbours import most_alike
 from topomerge.fusion.atlas.pairs import Checks, hypotheses, promise
 from topomerge.fusion.atlas.pose_graph import residual
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.bend.bend import NEITHER_BENDS, bend_together
+from topomerge.fusion.bend.bend import NEITHER_BENDS
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.inputs import check_cells, check_scale, check_units, link_threshold, without_rooms
 from topomerge.fusion.posterior import check_same
@@ -46,6 +46,19 @@ class AtlasSettings:
     embedder: str | Descriptor | None = None
     rigid: bool = False
     same: str = "nothing"
+
+
+@dataclass(frozen=True)
+class Pace:
+    """When an answer is wanted.
+
+    Args:
+        seconds: after which no more pairs are registered; `AtlasResult.complete` says whether some are left.
+        answered: is told how the maps lie before they are finely registered and bent.
+    """
+
+    seconds: float = np.inf
+    answered: Callable[[AtlasResult], None] | None = None
 
 
 def atlas(
@@ -87,17 +100,16 @@ def solve(
     keys: Sequence[str] | None = None,
     proposed: Proposed | None = None,
     memory: Memory | None = None,
-    seconds: float = np.inf,
+    pace: Pace | None = None,
 ) -> AtlasResult:
     """As `atlas`, of any number of maps, one or none, too.
 
     Args:
         names: of the maps, for messages; their sources if None.
         keys: what `map_key` should give for each map.
-        proposed: poses of pairs, tried beside those that are looked for; these pairs may be registered in any case, so that no
-            link is given up only as other maps look more alike.
+        proposed: poses of pairs, tried beside those that are looked for; these may be registered however alike the maps look.
         memory: of maps that were put together before; it changes how long it takes, not what comes out.
-        seconds: after which no more pairs are registered; `AtlasResult.complete` says whether some are left.
+        pace: of who waits for an answer.
 
     Raises:
         InputError: as `atlas`; and a map has another key.
@@ -111,7 +123,10 @@ def solve(
     order = sorted(range(len(maps)), key=lambda k: map_keys[k])
     ordered = Maps([maps[k] for k in order], settings.embedder, memory, [map_keys[k] for k in order])
     explorer = _Explorer(ordered, settings, threshold, {} if registrations is None else registrations, proposed or {})
-    assembly = explorer.explored(began + seconds)
+    pace = pace or Pace()
+    assembly = explorer.explored(began + pace.seconds)
+    if pace.answered is not None:
+        pace.answered(_result(assembly, explorer, names, order, rigid=True, fine=False))
     result = _result(assembly, explorer, names, order, settings.rigid)
     return replace(result, maps=Maps(maps), seconds=time.perf_counter() - began, warnings=(*warnings, *result.warnings))
 
@@ -214,11 +229,7 @@ class _Explorer:
 
 def partners_of(maps: Maps, linked: Iterable[tuple[int, int]] = ()) -> list[list[int]]:
     """For each map those that it may be searched in, most promising first: all others where they are few, else the ten that its
-    rooms look most like, and those that name it. A map without rooms names the largest ones.
-
-    Args:
-        linked: pairs that may be searched in each other in any case.
-    """
+    rooms look most like, those that name it and those that it is `linked` with. A map without rooms names the largest ones."""
     count = len(maps)
     if count <= MOST_PARTNERS + 1:
         pairs = {(i, j) for j in range(count) for i in range(j)}
@@ -233,17 +244,19 @@ def partners_of(maps: Maps, linked: Iterable[tuple[int, int]] = ()) -> list[list
     return [[m for _, m in sorted((-likely, m) for m, likely in of.items())] for of in partners]
 
 
-def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order: Sequence[int], rigid: bool) -> AtlasResult:
+def _result(
+    assembly: Assembly, explorer: _Explorer, names: Sequence[str], order: Sequence[int], rigid: bool, fine: bool = True
+) -> AtlasResult:
     """All by the places of the maps as they were given, in the frames of the first ones."""
     transforms: dict[int, Sim3] = {}
     residuals: dict[int, float] = {}
     bends: dict[int, Deformation] = {}
     warnings: list[str] = []
     for component in assembly.components:
-        poses, edges = explorer.assembler.settled(component, assembly.links, fine=True)
+        poses, edges = explorer.assembler.settled(component, assembly.links, fine)
         if not rigid and len(component) > 1:
             pairs = sorted({link.maps for link in assembly.links if link.maps[0] in component})
-            poses, deformations, reason = _bent(explorer.maps, poses, pairs, explorer.scale == "free")
+            poses, deformations, reason = bent_together(explorer.maps, poses, pairs, explorer.scale == "free")
             if reason not in ("", NEITHER_BENDS):
                 warnings.append(f"{', '.join(names[order[k]] for k in sorted(component))} were not bent: {reason}")
             bends |= {order[k]: d for k, d in deformations.items()}
@@ -268,21 +281,6 @@ def _result(assembly: Assembly, explorer: _Explorer, names: Sequence[str], order
         warnings=tuple(warnings),
         complete=explorer.complete,
     )
-
-
-def _bent(
-    maps: Maps, poses: Mapping[int, Sim3], pairs: Sequence[tuple[int, int]], scaled: bool
-) -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
-    """`bend_together`, by the numbers of the maps."""
-    names = sorted(poses)
-    places = tuple((names.index(i), names.index(j)) for i, j in pairs)
-
-    def make() -> tuple[dict[int, Sim3], dict[int, Deformation], str]:
-        return bend_together({n: maps.prepared(k) for n, k in enumerate(names)}, dict(enumerate(lying)), places, scaled)
-
-    lying = tuple(poses[k] for k in names)
-    moved, deformations, reason = maps.answer(("bent", lying, places, scaled), names, make)
-    return {names[n]: p for n, p in moved.items()}, {names[n]: d for n, d in deformations.items()}, reason
 
 
 def _reordered(links: Iterable[Link], order: Sequence[int]) -> tuple[Link, ...]:

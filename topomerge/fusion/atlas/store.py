@@ -31,7 +31,7 @@ from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.memory import Memory, map_key
 from topomerge.fusion.atlas.registration_cache import PAIRS_FILE, read_registrations, registrations_to_json
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.solve import AtlasSettings, Proposed, solve
+from topomerge.fusion.atlas.solve import AtlasSettings, Pace, Proposed, solve
 from topomerge.fusion.atlas.stored import ATLAS_FORMAT, Entry, Stored, check_folder, held_by, read_atlas
 from topomerge.fusion.result import transform_to_json
 from topomerge.io.listing import json_text, plain
@@ -129,7 +129,7 @@ def change(
     make: Callable[[Stored], Change],
     report: Report,
     memory: Memory | None = None,
-    solved: Callable[[AtlasResult], None] | None = None,
+    answered: Callable[[AtlasResult], None] | None = None,
 ) -> AtlasResult:
     """Put everything together and write it, all or nothing; what others changed before is in it.
 
@@ -137,7 +137,7 @@ def change(
         make: called with what the atlas holds when no other process can change it any more.
         report: as of `add`.
         memory: of what was made of its maps before.
-        solved: is told where the maps lie, before joined maps and report are made.
+        answered: as of `solve.Pace`.
 
     Raises:
         InputError: what `make` says, or `atlas` of the maps; or the folder can't be written.
@@ -156,10 +156,8 @@ def change(
         names, keys = [e.name for e in stored.entries], [e.key for e in stored.entries]
         registrations = read_registrations(folder, stored.settings)
         choices, proposed = AtlasSettings(**stored.settings), {**before.lying(), **wanted.proposed}
-        atlas = solve(files, choices, registrations, names, keys, proposed, memory, wanted.seconds)
+        atlas = solve(files, choices, registrations, names, keys, proposed, memory, Pace(wanted.seconds, answered))
         atlas = atlas.in_frames({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
-        if solved is not None:
-            solved(atlas)
         joined, components = {}, []
         for n, members in enumerate(atlas.components):
             component = _component(atlas, stored, n)
