@@ -27,6 +27,21 @@ HARD: dict[str, tuple[dict[str, float], str]] = {  # set -> difficulty, and what
     "drift": ({}, "drift"),
     "glass": ({"glass": 0.6}, ""),
 }
+HOMES = (
+    "1c_1096_areacleanup",
+    "1c_1096_virtualwall_and_forbidden_zone",
+    "S5_FW2008_with_segments",
+    "S6_FW2652_with_active_segment_and_no_mop_zone",
+    "converted_3790",
+    "d9_1058_with_custom_named_segments",
+    "d9_1093_huge",
+    "l10su_1058_goto_target",
+    "l10su_1121_new_path",
+    "misc_monastery_with_cutoff",
+    "viomi_v6_41_virtual_restrictions_and_active_zones",
+    "x10plus_1104_with_obstacle",
+    "z10_1056_virtual_restrictions",
+)
 TSC = "grids_rose2_homes_strands"
 LOOK = (
     "octomap_freiburg078/fr_078_tidyup.bt",
@@ -161,6 +176,11 @@ def invariance() -> list[Case]:
     return out
 
 
+def homes() -> list[Case]:
+    """Real homes as vacuum robots drew them, against the robots' own rooms: for development."""
+    return [Case("homes of vacuum robots", "home", name) for name in HOMES]
+
+
 def look() -> list[Case]:
     """Real maps without truth: for the eye."""
     return [Case("by eye", "file", name) for name in LOOK]
@@ -176,7 +196,8 @@ def peers() -> list[Case]:
 GROUPS: dict[str, Callable[[], list[Case]]] = {
     f.__name__: f for f in (dev, simulated, hard, plans, grids, ifc, pairs, invariance, look)
 }
-SELECTIONS: dict[str, Callable[[], list[Case]]] = {"peers": peers}  # of the groups' cases: "all" holds them already
+# "all" leaves these out: it holds their cases already, or they are for development.
+SELECTIONS: dict[str, Callable[[], list[Case]]] = {"peers": peers, "homes": homes}
 
 
 def chosen(names: Iterable[str], limit: int | None = None) -> list[Case]:

@@ -26,7 +26,7 @@ class Case:
     Args:
         set: the row of the tables that it belongs to.
         source: procedural; r2v, campus, mall, rmf, ipa-plan (plans that are erected and scanned); ifc (models, scanned); ipa, gdc
-            (grids, raised); file (anything that can be read; nothing is true about it).
+            (grids, raised); home (vacuum robots' maps); file (anything that can be read; nothing is true about it).
         building: kind of procedural building, or name of the plan, model, grid or file.
         seed: of the building and of the walk.
         rooms: rooms to visit; 0: all.

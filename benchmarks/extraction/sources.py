@@ -15,6 +15,7 @@ from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.pairs.pairs import draw_frames
 from topomerge.datasets.pairs.parts import two_parts
 from topomerge.datasets.plans.sealed import refuse_file
+from topomerge.datasets.real.robot_homes import home_truth
 from topomerge.datasets.simulation.floor_truth import in_frame, truth_of
 from topomerge.datasets.simulation.scanner import moved, scan
 from topomerge.datasets.simulation.sensors import get_sensor
@@ -31,6 +32,7 @@ COMMON = 0.6  # share of the rooms that the two sessions of a pair have in commo
 ADRIFT = 1.5  # degrees about every 15 m: three times a hand-held camera's
 IPA, IPA_CELL = "grids_ipa_room_segmentation", 0.05
 IPA_ABOUT = "image: {image}\nresolution: {cell}\norigin: [0, 0, 0]\noccupied_thresh: 0.0197\nfree_thresh: 0.0197\nnegate: 0\n"
+HOMES_FOLDER = "homes_vacuum_robots"
 GDC = "utexas_gdc_floors/maps/real"
 
 
@@ -52,6 +54,10 @@ def make(case: Case, data: Path | None) -> Scan:
     if case.source == "gdc":
         folder = data / GDC / case.building
         return raised(case, folder / f"{case.building}.yaml", folder / "locations.yaml")
+    if case.source == "home":
+        path = data / HOMES_FOLDER / f"{case.building}.json"
+        cloud = read_points(path)
+        return Scan(cloud, *home_truth(path, cloud.points.astype(np.float64) + cloud.shift))
     if case.source == "file":
         path = data / case.building
         refuse_file(path)

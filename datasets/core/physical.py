@@ -21,6 +21,7 @@ LEVEL_WORDS = {
 }
 ALIASES = {"romainrolland": "romainroland"}  # misspelt by the owner
 STRANGERS = ("scuolasconosciuta",)  # "unknown school": the three are different ones
+HOMES = ("1c", "l10su")  # robots of which every map is of one home, on another day
 SESSIONS = ("tsc", "g4s", "umic", "movecare", "uma")  # of one place, named by date or version behind it
 OF_ONE_PLACE = {"octomap": "freiburg/78", "ipad": "delft", "libpointmatcher": "libpointmatcher", "gdc": "utexas/gdc"}
 
@@ -42,6 +43,8 @@ def physical_building(source: str, name: str) -> str:
         return f"procedural/{re.sub(r'(?<=[0-9])-.*$', '', name)}"
     if source == "r2v":  # the plans of one property
         return f"r2v/{name.rpartition('/')[0] or name}"
+    if source == "home":
+        return f"home/{next((h for h in HOMES if name.startswith(h)), name)}"
     if source == "halmstad":
         return f"halmstad/{re.split(r'[_/-]', name)[0]}"
     last = name.rpartition("/")[2].lower()

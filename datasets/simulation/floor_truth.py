@@ -106,7 +106,7 @@ def truth_of(
         drift=none if drift is None else drift,
         complete=np.array(complete),
     )
-    return replace(truth, raster=_judged(truth, truth.place(points)))
+    return judged(truth, points)
 
 
 def in_frame(truth: Truth, frame: Sim3) -> Truth:
@@ -128,12 +128,13 @@ def draw_rooms(rooms: tuple[TrueRoom, ...], floors: Array) -> tuple[Array, Array
     return raster, origin
 
 
-def _judged(truth: Truth, places: Array) -> Array:
-    """The raster without the columns that are not judged: walls, and what the scan has not seen.
+def judged(truth: Truth, points: Array) -> Truth:
+    """The truth without the columns that are not judged: walls, and what the scan has not seen.
 
     Args:
-        places: (n, 3) of the scan, in the building's frame.
+        points: (n, 3) of the scan.
     """
+    places = truth.place(points)
     out = truth.raster.copy()
     ij, inside = truth.columns(places)
     for k, floor in enumerate(truth.floors):
@@ -144,7 +145,7 @@ def _judged(truth: Truth, places: Array) -> Array:
         of_room = out[k] >= 0
         walls = ~of_room & (ndimage.distance_transform_edt(~of_room) * TRUTH_CELL <= WALL_ZONE)
         out[k][walls | (of_room & ~near) | (~of_room & ~truth.complete)] = NOT_JUDGED
-    return out
+    return replace(truth, raster=out)
 
 
 def said(map: TopometricMap, truth: Truth) -> Array:

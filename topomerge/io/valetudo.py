@@ -1,0 +1,156 @@
+"""Maps of vacuum robots: the JSON that Valetudo serves and exports (``"__class": "ValetudoMap"``, version 1 or 2).
+
+Layers of pixels: `wall`, `floor`, and one `segment` for each room that the robot tells apart, whose pixels are floor. Walls
+become walls as of a floor plan. The frame is the robot's own, so that maps of one home on two days fit: x right, y up, the corner
+of pixel (0, 0) at the origin. The robot's own rooms are no truth and are not kept: `robot_rooms` gives them.
+Source: https://valetudo.cloud (map data format); `pixels` lists x, y, `compressedPixels` x, y and how many follow to the right.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.errors import InputError
+from topomerge.io import grid
+from topomerge.io.options import ReadOptions
+from topomerge.io.piece import Piece, damaged
+from topomerge.types import Array
+
+KIND = "a vacuum robot's map"
+LARGEST_JSON = 1 << 28  # bytes
+FREE_LAYERS = ("floor", "segment")
+WALLED = 0.3  # share of the floor's outline along which robots that draw walls have one: they have 0.5 to 1, the others under 0.1
+
+
+@dataclass(frozen=True)
+class RobotMap:
+    """What a vacuum robot drew; arrays (h, w), the lowest row of the picture first.
+
+    Args:
+        walls, free: bool.
+        rooms: int32, number of the robot's own room from 1, in the order of the file; 0: none.
+        names: of these rooms, as their owner called them; "" where they have none.
+        resolution: m a pixel.
+        origin: (2,) m, lower left corner.
+    """
+
+    walls: Array
+    free: Array
+    rooms: Array
+    names: tuple[str, ...]
+    resolution: float
+    origin: Array
+
+
+def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
+    """Floor points, then walls layer by layer, in metres."""
+    if options.resolution is not None:
+        raise InputError(f"{path}: states its own resolution; leave --resolution out")
+    drawn = robot_rooms(path)
+    free, walls = np.pad(drawn.free, 1), np.pad(drawn.walls, 1)
+    outline = ndimage.binary_dilation(free, np.ones((3, 3))) & ~free
+    walled = float((outline & ndimage.binary_dilation(walls, np.ones((5, 5)))).sum() / max(outline.sum(), 1))
+    warnings = ()
+    if walled < WALLED:
+        walls |= outline
+        warnings = (f"{path}: draws walls along {walled:.0%} of its floor's outline; the outline was taken for walls",)
+    yield Piece(np.empty((0, 3)), warnings=warnings, done=0.1)
+    x, y = (drawn.origin - drawn.resolution).tolist()
+    plan = grid.Plan(path, drawn.resolution, (x, y, 0.0))
+    yield from grid.extrude(path, np.flipud(walls), np.flipud(free), plan, options)
+
+
+def robot_rooms(path: Path) -> RobotMap:
+    """The walls, the floor and the robot's own rooms.
+
+    Raises:
+        InputError: it is no map of Valetudo, or one that can't be used.
+    """
+    about = _json(path)
+    cell = about.get("pixelSize")
+    layers = about.get("layers")
+    if not _number(cell) or not 0.5 <= cell <= 100 or not isinstance(layers, list):
+        raise InputError(f"{path}: has no layers, or no pixel size of 0.5 to 100 cm; save the map again")
+    runs = [(layer.get("type"), _name(layer), _runs(path, layer)) for layer in layers if isinstance(layer, dict)]
+    every = np.concatenate([np.zeros((0, 3), np.int64), *(r for _, _, r in runs)])
+    if not len(every):
+        raise InputError(f"{path}: shows neither floor nor walls; let the robot drive first")
+    low = every[:, :2].min(axis=0)
+    width, height = (np.maximum(every[:, 0] + every[:, 2], every[:, 0] + 1).max(), every[:, 1].max() + 1) - low
+    if width * height > grid.PIXELS:
+        raise InputError(f"{path}: spans {width} by {height} pixels, more than {grid.PIXELS:,}; it is damaged")
+    walls, free = np.zeros((height, width), bool), np.zeros((height, width), bool)
+    rooms, names = np.zeros((height, width), np.int32), []
+    for kind, name, run in runs:
+        mask = _painted(run, low, (int(height), int(width)))
+        if kind == "wall":
+            walls |= mask
+        elif kind in FREE_LAYERS:
+            free |= mask
+            if kind == "segment":
+                names.append(name)
+                rooms[mask] = len(names)
+    free &= ~walls
+    turned = [np.flipud(a) for a in (walls, free, np.where(walls, 0, rooms))]
+    return RobotMap(*turned, tuple(names), cell / 100, np.array([low[0], -(low[1] + height)]) * cell / 100)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    if path.stat().st_size > LARGEST_JSON:
+        raise InputError(f"{path}: is too large for {KIND}; give the map itself")
+    try:
+        about = json.loads(path.read_bytes())
+    except (UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise damaged(path, KIND, error) from error
+    if not isinstance(about, dict) or about.get("__class") != "ValetudoMap":
+        raise InputError(
+            f"{path}: is no map of Valetudo, the only JSON that can be read; give the scan or the map that it tells of"
+        )
+    return about
+
+
+def _name(layer: dict[str, Any]) -> str:
+    about = layer.get("metaData")
+    return str(about.get("name") or "")[:80] if isinstance(about, dict) else ""
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _runs(path: Path, layer: dict[str, Any]) -> Array:
+    """(n, 3) int64 column, row and length of runs of pixels."""
+    compressed = layer.get("compressedPixels") or []
+    listed, numbers = (compressed, 3) if compressed else (layer.get("pixels") or [], 2)
+    kind = str(layer.get("type"))[:20]
+    if not listed:
+        return np.zeros((0, 3), np.int64)
+    try:
+        runs = np.array(listed)
+    except ValueError as error:
+        raise damaged(path, KIND, f"pixels of the layer {kind} are no numbers") from error
+    if runs.ndim != 1 or len(runs) % numbers or not np.issubdtype(runs.dtype, np.integer):
+        raise damaged(path, KIND, f"pixels of the layer {kind} are no list of whole numbers, {numbers} each")
+    runs = runs.reshape(-1, numbers).astype(np.int64)
+    if numbers == 2:
+        runs = np.column_stack([runs, np.ones(len(runs), np.int64)])
+    if runs.min() < 0 or runs.max() > grid.PIXELS or int(runs[:, 2].sum()) > grid.PIXELS:
+        raise damaged(path, KIND, f"pixels of the layer {kind} lie outside of any map")
+    return runs
+
+
+def _painted(runs: Array, low: Array, shape: tuple[int, int]) -> Array:
+    """(h, w) bool, top row first."""
+    count = runs[:, 2]
+    first = (runs[:, 1] - low[1]) * shape[1] + runs[:, 0] - low[0]
+    within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    mask = np.zeros(shape[0] * shape[1], bool)
+    mask[np.repeat(first, count) + within] = True
+    return mask.reshape(shape)
