@@ -1,4 +1,4 @@
-"""Slices of a 2D laser: they get walls and a floor (beyond the thesis)."""
+"""Slices of a 2D laser: they get walls and a floor. Raised plans: their walls show no doors (beyond the thesis)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from topomerge.types import Array, VoxelGrid
 
 SLICE_HEIGHT = 0.6  # m: what is flatter is a slice
 EXTRUDED_HEIGHT = 2.4  # m, of the walls that a slice becomes
+RAISED_SHARE = 0.999  # of the columns of a raised plan are filled alike; of scans at most 0.6 were, usually a tenth
+RAISED_FROM, BELOW_TOP = 0.5, 0.3  # m above the floor, and m below the top of the walls, between which these are looked at
 ENCLOSED_SHARE = 0.75  # of the directions in which a place inside sees a wall
 SIGHT_DIRECTIONS = 24
 SIGHT_RANGE = 15.0  # m
 
 
 def with_raised_slice(scan: Scan) -> Scan:
-    """A scan that is a slice gets walls over its columns, and a floor; any other stays as it is."""
+    """A scan that is a slice gets walls over its columns, and a floor; any other stays as it is, but for the walls of a raised
+    plan, at which nobody needs to look closely."""
     if not is_slice(scan.grid):
-        return scan
+        return replace(scan, fine=None) if is_raised(scan.grid) else scan
     warning = f"the scan is a slice: walls of {EXTRUDED_HEIGHT:g} m and a floor were assumed"
     return replace(scan.with_grid(_extruded(scan.grid, scan.rays), warning), fine=None)
 
@@ -34,6 +37,18 @@ def is_slice(grid: VoxelGrid) -> bool:
         return False
     low, high = levels[int(0.01 * len(levels))], levels[int(0.99 * (len(levels) - 1))]
     return bool((high - low) * grid.edge <= SLICE_HEIGHT)
+
+
+def is_raised(grid: VoxelGrid) -> bool:
+    """Was the scan a plan, of which every wall was raised alike? Then there are neither lintels nor leaves nor recesses."""
+    levels = grid.cells[:, 2]
+    if not len(levels):
+        return False
+    low, high = np.sort(levels)[[int(0.01 * len(levels)), int(0.99 * (len(levels) - 1))]].tolist()
+    bottom, top = low + round(RAISED_FROM / grid.edge), high - round(BELOW_TOP / grid.edge)
+    standing = grid.cells[(levels >= bottom) & (levels < top), :2]
+    filled = np.unique(standing, axis=0, return_counts=True)[1]
+    return bool(len(filled) and (filled == top - bottom).mean() >= RAISED_SHARE)
 
 
 def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:

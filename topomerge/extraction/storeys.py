@@ -11,10 +11,14 @@ STOREY_LEAST_AREA = 3.0  # m2
 STOREY_LEAST_SHARE = 0.01  # of the largest storey: a landing upstairs is one
 HIGHEST_CEILING = 30.0  # m
 STOREY_LEAST_HEIGHT = 1.9  # m between floors: nobody stands upright in less
+GALLERY_LEAST_AREA = 10.0  # m2 that lie at its level, of a floor in the air: landings are smaller
+IN_THE_AIR = 1.0  # m below the ceiling of the storey below
+LEVEL_SHARE = 0.5  # of a floor that lies within a cell of its level; flights, what hangs and mirror images are spread
 
 
 def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, Array]:
-    """Peaks of the height histogram of the floor, at least 1.9 m apart.
+    """Peaks of the height histogram of the floor, at least 1.9 m apart. What hangs below the ceiling of the storey below, and is
+    not level, is none: stairs with a landing in a hall through two storeys, and what glass mirrors.
 
     Args:
         navigable: the navigable volume.
@@ -37,17 +41,30 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
         if all(abs(int(z) - f) * navigable.edge >= STOREY_LEAST_HEIGHT for f in floors):
             floors.append(int(z))
     floors.sort()
+    storeys, storey, level = _of_floors(navigable, lowest, floors, floor_to_ceiling)
+    in_the_air = np.append(False, storeys["floor"][1:] < storeys["ceiling"][:-1] - IN_THE_AIR)
+    none = in_the_air & (level < np.maximum(GALLERY_LEAST_AREA, LEVEL_SHARE * storeys["area"]))
+    if none.any():
+        floors = [z for z, gone in zip(floors, none, strict=True) if not gone]
+        storeys, storey, _ = _of_floors(navigable, lowest, floors, floor_to_ceiling)
+    return storeys, storey
+
+
+def _of_floors(navigable: VoxelGrid, lowest: Array, floors: list[int], floor_to_ceiling: Array) -> tuple[Array, Array, Array]:
+    """The storeys of floors at these levels (ascending), the storey of each navigable cell, and how much of a storey's floor,
+    m2, lies at its level."""
     halfway = (np.array(floors[:-1]) + np.array(floors[1:])) / 2
     storey = np.searchsorted(halfway, navigable.cells[:, 2]).astype(np.int32)
-    storeys = np.zeros(len(floors), STOREY_DTYPE)
+    storeys, level = np.zeros(len(floors), STOREY_DTYPE), np.zeros(len(floors))
     for s, z in enumerate(floors):
         rows = lowest[storey[lowest] == s]
         near = rows[np.abs(navigable.cells[rows, 2] - z) <= 1]
+        level[s] = len(near) * navigable.edge**2
         near = near if len(near) else rows
         height = navigable.origin[2] + (navigable.cells[near, 2].mean() + 0.5) * navigable.edge
         ceiling = height + (ceiling_height(floor_to_ceiling[near]) or np.nan)
         storeys[s] = (height, ceiling, len(rows) * navigable.edge**2)
-    return storeys, storey
+    return storeys, storey, level
 
 
 def floor_to_ceiling(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> Array:

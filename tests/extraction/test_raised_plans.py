@@ -1,0 +1,48 @@
+"""A plan whose walls were raised is told from a scan: its walls show no doors, and are not asked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.scenes import two_rooms
+from topomerge.extraction.scan import read_scan
+from topomerge.extraction.slices import is_raised, with_raised_slice
+from topomerge.io import read_points
+
+
+@pytest.fixture
+def drawn(tmp_path: Path) -> Path:
+    image = np.full((80, 120), 254, np.uint8)
+    image[[0, 79]] = image[:, [0, 60, 119]] = 0
+    image[30:40, 60] = 254
+    Image.fromarray(image).save(tmp_path / "plan.png")
+    return tmp_path / "plan.png"
+
+
+@pytest.mark.parametrize("ceiling", [False, True])
+def test_a_raised_plan_is_one_in_any_frame(drawn: Path, ceiling: bool) -> None:
+    cloud = read_points(drawn, resolution=0.05, ceiling=ceiling)
+    scan = read_scan(cloud, 0.1)
+    assert is_raised(scan.grid) and scan.fine is not None and with_raised_slice(scan).fine is None
+    turn = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
+    assert is_raised(read_scan(cloud.points @ turn.T + (3.03, -7.1, 2.22), 0.1).grid)
+
+
+def test_a_scan_is_none() -> None:
+    scan = read_scan(two_rooms().points(), 0.1)
+    assert not is_raised(scan.grid) and with_raised_slice(scan) is scan
+
+
+def test_walls_without_anything_in_between_but_with_a_lintel_are_none(drawn: Path) -> None:
+    points = read_points(drawn, resolution=0.05).points.astype(float)
+    above_door = np.stack(np.meshgrid([3.025], np.arange(2.0, 2.5, 0.05), np.arange(1.5, 2.5, 0.05)), axis=-1).reshape(-1, 3)
+    window = (points[:, 1] < 0.06) & (points[:, 0] > 1) & (points[:, 0] < 2) & (points[:, 2] > 0.9)
+    assert not is_raised(read_scan(np.concatenate([points[~window], above_door]), 0.1).grid)
+
+
+def test_no_cells() -> None:
+    assert not is_raised(read_scan(np.zeros((1, 3)), 0.1).grid)
