@@ -102,8 +102,9 @@ def pose_features(map: TopometricMap, rays: tuple[Array, Array] | None) -> Array
         return None
     starts, ends = (np.asarray(part, np.float64).reshape(-1, 3) for part in rays)
     finite = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
-    places, place = np.unique(starts[finite], axis=0, return_inverse=True)
-    stood = _rooms_below(map, places)[place.ravel()]
+    starts = starts[finite]
+    moved = np.append(True, (starts[1:] != starts[:-1]).any(axis=1))[: len(starts)]  # the rays of one place follow each other
+    stood = _rooms_below(map, starts[moved])[np.cumsum(moved) - 1]
     if not len(stood) or (stood >= 0).mean() < RAYS_OVER_FLOOR:
         return None
     cell = map.grid.rows(map.grid.locate(ends[finite]))

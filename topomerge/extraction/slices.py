@@ -32,23 +32,30 @@ def with_raised_slice(scan: Scan) -> Scan:
 
 def is_slice(grid: VoxelGrid) -> bool:
     """Is the scan flat, but for single points?"""
-    levels = np.sort(grid.cells[:, 2])
-    if not len(levels):
+    if not len(grid):
         return False
-    low, high = levels[int(0.01 * len(levels))], levels[int(0.99 * (len(levels) - 1))]
-    return bool((high - low) * grid.edge <= SLICE_HEIGHT)
+    low, high = _extent(grid)
+    return (high - low) * grid.edge <= SLICE_HEIGHT
 
 
 def is_raised(grid: VoxelGrid) -> bool:
     """Was the scan a plan, of which every wall was raised alike? Then there are neither lintels nor leaves nor recesses."""
-    levels = grid.cells[:, 2]
-    if not len(levels):
+    if not len(grid):
         return False
-    low, high = np.sort(levels)[[int(0.01 * len(levels)), int(0.99 * (len(levels) - 1))]].tolist()
+    low, high = _extent(grid)
     bottom, top = low + round(RAISED_FROM / grid.edge), high - round(BELOW_TOP / grid.edge)
-    standing = grid.cells[(levels >= bottom) & (levels < top), :2]
-    filled = np.unique(standing, axis=0, return_counts=True)[1]
+    x, y, z = grid.cells.T
+    standing = (z >= bottom) & (z < top)
+    filled = np.bincount(x[standing].astype(np.int64) * grid.shape[1] + y[standing])
+    filled = filled[filled > 0]
     return bool(len(filled) and (filled == top - bottom).mean() >= RAISED_SHARE)
+
+
+def _extent(grid: VoxelGrid) -> tuple[int, int]:
+    """The lowest and the highest level, but for single points."""
+    below = np.cumsum(np.bincount(grid.cells[:, 2]))
+    low, high = np.searchsorted(below, (int(0.01 * len(grid)), int(0.99 * (len(grid) - 1))), side="right").tolist()
+    return low, high
 
 
 def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
@@ -58,7 +65,7 @@ def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
         grid: occupied cells.
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, where they are known.
     """
-    low = int(np.sort(grid.cells[:, 2])[int(0.01 * len(grid))])
+    low, _ = _extent(grid)
     columns, column = np.unique(grid.cells[:, :2], axis=0, return_inverse=True)
     wall = np.zeros(grid.shape[:2], bool)
     wall[tuple(columns.T)] = True

@@ -63,22 +63,25 @@ def fill_strips(
     corners = np.concatenate([corners, corners + across * frames[:, None, 4:6]], axis=1)
     low = corners.min(axis=(0, 1))
     columns = ((corners.max(axis=(0, 1)) - low) // tile).astype(np.int64) + 1
-    pairs = [
-        (i * columns[1] + j, line)
-        for line in range(len(frames))
-        for i, j in _tiles(frames[line], float(along[line]), across, low, tile)
-        if 0 <= i < columns[0] and 0 <= j < columns[1]
-    ]
-    table = np.array(sorted(pairs), np.int64)
+    table = _touched(frames, along, across, low, tile, columns)
     first = np.searchsorted(table[:, 0], np.arange(int(columns.prod()) + 1))
     lines = np.ascontiguousarray(table[:, 1])
     _fill(points, frames, sizes, starts, low, tile, columns, first, lines, step, out)
     return out
 
 
-def _tiles(frame: Floats, along: float, across: float, low: Floats, tile: float) -> set[tuple[int, int]]:
-    """The squares that a strip touches: those of places in it that are closer to each other than a square is wide."""
-    t, d = (np.linspace(0, length, int(np.ceil(4 * length / tile)) + 2) for length in (along, across))
-    places = frame[:2] + t[:, None, None] * frame[2:4] + d[:, None] * frame[4:6]
-    near = places.reshape(-1, 2)[:, None] + tile / 4 * np.array([(u, v) for u in (-1, 0, 1) for v in (-1, 0, 1)])
-    return set(map(tuple, np.floor((near.reshape(-1, 2) - low) / tile).astype(np.int64).tolist()))
+def _touched(frames: Floats, along: Floats, across: float, low: Floats, tile: float, columns: Ints) -> Ints:
+    """(n, 2) square and strip of all that touch each other, ascending: squares of places in a strip that are closer to each other
+    than a square is wide."""
+    d = np.linspace(0, across, int(np.ceil(4 * across / tile)) + 2)
+    aside = tile / 4 * np.array([(u, v) for u in (-1, 0, 1) for v in (-1, 0, 1)])
+    parts = []
+    for line, frame in enumerate(frames):
+        t = np.linspace(0, along[line], int(np.ceil(4 * along[line] / tile)) + 2)
+        places = frame[:2] + t[:, None, None] * frame[2:4] + d[:, None] * frame[4:6]
+        near = np.floor(((places.reshape(-1, 1, 2) + aside).reshape(-1, 2) - low) / tile).astype(np.int64)
+        near = near[((near >= 0) & (near < columns)).all(axis=1)]
+        square = np.unique(near[:, 0] * columns[1] + near[:, 1])
+        parts.append(np.column_stack([square, np.full(len(square), line)]))
+    table = np.concatenate(parts)
+    return np.asarray(table[np.lexsort((table[:, 1], table[:, 0]))])
