@@ -208,5 +208,5 @@ class _Hulls:
         others = [hull for n, hull in self.hulls.items() if n != room]
         if not others:
             return 0.0
-        hull = shapely.convex_hull(shapely.union_all(others))
+        hull = shapely.convex_hull(shapely.geometrycollections(others))
         return float(shapely.contains_xy(hull, self.columns[room]).mean())
