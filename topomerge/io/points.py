@@ -54,10 +54,12 @@ FORMATS = (
     Format("an OctoMap", "octomap", (".bt", ".ot")),
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc"),
     Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic")),
+    Format("a ScanNet recording", "sens", (".sens",)),
     Format("a floor plan", "grid", (".yaml", ".yml", ".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"), fixed=True),
 )
 SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
 RGBD_FOLDER = Format("a folder of RGB-D images", "rgbd", (), takes=("poses",))
+POSED_RGBD_FOLDER = Format("a folder of RGB-D images with their poses", "rgbd_folders", ())
 
 
 def suffixes() -> tuple[str, ...]:
@@ -149,7 +151,11 @@ def _folder_format(path: Path) -> Format:
     names = [p.name for p in path.iterdir()]
     if "metadata.yaml" in names or any(n.endswith(bag.suffixes) for n in names):
         return bag
-    return RGBD_FOLDER if "depth.txt" in names else SCAN_FOLDER
+    if "depth.txt" in names:
+        return RGBD_FOLDER
+    from topomerge.io.rgbd_folders import layout_of
+
+    return POSED_RGBD_FOLDER if layout_of(path) else SCAN_FOLDER
 
 
 def _pieces(path: Path, file_format: Format, options: ReadOptions) -> Iterator[Piece]:
