@@ -17,7 +17,6 @@ from tests.io.bags import KINDS, MOUNT, Entry, Messages, walk_messages, write_ba
 from tests.io.test_read_folders import assert_same, refusal_of, refused
 from tests.io.walks import START, Walk, room_walk, write_kitti, write_tum
 from tests.samples import box_colors, write_plan
-from topomerge.errors import InputError
 from topomerge.io import read_points
 from topomerge.io.bag_file import TRANSFORMS
 

@@ -69,12 +69,12 @@ class Frame:
     done: float = 0.0
 
 
-def posed_scans(path: Path, frames: Iterable[Frame], said: list[str]) -> Iterator[PosedScan]:
+def posed_scans(path: Path, frames: Iterable[Frame | None], said: list[str]) -> Iterator[PosedScan]:
     """The scan of each frame; those without a pose are left out, and counted in what is said.
 
     Args:
         path: of the recording, for messages.
-        frames: read one at a time.
+        frames: read one at a time; None: an image without a pose.
         said: takes warnings.
 
     Raises:
@@ -83,7 +83,7 @@ def posed_scans(path: Path, frames: Iterable[Frame], said: list[str]) -> Iterato
     count = lost = 0
     for frame in frames:
         count += 1
-        if frame.pose is None or not np.isfinite(frame.pose).all():
+        if frame is None or frame.pose is None or not np.isfinite(frame.pose).all():
             lost += 1
         elif len(no_rotations(frame.pose[None])):
             raise InputError(f"{frame.name}: its pose is not a rotation and a place; mend it, or remove the image")

@@ -54,6 +54,7 @@ FORMATS = (
     Format("an OctoMap", "octomap", (".bt", ".ot")),
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc"),
     Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic")),
+    Format("an RTAB-Map database", "rtabmap", (".db",)),
     Format("a ScanNet recording", "sens", (".sens",)),
     Format("a floor plan", "grid", (".yaml", ".yml", ".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"), fixed=True),
 )
