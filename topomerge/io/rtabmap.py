@@ -27,7 +27,7 @@ from topomerge.types import Array
 RTABMAP_KIND = "an RTAB-Map database"
 OLDEST, NEWEST = (0, 11, 10), (0, 23)  # versions of the database that are read; of the newest, all corrections
 OPTIMISED_SINCE = (0, 17)
-TABLES = ("Node", "Data", "Admin")
+BASE_TABLES = ("Node", "Data", "Admin")
 Poses = dict[int, Array | None]  # (4, 4) of the robot, by node
 
 
@@ -68,8 +68,8 @@ def _version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
         InputError: it is none of RTAB-Map's, or one that is not read.
     """
     tables = dict(base.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
-    if any(not re.match(r"(?i)\s*CREATE\s+TABLE\s", str(tables.get(name, ""))) for name in TABLES):
-        raise InputError(f"{path}: is no RTAB-Map database (it has no tables {', '.join(TABLES)}); check the file's name")
+    if any(not re.match(r"(?i)\s*CREATE\s+TABLE\s", str(tables.get(name, ""))) for name in BASE_TABLES):
+        raise InputError(f"{path}: is no RTAB-Map database (it has no tables {', '.join(BASE_TABLES)}); check the file's name")
     text = str((base.execute("SELECT version FROM Admin").fetchone() or ("none",))[0])
     version = tuple(int(n) for n in re.findall(r"\d+", text)[:3])
     if version < OLDEST or version[:2] > NEWEST:
