@@ -278,7 +278,7 @@ BAD = {
     ),
     "nothing": (
         lambda w: without(walk_messages(w), "/points"),
-        r"has no PointCloud2, LaserScan or OccupancyGrid; .*this holds /tf \(3 TFMessage\)",
+        r"has no PointCloud2, depth images, LaserScan or OccupancyGrid; .*this holds /tf \(3 TFMessage\)",
     ),
     "two parents": (
         lambda w: joined(two_parents, walk_messages(w, "none")),

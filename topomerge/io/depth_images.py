@@ -98,8 +98,22 @@ def posed_scans(path: Path, frames: Iterable[Frame | None], said: list[str]) -> 
 def _scan(frame: Frame) -> PosedScan:
     """The points of one frame as its camera sees them."""
     depth = read_depth(frame.depth) if isinstance(frame.depth, Path) else frame.depth
-    camera = frame.camera
-    _check_camera(frame, depth.shape)
+    points, rows, columns = depth_points(frame.name, depth, frame.camera)
+    return PosedScan(points, frame.pose, _colors(frame, points, rows, columns, depth.shape), done=frame.done)
+
+
+def depth_points(name: Path | str, depth: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    """(n, 3) points in front of a camera, m, and the rows and columns (n,) of their pixels; not every pixel becomes one.
+
+    Args:
+        name: of the image, for messages.
+        depth: (h, w) values along the camera's axis; 0 or not finite where nothing was measured.
+        camera: that took it.
+
+    Raises:
+        InputError: the camera can't be that of an image of this size.
+    """
+    _check_camera(name, camera, depth.shape)
     step = max(1, round(min(camera.focal) * SPACING_AT_4_M / 4.0))
     rows, columns = np.nonzero(depth[::step, ::step] > 0)
     rows, columns = rows * step, columns * step
@@ -107,25 +121,26 @@ def _scan(frame: Frame) -> PosedScan:
     close = z <= FARTHEST
     rows, columns, z = rows[close], columns[close], z[close]
     x, y = ((v - c) / f * z for v, c, f in zip((columns, rows), camera.centre, camera.focal, strict=True))
-    points = np.stack([x, y, z], axis=1)
-    return PosedScan(points, frame.pose, _colors(frame, points, rows, columns, depth.shape), done=frame.done)
+    return np.stack([x, y, z], axis=1), rows, columns
 
 
-def _check_camera(frame: Frame, shape: tuple[int, ...]) -> None:
+def _check_camera(name: Path | str, camera: Camera, shape: tuple[int, ...]) -> None:
     """Refuse a camera that can't be that of an image of this shape.
 
     Raises:
         InputError: it is one for another size.
     """
-    (height, width), camera = shape, frame.camera
+    height, width = shape
+    if not height * width:
+        raise InputError(f"{name}: has no pixels; record it again")
     if camera.size is not None and camera.size != shape:
         theirs = f"its camera {camera.size[1]} x {camera.size[0]}"
-        raise InputError(f"{frame.name}: has {width} x {height} pixels, {theirs}; {camera.mend}")
+        raise InputError(f"{name}: has {width} x {height} pixels, {theirs}; {camera.mend}")
     shares = [c / n for c, n in zip(camera.centre, (width, height), strict=True)]
     wide = [f / width for f in camera.focal]
     if not (MIDDLE[0] <= min(shares) <= max(shares) <= MIDDLE[1] and FOCAL_SHARE[0] <= min(wide) <= max(wide) <= FOCAL_SHARE[1]):
         stated = f"focal lengths {camera.focal[0]:g} {camera.focal[1]:g}, centre {camera.centre[0]:g} {camera.centre[1]:g}"
-        raise InputError(f"{frame.name}: has {width} x {height} pixels, and a camera of {stated} can't be its own; {camera.mend}")
+        raise InputError(f"{name}: has {width} x {height} pixels, and a camera of {stated} can't be its own; {camera.mend}")
 
 
 def _colors(frame: Frame, points: Array, rows: Array, columns: Array, shape: tuple[int, ...]) -> Array | None:
