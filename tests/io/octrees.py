@@ -70,7 +70,7 @@ def _las(points: np.ndarray, colors: np.ndarray):
 
 
 def write_copc(path: Path, tree: Tree) -> Path:
-    """A LAZ 1.4 file with a chunk for each node, and where each lies: COPC 1.0."""
+    """A LAZ 1.4 file with a chunk for each node, and where each lies: COPC 1.0. Nodes of the finest level have own pages."""
     import lazrs
 
     cloud = _las(tree.points, tree.colors)
@@ -82,16 +82,21 @@ def write_copc(path: Path, tree: Tree) -> Path:
     stream.seek(start)
     packer = lazrs.LasZipCompressor(stream, vlr)
     packer.reserve_offset_to_chunk_table()
-    entries, before = b"", start + 8
+    entries, finest, before = {}, {}, start + 8
     for key, rows in tree.nodes.items():
         packer.compress_many(raw[rows].tobytes())
         packer.finish_current_chunk()
-        entries += struct.pack("<4iQ2i", *key, before, stream.tell() - before, len(rows))
+        entry = struct.pack("<4iQ2i", *key, before, stream.tell() - before, len(rows))
+        (finest if key[0] == LEVELS else entries)[key] = entry
         before = stream.tell()
     packer.done()
     hierarchy = stream.seek(0, io.SEEK_END)
-    evlr = struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(entries), b"") + entries
-    info = struct.pack("<5d2Q2d", *(LOW + EDGE / 2), EDGE / 2, SPACING, hierarchy + 60, len(entries), 0, 1) + bytes(88)
+    first = 32 * len(tree.nodes)  # bytes of the root's page; behind it lie the others
+    for number, key in enumerate(finest):
+        entries[key] = struct.pack("<4iQ2i", *key, hierarchy + 60 + first + 32 * number, 32, -1)
+    pages = b"".join([*entries.values(), *finest.values()])
+    evlr = struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(pages), b"") + pages
+    info = struct.pack("<5d2Q2d", *(LOW + EDGE / 2), EDGE / 2, SPACING, hierarchy + 60, first, 0, 1) + bytes(88)
     records = struct.pack("<H16sHH32s", 0, b"copc", 1, 160, b"") + info
     records += struct.pack("<H16sHH32s", 0, b"laszip encoded", 22204, len(laszip), b"") + laszip
     head = bytearray(las_bytes(tree.points, tree.colors, True)[:375])

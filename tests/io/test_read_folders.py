@@ -190,17 +190,17 @@ def test_bad_calibrations(tmp_path: Path) -> None:
             read_trajectory(tmp_path / "poses.txt")
 
 
-def refusal_of(path: Path, **options: str) -> str:
+def refusal_of(path: Path, **options: str | float) -> str:
     with pytest.raises(InputError) as refusal:
         read_points(path, **options)
     assert "\n" not in str(refusal.value)
     return str(refusal.value)
 
 
-def refused(path: Path) -> str | None:
+def refused(path: Path, **options: str | float) -> str | None:
     """Why it can't be read; None: it can."""
     try:
-        read_points(path)
+        read_points(path, **options)
     except InputError as error:
         return str(error)
     return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from shutil import copytree
@@ -73,17 +74,60 @@ def test_chunks_are_the_cloud(octrees: dict[str, Path]) -> None:
 
 
 def test_copc_is_read_as_the_laz_that_it_is(tmp_path: Path) -> None:
-    """Another reader of COPC, laspy's own, sees the same points."""
+    """Another reader of COPC, laspy's own, sees the same points, on the same levels."""
     import laspy
 
     path = write_copc(tmp_path / "a.copc.laz", room_tree())
     assert_same_points(read_points(path), room_tree())
     with laspy.CopcReader.open(path) as reader:
         assert len(reader.query()) == len(room_tree().points)
+        for level in range(LEVELS + 1):
+            rows = reader.query(level=range(level + 1))
+            assert len(rows) == len(room_tree().rows(level))
+            cloud = read_points(path, spacing=SPACING / 2**level)
+            assert_same_points(cloud, room_tree(), level)
+            theirs, black = np.column_stack([rows.x, rows.y, rows.z]), np.zeros((len(rows), 3), int)
+            np.testing.assert_array_equal(in_order(cloud.points, black), in_order(theirs, black))
     data = path.read_bytes()
     for length in (300, 600, len(data) // 2):
         path.write_bytes(data[:length])
-        assert refusal_of(path).startswith(f"{path}: ")
+        assert refusal_of(path).startswith(f"{path}: ") and refusal_of(path, spacing=0.5).startswith(f"{path}: ")
+
+
+def test_bad_copc(tmp_path: Path) -> None:
+    path = write_copc(tmp_path / "a.copc.laz", room_tree())
+    data = path.read_bytes()
+    info = 375 + 54
+    (page, size) = struct.unpack_from("<2Q", data, info + 40)
+
+    def said_of(at: int, layout: str, *values: int) -> str:
+        new = struct.pack(layout, *values)
+        path.write_bytes(data[:at] + new + data[at + len(new) :])
+        assert refused(path) is None, "all levels are the LAZ file that it is"
+        said = refusal_of(path, spacing=0.01)
+        assert said.startswith(f"{path}: ")
+        return said
+
+    assert "a page of 33 bytes" in said_of(info + 48, "<Q", 33)
+    assert f"at {1 << 60:,} of" in said_of(info + 40, "<Q", 1 << 60)
+    assert "a node of level 99" in said_of(page, "<i", 99)
+    assert "a node of level 0 with -2 points" in said_of(page + 28, "<i", -2)
+    assert "has a node of 2,000,000,000 points, too many for one; read it without --spacing" in said_of(
+        page + 28, "<i", 2_000_000_000
+    )
+    assert "its octree has more points than" in said_of(page + 28, "<i", 1_000_000)
+    assert "a node of level 0 with 360 points" in said_of(page + 16, "<Q", 1 << 60)
+    assert f"the page at {page:,} is named twice" in said_of(page + 16, "<Q2i", page, size, -1)
+    said_of(page + 24, "<i", 10)
+    path.write_bytes(data)
+    rng = np.random.default_rng(1)
+    for _ in range(40):
+        broken = bytearray(data)
+        for at in rng.integers(0, 375 + 54 + 160, 3) if rng.random() < 0.5 else rng.integers(page, len(data), 3):
+            broken[at] = int(rng.integers(256))
+        path.write_bytes(bytes(broken))
+        said = refused(path, spacing=0.1)
+        assert said is None or (said.startswith(f"{path}: ") and "\n" not in said)
 
 
 def a_copy(octrees: dict[str, Path], name: str, folder: Path) -> Path:

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.io.las import las_node
 from topomerge.io.octree import (
     LARGEST_NODE,
     MOST_LEVELS,
     check_node,
     deepest_level,
-    las_node,
     load_json,
     packed_colors,
     packed_rows,

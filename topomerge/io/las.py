@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from topomerge.errors import InputError
+from topomerge.io.copc import coarse_records, octree_of
+from topomerge.io.octree import check_node
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, read_head
 from topomerge.types import Array
@@ -19,11 +23,33 @@ SMALLEST_CHUNK = 20  # bytes: a compressed chunk starts with one point as it is
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Blocks of points with their colours."""
-    del options
-    for header, rows, done in records(path):
+    """Blocks of points with their colours; of a COPC file, those of the levels that are coarse enough for `spacing`."""
+    octree = None if options.spacing is None else octree_of(path)
+    if octree is not None:
+        _check_head(path)
+    for header, rows, done in records(path) if octree is None else coarse_records(path, octree, options):
         colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
         yield Piece(coordinates(rows), _colors(rows) if colored else None, done=done)
+
+
+def las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[Piece]:
+    """The points of a node that is a LAS or LAZ file.
+
+    Raises:
+        InputError: it can't be read, or has fewer points than the hierarchy promises.
+    """
+    check_node(path)
+    count = 0
+    try:
+        for piece in read(path, replace(options, spacing=None)):
+            count += len(piece.points)
+            yield replace(piece, done=0.0)
+    except (InputError, MemoryError, ImportError, GeneratorExit, KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # panics of the decoder are no Exception
+        raise damaged(path, "a node of an octree", error) from error
+    if count < promised:
+        raise cut_short(path, count, promised)
 
 
 def records(path: Path) -> Iterator[tuple[Any, Any, float]]:

@@ -8,17 +8,14 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io import las
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, bytes8, cut_short, damaged
+from topomerge.io.piece import bytes8, cut_short, damaged
 
 LARGEST_JSON = 1 << 28  # bytes: a page of a hierarchy of ten million nodes
 MOST_LEVELS = 40  # of an octree: a millimetre of a million kilometres
@@ -50,26 +47,6 @@ def deepest_level(root_spacing: float, options: ReadOptions) -> int:
     if options.spacing is None or not (math.isfinite(root_spacing) and root_spacing > 0):
         return sys.maxsize
     return max(0, math.ceil(math.log2(root_spacing * options.factor / options.spacing) - 1e-9))
-
-
-def las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[Piece]:
-    """The points of a node that is a LAS or LAZ file.
-
-    Raises:
-        InputError: it can't be read, or has fewer points than the hierarchy promises.
-    """
-    check_node(path)
-    count = 0
-    try:
-        for piece in las.read(path, options):
-            count += len(piece.points)
-            yield replace(piece, done=0.0)
-    except (InputError, MemoryError, ImportError, GeneratorExit, KeyboardInterrupt, SystemExit):
-        raise
-    except BaseException as error:  # panics of the decoder are no Exception
-        raise damaged(path, "a node of an octree", error) from error
-    if count < promised:
-        raise cut_short(path, count, promised)
 
 
 def check_node(path: Path) -> None:

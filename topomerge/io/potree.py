@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.octree import MOST_LEVELS, check_node, deepest_level, las_node, load_json, packed_colors, packed_rows
+from topomerge.io.las import las_node
+from topomerge.io.octree import MOST_LEVELS, check_node, deepest_level, load_json, packed_colors, packed_rows
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array
