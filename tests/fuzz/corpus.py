@@ -197,7 +197,7 @@ def write_atlas(folder: Path) -> dict[str, Path]:
     """The listing of an atlas of one map."""
     from topomerge.fusion.atlas.store import add
 
-    add(folder / "atlas", [("house", building(2, 2))], lambda *_: "")
+    add(folder / "atlas", [("house", building(2, 2))], lambda *_, **__: "")
     shutil.copy(folder / "atlas" / "atlas.json", folder / "atlas.json")
     return {"atlas.json": folder / "atlas.json"}
 
