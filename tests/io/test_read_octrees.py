@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("laspy")
 
-from tests.io.octrees import LEVELS, SPACING, Tree, room_tree, write_copc, write_ept, write_potree
+from tests.io.octrees import LEVELS, SPACING, Tree, las_bytes, room_tree, write_copc, write_ept, write_potree
 from tests.io.test_read_folders import refusal_of, refused
 from topomerge.io import read_chunks, read_points
 from topomerge.types import PointCloud
@@ -128,6 +128,21 @@ def test_bad_copc(tmp_path: Path) -> None:
         path.write_bytes(bytes(broken))
         said = refused(path, spacing=0.1)
         assert said is None or (said.startswith(f"{path}: ") and "\n" not in said)
+
+
+def test_chunks_that_promise_too_much(tmp_path: Path) -> None:
+    """The decoder of LAZ 1.4 would allocate four gigabytes, and end the process where there are less."""
+    tree = room_tree()
+    plain = tmp_path / "a.laz"
+    plain.write_bytes(las_bytes(tree.points, tree.colors, True))
+    for path in (plain, write_copc(tmp_path / "a.copc.laz", tree)):
+        data = bytearray(path.read_bytes())
+        assert_same_points(read_points(path), tree)
+        (start,) = struct.unpack_from("<I", data, 96)
+        data[start + 8 + 36 + 4 : start + 8 + 36 + 8] = b"\xff" * 4
+        path.write_bytes(bytes(data))
+        assert "bytes promises 4,294," in refusal_of(path)
+        assert "bytes promises 4,294," in refusal_of(path, spacing=5.0)
 
 
 def a_copy(octrees: dict[str, Path], name: str, folder: Path) -> Path:

@@ -15,6 +15,7 @@ from typing import IO, Any
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.io.laz_chunks import check_chunk, layers_of
 from topomerge.io.octree import MOST_LEVELS, deepest_level
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import damaged
@@ -64,14 +65,17 @@ def coarse_records(path: Path, octree: Octree, options: ReadOptions) -> Iterator
         packing = header.vlrs.get("LasZipVlr")
         if not packing:
             raise damaged(path, COPC_KIND, "its points are not compressed")
-        size, seen = header.point_format.size, 0
+        record = packing[0].record_data_bytes()
+        layers, size, seen = layers_of(record), header.point_format.size, 0
         for place, length, count in _nodes(path, stream, octree, deepest_level(octree.spacing, options)):
             seen += count
             if seen > header.point_count:
                 raise damaged(path, COPC_KIND, f"its octree has more points than the {header.point_count:,} of the file")
             stream.seek(place)
+            data = stream.read(length)
+            check_chunk(path, data, length, layers, size)
             out = np.zeros(count * size, np.uint8)
-            lazrs.decompress_points_with_chunk_table(stream.read(length), packing[0].record_data_bytes(), out, [(count, length)])
+            lazrs.decompress_points_with_chunk_table(data, record, out, [(count, length)])
             packed = laspy.PackedPointRecord.from_buffer(out, header.point_format)
             rows = laspy.ScaleAwarePointRecord(packed.array, header.point_format, header.scales, header.offsets)
             yield header, rows, seen / header.point_count

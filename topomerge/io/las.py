@@ -12,6 +12,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.copc import coarse_records, octree_of
+from topomerge.io.laz_chunks import check_chunk, head_size, layers_of
 from topomerge.io.octree import check_node
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, read_head
@@ -93,11 +94,16 @@ def _check_head(path: Path) -> None:
         raise damaged(path, "a LAS file", f"{records:,} records before point data at byte {start:,} of {size:,}")
     if head[104] & 0x80:  # compressed
         _check_table(path, start, size)
-        _check_items(path, start, int.from_bytes(head[105:107], "little"))
+        record = _check_items(path, start, int.from_bytes(head[105:107], "little"))
+        _check_chunks(path, start, record, int.from_bytes(head[105:107], "little"))
 
 
-def _check_items(path: Path, start: int, record: int) -> None:
-    """Refuse a LAZ file whose compressed fields don't add up to a point of `record` bytes; the decoder would allocate them."""
+def _check_items(path: Path, start: int, record: int) -> bytes:
+    """The record of the compression.
+
+    Raises:
+        InputError: its fields don't add up to a point of `record` bytes; the decoder would allocate them.
+    """
     with path.open("rb") as stream:
         before = stream.read(min(start, LARGEST_HEAD))
     at = before.find(LASZIP) + 52  # of the record's data: the name stands 2 bytes into a record head of 54
@@ -105,6 +111,27 @@ def _check_items(path: Path, start: int, record: int) -> None:
     items = before[at + 34 : at + 34 + 6 * count]  # kind, size and version of two bytes each
     if at < 52 or len(items) < 6 * count or sum(struct.unpack("<" + "2xH2x" * count, items)) != record:
         raise damaged(path, "a LAZ file", f"its fields do not add up to {record} bytes")
+    return before[at : at + 34 + 6 * count]
+
+
+def _check_chunks(path: Path, start: int, record: bytes, point: int) -> None:
+    """Refuse a LAZ file in which the layers of a chunk promise more bytes than the chunk has."""
+    import lazrs
+
+    layers, size = layers_of(record), path.stat().st_size
+    if not layers:
+        return
+    at = start + 8
+    with path.open("rb") as stream:
+        stream.seek(start)
+        for count, length in lazrs.read_chunk_table(stream, lazrs.LazVlr(record)):
+            if not count and not length:  # some writers end with an empty one
+                continue
+            if at + length > size:
+                raise damaged(path, "a LAZ file", f"a chunk of {length:,} bytes at byte {at:,} of {size:,}")
+            stream.seek(at)
+            check_chunk(path, stream.read(head_size(layers, point)), length, layers, point)
+            at += length
 
 
 def _check_table(path: Path, start: int, size: int) -> None:

@@ -156,7 +156,7 @@ def _save_las(
             written, beyond = written + int(near.sum()), beyond + int((~near).sum())
             if progress is not None:
                 progress(min(done, 1.0), f"writing {target.name}")
-    except laspy.errors.LaspyException as error:  # it reads what it can't write
+    except (laspy.errors.LaspyException, UnicodeError) as error:  # it reads what it can't write
         raise damaged(source, "a LAS file", error) from error
     finally:
         if writer is not None:
