@@ -144,13 +144,21 @@ def write_corpus(folder: Path) -> dict[str, Path]:
 
 
 def write_walks(folder: Path) -> dict[str, Path]:
-    """Bags of either version of ROS, and a full OctoMap."""
+    """Bags of either version of ROS, a full OctoMap, recordings of depth cameras and an octree."""
     from tests.io.bags import walk_messages, write_bag
+    from tests.io.octrees import room_tree, write_copc
+    from tests.io.rgbd import camera_poses, write_sens
+    from tests.io.rtabmap_bases import write_rtabmap
+    from tests.io.test_read_rtabmap import depth_nodes, scan_nodes
     from tests.io.walks import room_walk
 
     found = {"full.ot": folder / "full.ot"}
     nodes = [samples.full_node(0.4, 1)] * 15 + [samples.full_node(0.4, 7)] + [samples.full_node(odds, 0) for odds in (1, -1, 2)]
     found["full.ot"].write_bytes(samples.FULL_OCTOMAP_HEADER + b"".join(nodes))
+    found["cloud.copc.laz"] = write_copc(folder / "cloud.copc.laz", room_tree())
+    found["room.sens"] = write_sens(folder / "room.sens", camera_poses())
+    found["scans.db"] = write_rtabmap(folder / "scans.db", scan_nodes(room_walk()))
+    found["depth.db"] = write_rtabmap(folder / "depth.db", depth_nodes(camera_poses()[:1]))
     for kind in ("bag", "db3", "mcap") if find_spec("rosbags") else ():
         found[f"walk.{kind}"] = write_bag(folder / kind, kind, walk_messages(room_walk())).rename(folder / f"walk.{kind}")
     return found
@@ -189,7 +197,7 @@ def write_atlas(folder: Path) -> dict[str, Path]:
     """The listing of an atlas of one map."""
     from topomerge.fusion.atlas.store import add
 
-    add(folder / "atlas", [("house", building(2, 2))], lambda *_: "")
+    add(folder / "atlas", [("house", building(2, 2))], lambda *_, **__: "")
     shutil.copy(folder / "atlas" / "atlas.json", folder / "atlas.json")
     return {"atlas.json": folder / "atlas.json"}
 

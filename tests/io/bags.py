@@ -78,6 +78,29 @@ class Messages:
             "sensor_msgs/msg/LaserScan", header=self.header(time, frame), ranges=ranges.astype(np.float32), **angles, **more
         )
 
+    def image(self, values: np.ndarray, time: float, frame: str, encoding: str = "16UC1", order: str = "<") -> Any:
+        """An Image whose rows end with two bytes that say nothing."""
+        height, width = values.shape[:2]
+        rows = values.astype(values.dtype.newbyteorder(order)).reshape(height, -1).view(np.uint8)
+        data = np.hstack([rows, np.full((height, values.itemsize), 7, np.uint8)])
+        size = {"height": height, "width": width, "step": data.shape[1], "is_bigendian": int(order == ">")}
+        return self._of("sensor_msgs/msg/Image", header=self.header(time, frame), encoding=encoding, data=data.ravel(), **size)
+
+    def packed_image(self, data: bytes, time: float, frame: str, form: str = "16UC1; compressedDepth png") -> Any:
+        """A CompressedImage of depth, behind its twelve bytes."""
+        packed = np.frombuffer(bytes(12) + data, np.uint8)
+        return self._of("sensor_msgs/msg/CompressedImage", header=self.header(time, frame), format=form, data=packed)
+
+    def camera(self, matrix: np.ndarray, shape: tuple[int, int], time: float, frame: str, rectified: bool = True) -> Any:
+        """A CameraInfo with P and another K, or with K alone."""
+        k, p = (matrix[:3, :3] * (1.5 if rectified else 1)).ravel(), matrix[:3].ravel() * rectified
+        numbers = {"d": np.zeros(5), "k": k, "r": np.eye(3).ravel(), "p": p}
+        numbers = {name.upper() if self.first else name: value for name, value in numbers.items()}
+        region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+        more = {"roi": self._of("sensor_msgs/msg/RegionOfInterest", **region, do_rectify=False), "binning_x": 0, "binning_y": 0}
+        size = {"height": shape[0], "width": shape[1], "distortion_model": "plumb_bob"}
+        return self._of("sensor_msgs/msg/CameraInfo", header=self.header(time, frame), **size, **numbers, **more)
+
     def transforms(self, poses: Iterable[tuple[str, str, np.ndarray]], time: float) -> Any:
         """A message of tf from (parent, child, pose)."""
         all_transforms = [

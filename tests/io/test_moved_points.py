@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import topomerge.io.ply as ply_reader
+from tests.io.octrees import room_tree, write_copc, write_potree
 from tests.samples import box_colors, box_points
 from topomerge.errors import InputError
 from topomerge.io import moved_points
@@ -54,6 +55,19 @@ def test_points_of_every_format_are_moved(samples: dict[str, Path], tmp_path: Pa
     assert np.abs(exact(target) - wanted).max() < 1e-4
     assert np.array_equal(before.colors, after.colors) if before.colors is not None else after.colors is None
     assert [p.name for p in tmp_path.iterdir()] == [target.name]
+
+
+def test_an_octree_is_moved_as_laz(tmp_path: Path) -> None:
+    """Moved points no longer lie where the octree of a COPC file says; folders of octrees become PLY."""
+    import laspy
+
+    sources = [write_copc(tmp_path / "a.copc.laz", room_tree()), write_potree(tmp_path / "potree", room_tree())]
+    for source, suffix in zip(sources, (".laz", ".ply"), strict=True):
+        target = tmp_path / f"moved{moved_suffix(source)}"
+        assert target.suffix == suffix and save_moved(source, target, bow, np.zeros(3)).written == len(room_tree().points)
+        assert np.abs(exact(target) - bow(read_points(source).points.astype(np.float64))).max() < 1e-3
+    with laspy.open(tmp_path / "moved.laz") as reader:
+        assert [record.user_id for record in reader.header.vlrs] == ["laszip encoded"] or not reader.header.vlrs
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz", ".npy"])

@@ -14,10 +14,9 @@ import pytest
 pytest.importorskip("rosbags")
 
 from tests.io.bags import KINDS, MOUNT, Entry, Messages, walk_messages, write_bag
-from tests.io.test_read_folders import assert_same, refusal_of
+from tests.io.test_read_folders import assert_same, refusal_of, refused
 from tests.io.walks import START, Walk, room_walk, write_kitti, write_tum
 from tests.samples import box_colors, write_plan
-from topomerge.errors import InputError
 from topomerge.io import read_points
 from topomerge.io.bag_file import TRANSFORMS
 
@@ -279,7 +278,7 @@ BAD = {
     ),
     "nothing": (
         lambda w: without(walk_messages(w), "/points"),
-        r"has no PointCloud2, LaserScan or OccupancyGrid; .*this holds /tf \(3 TFMessage\)",
+        r"has no PointCloud2, depth images, LaserScan or OccupancyGrid; .*this holds /tf \(3 TFMessage\)",
     ),
     "two parents": (
         lambda w: joined(two_parents, walk_messages(w, "none")),
@@ -326,15 +325,6 @@ def test_cut_bags(tmp_path: Path, walk: Walk, kind: str) -> None:
     for length in (20, len(data) // 2, len(data) - 40):
         path.write_bytes(data[:length])
         assert refusal_of(path).startswith(f"{path}: ")
-
-
-def refused(path: Path) -> str | None:
-    """Why it can't be read; None: it can."""
-    try:
-        read_points(path)
-    except InputError as error:
-        return str(error)
-    return None
 
 
 @pytest.mark.usefixtures("bags_here")

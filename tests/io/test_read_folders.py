@@ -164,7 +164,7 @@ TUM_LINE = "%.3f 0 0 0 0 0 0 1\n"
     ("text", "says"),
     [
         ("", "holds no poses"),
-        ("1 2 3\n", "line 1 has 3 numbers; a line of KITTI has 12, one of TUM 8"),
+        ("1 2 3\n", "line 1 has 3 numbers; a line of KITTI has 12, one of TUM has 8"),
         (TUM_LINE % 1 + "1 2 3\n", "line 2 has 3 numbers"),
         ("x 0 0 0 0 0 0 1\n", "line 1 is not a row of numbers"),
         (TUM_LINE % 1 + "2 nan 0 0 0 0 0 1\n", "line 2 holds a number that is not finite"),
@@ -190,11 +190,20 @@ def test_bad_calibrations(tmp_path: Path) -> None:
             read_trajectory(tmp_path / "poses.txt")
 
 
-def refusal_of(path: Path, **options: str) -> str:
+def refusal_of(path: Path, **options: str | float) -> str:
     with pytest.raises(InputError) as refusal:
         read_points(path, **options)
     assert "\n" not in str(refusal.value)
     return str(refusal.value)
+
+
+def refused(path: Path, **options: str | float) -> str | None:
+    """Why it can't be read; None: it can."""
+    try:
+        read_points(path, **options)
+    except InputError as error:
+        return str(error)
+    return None
 
 
 def test_bad_folders(tmp_path: Path, walk: Walk) -> None:

@@ -7,44 +7,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from tests.io.rgbd import ROOM, camera_poses, write_tum_images
 from tests.io.test_read_folders import refusal_of
-from tests.io.walks import START, write_tum
 from topomerge.io import read_points
-
-FOCAL, CENTRE, SHAPE = (525.0, 525.0), (319.5, 239.5), (480, 640)
-ROOM = np.array([4.0, 3.0, 2.5])
-
-
-def camera_poses() -> np.ndarray:
-    """Three places in the room; z of the camera is ahead, y down."""
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    for pose, (turn, place) in zip(poses, [(0.3, (1, 1, 1.2)), (2.0, (2, 1.5, 1.2)), (4.0, (3, 2, 1.0))], strict=True):
-        ahead = np.array([np.cos(turn), np.sin(turn), 0])
-        pose[:3, :3] = np.column_stack([np.cross(ahead, (0, 0, 1)), (0, 0, -1), ahead])
-        pose[:3, 3] = place
-    return poses
-
-
-def depth_image(pose: np.ndarray) -> np.ndarray:
-    """(480, 640) uint16: how far along the camera's axis the walls of the room are, 5000 a metre."""
-    rows, columns = np.indices(SHAPE)
-    rays = np.stack([(columns - CENTRE[0]) / FOCAL[0], (rows - CENTRE[1]) / FOCAL[1], np.ones(SHAPE)], axis=-1) @ pose[:3, :3].T
-    with np.errstate(divide="ignore"):
-        share = np.where(rays > 0, (ROOM - pose[:3, 3]) / rays, -pose[:3, 3] / rays).min(axis=-1)
-    return np.rint(share * 5000).astype(np.uint16)
 
 
 def write_rgbd(folder: Path) -> Path:
-    for name in ("depth", "rgb"):
-        (folder / name).mkdir(parents=True)
-    poses, times = camera_poses(), START + np.arange(3)
-    for pose, time in zip(poses, times.tolist(), strict=True):
-        Image.fromarray(depth_image(pose)).save(folder / "depth" / f"{time:.6f}.png")
-        Image.fromarray(np.full((*SHAPE, 3), (10, 20, 30), np.uint8)).save(folder / "rgb" / f"{time + 0.01:.6f}.png")
-    (folder / "depth.txt").write_text("# depth\n" + "".join(f"{t:.6f} depth/{t:.6f}.png\n" for t in times))
-    (folder / "rgb.txt").write_text("".join(f"{t + 0.01:.6f} rgb/{t + 0.01:.6f}.png\n" for t in times))
-    write_tum(folder / "groundtruth.txt", poses, times)
-    return folder
+    return write_tum_images(folder, camera_poses())
 
 
 def test_images_show_the_room(tmp_path: Path) -> None:
@@ -93,6 +62,6 @@ def test_bad_folders_of_images(tmp_path: Path) -> None:
     image.write_bytes(image.read_bytes()[:2000])
     assert refusal_of(folder).startswith(f"{image}: damaged")
     Image.fromarray(np.ones((24, 32), np.uint16)).save(image)
-    assert "has 32 x 24 pixels; state its camera" in refusal_of(folder)
+    assert "has 32 x 24 pixels, its camera 640 x 480; state its camera in camera.txt" in refusal_of(folder)
     (folder / "groundtruth.txt").unlink()
     assert "has depth images, but no groundtruth.txt" in refusal_of(folder)

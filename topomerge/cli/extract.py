@@ -65,7 +65,12 @@ EXTRACT = Command(
         option("--resolution", type=above_zero, metavar="R", help="m a pixel, of a plain image of a floor plan"),
         option("--extrude", type=above_zero, metavar="H", help="m of wall height for 2D maps (default 2.5)"),
         option("--ceiling", action="store_true", help="close 2D maps with a ceiling"),
-        option("--spacing", type=above_zero, metavar="D", help="m between points on surfaces of meshes, models and 2D maps"),
+        option(
+            "--spacing",
+            type=above_zero,
+            metavar="D",
+            help="m between points on surfaces of meshes, models and 2D maps, or of the finest level of an octree",
+        ),
         option("--doors", action="store_true", help="keep the door leaves of building models: a leaf is modelled shut"),
         option(
             "--poses",

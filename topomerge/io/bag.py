@@ -1,4 +1,4 @@
-"""ROS bags: points of a LiDAR, a depth camera or a 2D laser with the sensor's poses, or a robot's map.
+"""ROS bags: points of a LiDAR, depth images or slices of a 2D laser with the sensor's poses, or a robot's map.
 
 Poses are those of tf; where tf does not move the sensor, those of the odometry; or of a trajectory file or topic (--poses).
 The messages with poses are read first, those with points after them, one at a time. A scan counts as taken in one instant.
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.io.bag_depth import COMPRESSED_IMAGE, IMAGE, Decoder, depth_decoder, depth_topics
 from topomerge.io.bag_file import BAG_KIND, Bag, Message, Topic
 from topomerge.io.bag_messages import LASER_SCAN, OCCUPANCY_GRID, POINT_CLOUD, cloud_points, laser_points, occupancy_plan, stamp
 from topomerge.io.bag_poses import SensorPoses, sensor_poses
@@ -26,7 +27,9 @@ from topomerge.io.subprocess_reader import read_in_subprocess
 from topomerge.io.trajectory import BACKWARD
 
 BAG_MEMORY = 4 << 30  # bytes beside what the process starts with: the largest messages, and all poses
-DECODERS = {POINT_CLOUD: cloud_points, LASER_SCAN: laser_points}
+DECODERS: dict[str, Decoder] = {POINT_CLOUD: cloud_points, LASER_SCAN: laser_points}
+READ_TYPES = (*DECODERS, IMAGE, COMPRESSED_IMAGE, OCCUPANCY_GRID)
+READ_NAMES = "PointCloud2, depth images, LaserScan or OccupancyGrid"
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -51,30 +54,30 @@ def _read(path: Path, options: ReadOptions) -> Iterator[Piece]:
             yield from _map(bag, topic, options)
             return
         poses = sensor_poses(bag, topic, options.poses, _first_frame(bag, topic))
-        yield from pieces(_scans(bag, topic, poses), poses.warnings)
+        decode = DECODERS.get(topic.type) or depth_decoder(bag, topic)
+        yield from pieces(_scans(bag, topic, decode, poses), poses.warnings)
 
 
 def _topic(bag: Bag, name: str | None) -> Topic:
-    """The topic to read: the one that is named, or the only one with points, else with slices, else with a map.
+    """The topic to read: the one that is named, or the only one with points, else with depth images, slices, or a map.
 
     Raises:
         InputError: there is none, or are several; with what the bag holds.
     """
     if name is not None:
         topic = bag.named(name)
-        if topic is None or topic.type not in (*DECODERS, OCCUPANCY_GRID) or not topic.count:
+        if topic is None or topic.type not in READ_TYPES or not topic.count:
             wrong = "is not in the bag" if topic is None else f"holds {topic.count:,} {topic.kind}"
-            able = "PointCloud2, LaserScan or OccupancyGrid"
-            raise InputError(f"{bag.path}: the topic {name} {wrong}; give --topic with {able}: {bag.listing()}")
+            raise InputError(f"{bag.path}: the topic {name} {wrong}; give --topic with {READ_NAMES}: {bag.listing()}")
         return topic
-    for kind in (POINT_CLOUD, LASER_SCAN, OCCUPANCY_GRID):
-        topics = bag.of_type(kind)
+    for kind in (POINT_CLOUD, IMAGE, LASER_SCAN, OCCUPANCY_GRID):
+        topics = depth_topics(bag) if kind == IMAGE else bag.of_type(kind)
         if len(topics) > 1:
             shown = ", ".join(f"{t.name} ({t.count:,} {t.kind})" for t in topics)
             raise InputError(f"{bag.path}: has several topics to read ({shown}); give --topic with one of them")
         if topics:
             return topics[0]
-    raise InputError(f"{bag.path}: has no PointCloud2, LaserScan or OccupancyGrid; give another bag, this holds {bag.listing()}")
+    raise InputError(f"{bag.path}: has no {READ_NAMES}; give another bag, this holds {bag.listing()}")
 
 
 def _first_frame(bag: Bag, topic: Topic) -> str:
@@ -93,7 +96,7 @@ def _map(bag: Bag, topic: Topic, options: ReadOptions) -> Iterator[Piece]:
     yield from extrude(bag.path, occupied, free, plan, options)
 
 
-def _scans(bag: Bag, topic: Topic, poses: SensorPoses) -> Iterator[PosedScan]:
+def _scans(bag: Bag, topic: Topic, decode: Decoder, poses: SensorPoses) -> Iterator[PosedScan]:
     """The scans of a topic, one at a time; those without a pose are left out, and counted in the warnings of the poses.
 
     Raises:
@@ -106,7 +109,7 @@ def _scans(bag: Bag, topic: Topic, poses: SensorPoses) -> Iterator[PosedScan]:
         if time < newest - BACKWARD:
             raise message.fault(bag.path, f"sets the clock back by {newest - time:.1f} s")
         newest, count = max(newest, time), count + 1
-        points, colors = DECODERS[topic.type](bag.path, message)
+        points, colors = decode(bag.path, message)
         scan = poses.place(message.content.header.frame_id, time, count, points)
         if scan is None:
             lost += 1

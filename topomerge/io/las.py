@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from topomerge.errors import InputError
+from topomerge.io.copc import coarse_records, octree_of
+from topomerge.io.laz_chunks import check_chunk, head_size, layers_of
+from topomerge.io.octree import check_node
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, read_head
 from topomerge.types import Array
@@ -19,11 +24,33 @@ SMALLEST_CHUNK = 20  # bytes: a compressed chunk starts with one point as it is
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    """Blocks of points with their colours."""
-    del options
-    for header, rows, done in records(path):
+    """Blocks of points with their colours; of a COPC file, those of the levels that are coarse enough for `spacing`."""
+    octree = None if options.spacing is None else octree_of(path)
+    if octree is not None:
+        _check_head(path)
+    for header, rows, done in records(path) if octree is None else coarse_records(path, octree, options):
         colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
         yield Piece(coordinates(rows), _colors(rows) if colored else None, done=done)
+
+
+def las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[Piece]:
+    """The points of a node that is a LAS or LAZ file.
+
+    Raises:
+        InputError: it can't be read, or has fewer points than the hierarchy promises.
+    """
+    check_node(path)
+    count = 0
+    try:
+        for piece in read(path, replace(options, spacing=None)):
+            count += len(piece.points)
+            yield replace(piece, done=0.0)
+    except (InputError, MemoryError, ImportError, GeneratorExit, KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # panics of the decoder are no Exception
+        raise damaged(path, "a node of an octree", error) from error
+    if count < promised:
+        raise cut_short(path, count, promised)
 
 
 def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
@@ -67,11 +94,16 @@ def _check_head(path: Path) -> None:
         raise damaged(path, "a LAS file", f"{records:,} records before point data at byte {start:,} of {size:,}")
     if head[104] & 0x80:  # compressed
         _check_table(path, start, size)
-        _check_items(path, start, int.from_bytes(head[105:107], "little"))
+        record = _check_items(path, start, int.from_bytes(head[105:107], "little"))
+        _check_chunks(path, start, record, int.from_bytes(head[105:107], "little"))
 
 
-def _check_items(path: Path, start: int, record: int) -> None:
-    """Refuse a LAZ file whose compressed fields don't add up to a point of `record` bytes; the decoder would allocate them."""
+def _check_items(path: Path, start: int, record: int) -> bytes:
+    """The record of the compression.
+
+    Raises:
+        InputError: its fields don't add up to a point of `record` bytes; the decoder would allocate them.
+    """
     with path.open("rb") as stream:
         before = stream.read(min(start, LARGEST_HEAD))
     at = before.find(LASZIP) + 52  # of the record's data: the name stands 2 bytes into a record head of 54
@@ -79,6 +111,27 @@ def _check_items(path: Path, start: int, record: int) -> None:
     items = before[at + 34 : at + 34 + 6 * count]  # kind, size and version of two bytes each
     if at < 52 or len(items) < 6 * count or sum(struct.unpack("<" + "2xH2x" * count, items)) != record:
         raise damaged(path, "a LAZ file", f"its fields do not add up to {record} bytes")
+    return before[at : at + 34 + 6 * count]
+
+
+def _check_chunks(path: Path, start: int, record: bytes, point: int) -> None:
+    """Refuse a LAZ file in which the layers of a chunk promise more bytes than the chunk has."""
+    import lazrs
+
+    layers, size = layers_of(record), path.stat().st_size
+    if not layers:
+        return
+    at = start + 8
+    with path.open("rb") as stream:
+        stream.seek(start)
+        for count, length in lazrs.read_chunk_table(stream, lazrs.LazVlr(record)):
+            if not count and not length:  # some writers end with an empty one
+                continue
+            if at + length > size:
+                raise damaged(path, "a LAZ file", f"a chunk of {length:,} bytes at byte {at:,} of {size:,}")
+            stream.seek(at)
+            check_chunk(path, stream.read(head_size(layers, point)), length, layers, point)
+            at += length
 
 
 def _check_table(path: Path, start: int, size: int) -> None:

@@ -22,6 +22,7 @@ LAS_STEP = 1e-4  # m, of the coordinates in LAS; with 32 bits they reach 214 km 
 FLOAT32_WITHIN = 1e4  # m from the origin: float32 keeps half a millimetre
 LONGEST_COUNT = 20  # digits of a number of points; the head is written before it is known
 PROJECTION = "LASF_Projection"  # records of a LAS file that name the coordinate system
+OCTREE = "copc"  # a record that says where the nodes of an octree lie in the file
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ def _save_las(
             written, beyond = written + int(near.sum()), beyond + int((~near).sum())
             if progress is not None:
                 progress(min(done, 1.0), f"writing {target.name}")
-    except laspy.errors.LaspyException as error:  # it reads what it can't write
+    except (laspy.errors.LaspyException, UnicodeError) as error:  # it reads what it can't write
         raise damaged(source, "a LAS file", error) from error
     finally:
         if writer is not None:
@@ -174,11 +175,11 @@ def _las_coordinates(rows: Any) -> Array:
 
 
 def _las_header(header: Any, offset: Array, same: bool) -> Any:
-    """The header of the source for moved points, without what names a coordinate system that holds no longer."""
+    """The header of the source for moved points, without what holds no longer: an octree, and the name of a coordinate system."""
     out = copy.deepcopy(header)
     out.offsets, out.scales = offset, np.full(3, LAS_STEP)
     out.generating_software = "topomerge"
-    if not same:
-        out.vlrs = type(out.vlrs)([record for record in out.vlrs if record.user_id != PROJECTION])
+    dropped = {OCTREE} if same else {OCTREE, PROJECTION}
+    out.vlrs = type(out.vlrs)([record for record in out.vlrs if record.user_id not in dropped])
     out.evlrs = None
     return out

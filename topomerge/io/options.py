@@ -26,7 +26,7 @@ class ReadOptions:
         extrude: height of the walls made from a floor plan, m.
         ceiling: also close a floor plan from above.
         spacing: distance between points sampled on meshes, building models and floor plans, m; None: 0.05 m for surfaces
-            and the resolution for floor plans.
+            and the resolution for floor plans. Of clouds cut into octrees, that of the finest level to read; None: all levels.
         doors: keep the door leaves of a building model; by default its doors stand open.
         poses: file with the trajectory of a folder of scans, RGB-D images or a bag (KITTI or TUM format); of a bag also the name
             of a topic with poses. None: what lies beside the scans, or what the bag holds.

@@ -55,10 +55,17 @@ FORMATS = (
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc"),
     Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic")),
     Format("a vacuum robot's map", "valetudo", (".json",), fixed=True),
+    Format("an RTAB-Map database", "rtabmap", (".db",)),
+    Format("a ScanNet recording", "sens", (".sens",)),
     Format("a floor plan", "grid", (".yaml", ".yml", ".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"), fixed=True),
 )
 SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
 RGBD_FOLDER = Format("a folder of RGB-D images", "rgbd", (), takes=("poses",))
+OCTREES = {  # by the file that names all others
+    "ept.json": Format("an EPT point cloud", "ept", (), extra="las"),
+    "cloud.js": Format("a Potree 1.x point cloud", "potree", (), extra="las"),
+}
+POSED_RGBD_FOLDER = Format("a folder of RGB-D images with their poses", "rgbd_folders", ())
 
 
 def suffixes() -> tuple[str, ...]:
@@ -122,8 +129,8 @@ def format_of(path: Path) -> Format:
     """
     if path.is_dir():
         return _folder_format(path)
-    for file_format in FORMATS:
-        if path.suffix.lower() in file_format.suffixes:
+    for file_format in (OCTREES[path.name],) if path.name in OCTREES else FORMATS:
+        if path.name in OCTREES or path.suffix.lower() in file_format.suffixes:
             break
     else:
         if path.suffix.lower() == ".tmap":
@@ -145,12 +152,19 @@ def format_of(path: Path) -> Format:
 
 
 def _folder_format(path: Path) -> Format:
-    """What a folder holds: a ROS 2 bag or parts of a bag, RGB-D images, or scans."""
+    """What a folder holds: a ROS 2 bag or parts of a bag, an octree of files, RGB-D images, or scans."""
     bag = next(f for f in FORMATS if f.module == "bag")
     names = [p.name for p in path.iterdir()]
     if "metadata.yaml" in names or any(n.endswith(bag.suffixes) for n in names):
         return bag
-    return RGBD_FOLDER if "depth.txt" in names else SCAN_FOLDER
+    octree = next((OCTREES[name] for name in OCTREES if name in names), None)
+    if octree is not None:
+        return octree
+    if "depth.txt" in names:
+        return RGBD_FOLDER
+    from topomerge.io.rgbd_folders import layout_of
+
+    return POSED_RGBD_FOLDER if layout_of(path) else SCAN_FOLDER
 
 
 def _pieces(path: Path, file_format: Format, options: ReadOptions) -> Iterator[Piece]:

@@ -7,23 +7,18 @@ Source: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.io.grid import PIXELS
+from topomerge.io.depth_images import Camera, Frame, posed_scans
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, damaged
-from topomerge.io.posed import PosedScan, pieces
+from topomerge.io.piece import Piece
+from topomerge.io.posed import pieces
 from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
-from topomerge.types import Array
 
-STRIDE = 4  # pixels between points: 3 cm at 4 m
-FARTHEST = 5.0  # m: beyond, triangulating cameras err by 5 cm and more
 COLOR_GAP = 0.05  # s between a depth image and its colours
 DEPTH_OF_METRE = 5000.0
 TUM_SIZE = (480, 640)  # rows and columns for which the cameras below hold
@@ -33,16 +28,6 @@ CAMERAS = {
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
 USUAL_CAMERA = (525.0, 525.0, 319.5, 239.5)
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Focal lengths and centre, pixels; values of depth per metre; whether they hold for images of any size."""
-
-    focal: tuple[float, float]
-    centre: tuple[float, float]
-    metre: float = DEPTH_OF_METRE
-    any_size: bool = False
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -56,7 +41,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     camera, said = _camera(path)
     depths = _images(path, "depth.txt")
     colors = _images(path, "rgb.txt") if (path / "rgb.txt").is_file() else []
-    yield from pieces(_frames(path, depths, colors, trajectory, camera, said), said)
+    yield from pieces(posed_scans(path, _frames(path, depths, colors, trajectory, camera), said), said)
 
 
 def _camera(path: Path) -> tuple[Camera, list[str]]:
@@ -68,13 +53,15 @@ def _camera(path: Path) -> tuple[Camera, list[str]]:
             fx, fy, cx, cy, metre = [*values, DEPTH_OF_METRE][:5]
         except ValueError as error:
             raise InputError(f"{stated}: is not fx fy cx cy, and perhaps the depth of 1 m; mend it") from error
-        if not (np.isfinite(values).all() and min(fx, fy, metre) > 0):
-            raise InputError(f"{stated}: focal lengths and the depth of 1 m are numbers above 0; mend it")
-        return Camera((fx, fy), (cx, cy), metre, True), []
+        try:
+            return Camera((fx, fy), (cx, cy), metre, mend="mend camera.txt"), []
+        except ValueError as error:
+            raise InputError(f"{stated}: {error}; mend it") from error
     name = next((n for n in CAMERAS if n in path.resolve().name), None)
     fx, fy, cx, cy = CAMERAS[name] if name else USUAL_CAMERA
     usual = "its camera is not known: the usual one of 640 x 480 is taken; camera.txt with fx fy cx cy states another"
-    return Camera((fx, fy), (cx, cy)), [] if name else [usual]
+    mend = "state its camera in camera.txt: fx fy cx cy"
+    return Camera((fx, fy), (cx, cy), DEPTH_OF_METRE, TUM_SIZE, mend), [] if name else [usual]
 
 
 def _images(path: Path, name: str) -> list[tuple[float, Path]]:
@@ -103,74 +90,18 @@ def _images(path: Path, name: str) -> list[tuple[float, Path]]:
 
 
 def _frames(
-    path: Path,
-    depths: list[tuple[float, Path]],
-    colors: list[tuple[float, Path]],
-    trajectory: Trajectory,
-    camera: Camera,
-    said: list[str],
-) -> Iterator[PosedScan]:
-    """One image after the other; those without a pose are left out, and counted in what is said."""
+    path: Path, depths: list[tuple[float, Path]], colors: list[tuple[float, Path]], trajectory: Trajectory, camera: Camera
+) -> Iterator[Frame]:
+    """One image after the other, without a pose where there is none near its time."""
     times = np.array([time for time, _ in depths])
     near = trajectory.gap(times) <= LONGEST_GAP
     if not near.any():
         raise InputError(f"{path}: no depth image has a pose within {LONGEST_GAP:g} s; give --poses with those of these images")
-    if not near.all():
-        said.append(f"{int((~near).sum()):,} of {len(times):,} depth images have no pose near their time and are left out")
     color_times = np.array([time for time, _ in colors])
-    for number, pose in zip(np.flatnonzero(near).tolist(), trajectory.at(times[near]), strict=True):
+    for number, pose in enumerate(trajectory.at(times)):
         time, file = depths[number]
-        depth = read_depth(file)
-        if not camera.any_size and depth.shape != TUM_SIZE:
-            raise InputError(
-                f"{file}: has {depth.shape[1]} x {depth.shape[0]} pixels; state its camera in camera.txt: fx fy cx cy"
-            )
         shown = None
         if len(colors) and abs(color_times[nearest := int(np.abs(color_times - time).argmin())] - time) <= COLOR_GAP:
-            shown = _read_color(colors[nearest][1], depth.shape)
-        rows, columns = np.nonzero(depth[::STRIDE, ::STRIDE])
-        rows, columns = rows * STRIDE, columns * STRIDE
-        z = depth[rows, columns] / camera.metre
-        close = z <= FARTHEST
-        rows, columns, z = rows[close], columns[close], z[close]
-        x, y = ((v - c) / f * z for v, c, f in zip((columns, rows), camera.centre, camera.focal, strict=True))
-        points = np.stack([x, y, z], axis=1)
-        yield PosedScan(points, pose, None if shown is None else shown[rows, columns], done=(number + 1) / len(depths))
-
-
-def read_depth(path: Path) -> Array:
-    """(h, w) int32 values of a 16-bit PNG.
-
-    Raises:
-        InputError: it is none, or is cut short.
-    """
-    image = _open(path)
-    if image.ndim != 2 or image.dtype == np.uint8:
-        raise InputError(f"{path}: is no 16-bit depth image; depth.txt names other images than depth")
-    return image.astype(np.int32)
-
-
-def _read_color(path: Path, shape: tuple[int, ...]) -> Array | None:
-    """(h, w, 3) uint8; None where it is of another size than the depth."""
-    image = _open(path)
-    if image.dtype != np.uint8 or image.shape[:2] != shape:
-        return None
-    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image[..., :3]
-
-
-def _open(path: Path) -> Array:
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # our own limit is stricter than the library's warning
-            with Image.open(path, formats=("PNG", "JPEG")) as image:
-                if image.size[0] * image.size[1] > PIXELS:
-                    raise InputError(f"{path}: has {image.size[0]} x {image.size[1]} pixels, too many for a frame; give another")
-                return np.asarray(image)
-    except InputError:
-        raise
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file, but its list names it; copy the folder again") from None
-    except Exception as error:
-        raise damaged(path, "a PNG image", error) from error
+            shown = colors[nearest][1]
+        done = (number + 1) / len(depths)
+        yield Frame(file, file, camera, pose if near[number] else None, shown, done=done)

@@ -8,7 +8,7 @@ Sources: the development kit of the KITTI odometry benchmark; https://cvg.cit.tu
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ from topomerge.errors import InputError
 from topomerge.types import Array
 
 KITTI_NUMBERS, TUM_NUMBERS = 12, 8  # a line
+POSE_NUMBERS = {KITTI_NUMBERS: "KITTI", TUM_NUMBERS: "TUM"}
 LONGEST_GAP = 0.2  # s between a scan and the nearest pose
 BACKWARD = 1.0  # s: by less, messages may be out of order; by more the clock was set back
 UNIT_TOLERANCE = 0.05  # of a quaternion's length and of the product of a rotation with its transpose
@@ -69,7 +70,7 @@ def read_trajectory(path: Path) -> Trajectory:
         InputError: it is neither, a number is missing or not finite, or time runs backwards; with the number of the line.
     """
     try:
-        lines = list(_numbers(path))
+        lines = list(number_rows(path, POSE_NUMBERS))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; --poses names a trajectory (KITTI or TUM)") from None
     except IsADirectoryError:
@@ -83,8 +84,15 @@ def read_trajectory(path: Path) -> Trajectory:
     return _kitti(path, numbers, rows) if rows.shape[1] == KITTI_NUMBERS else _tum(path, numbers, rows)
 
 
-def _numbers(path: Path) -> Iterator[tuple[int, list[float]]]:
-    """(number, values) of each line that holds a pose."""
+def number_rows(path: Path, widths: Mapping[int, str]) -> Iterator[tuple[int, list[float]]]:
+    """(number, values) of each line of a text file; behind # stand comments.
+
+    Args:
+        widths: how many numbers a line may have -> what such a file is called; all lines have as many as the first.
+
+    Raises:
+        InputError: a line with other words than finite numbers, or with more or fewer; with the number of the line.
+    """
     width = 0
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         for number, line in enumerate(stream, 1):
@@ -97,9 +105,9 @@ def _numbers(path: Path) -> Iterator[tuple[int, list[float]]]:
                 shown = line.strip()[:40]
                 raise InputError(f"{path}: line {number} is not a row of numbers ({shown!r}); mend or remove it") from error
             width = width or len(row)
-            if len(row) != width or width not in (KITTI_NUMBERS, TUM_NUMBERS):
-                said = f"{len(row)} numbers; a line of KITTI has {KITTI_NUMBERS}, one of TUM {TUM_NUMBERS}"
-                raise InputError(f"{path}: line {number} has {said}: give the trajectory in one of these formats")
+            if len(row) != width or width not in widths:
+                said = ", one of ".join(f"{name} has {count}" for count, name in widths.items())
+                raise InputError(f"{path}: line {number} has {len(row)} numbers; a line of {said}: give the trajectory like that")
             if not np.isfinite(row).all():
                 raise InputError(f"{path}: line {number} holds a number that is not finite; mend it, or remove it with its scan")
             yield number, row
@@ -108,7 +116,7 @@ def _numbers(path: Path) -> Iterator[tuple[int, list[float]]]:
 def _kitti(path: Path, numbers: Array, rows: Array) -> Trajectory:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
-    bad = _no_rotations(poses)
+    bad = no_rotations(poses)
     if len(bad):
         raise InputError(f"{path}: line {numbers[bad[0]]} is not a rotation and a place (three rows of four numbers); mend it")
     calibration = path.with_name("calib.txt")
@@ -118,7 +126,7 @@ def _kitti(path: Path, numbers: Array, rows: Array) -> Trajectory:
     return Trajectory(poses)
 
 
-def _no_rotations(poses: Array) -> Array:
+def no_rotations(poses: Array) -> Array:
     """Rows of the poses whose upper left part turns nothing, or mirrors."""
     turns = poses[:, :3, :3]
     off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
@@ -136,7 +144,7 @@ def _laser_in_camera(path: Path) -> Array | None:
             matrix = np.vstack([np.array(text.split(), float).reshape(3, 4), (0, 0, 0, 1)])
         except ValueError as error:
             raise InputError(f"{path}: line {number} has not the twelve numbers of Tr; mend it, or remove the file") from error
-        if not np.isfinite(matrix).all() or len(_no_rotations(matrix[None])):
+        if not np.isfinite(matrix).all() or len(no_rotations(matrix[None])):
             raise InputError(f"{path}: line {number} is not a rotation and a place; mend it, or remove the file")
         return matrix
     return None

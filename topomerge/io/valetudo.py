@@ -24,7 +24,7 @@ from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array
 
 KIND = "a vacuum robot's map"
-LARGEST_JSON = 1 << 28  # bytes
+LARGEST_DRAWING = 1 << 28  # bytes
 FREE_LAYERS = ("floor", "segment")
 WALLED = 0.3  # share of the floor's outline along which robots that draw walls have one: they have 0.5 to 1, the others under 0.1
 
@@ -103,7 +103,7 @@ def robot_rooms(path: Path) -> RobotMap:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    if path.stat().st_size > LARGEST_JSON:
+    if path.stat().st_size > LARGEST_DRAWING:
         raise InputError(f"{path}: is too large for {KIND}; give the map itself")
     try:
         about = json.loads(path.read_bytes())

@@ -1,0 +1,203 @@
+"""Depth images with the camera that took them and where it stood -> scans: the part that all RGB-D formats share.
+
+Cameras look along their z, with x to the right and y down. Lens distortion is not undone.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.io.grid import PIXELS
+from topomerge.io.piece import damaged
+from topomerge.io.posed import PosedScan
+from topomerge.io.trajectory import no_rotations
+from topomerge.types import Array
+
+FARTHEST = 5.0  # m: beyond, cameras of depth err by 5 cm and more
+SPACING_AT_4_M = 0.03  # m between points on a wall that far away
+MIDDLE = (0.25, 0.75)  # of an image: where the centre of any camera lies; elsewhere it is that of another image
+FOCAL_SHARE = (0.2, 5.0)  # of an image's width: from 136 to 11 degrees wide
+ASPECT_TOLERANCE = 0.02  # by which colours and depth that show the same may differ in shape
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Focal lengths and centre (pixels), values of depth per metre.
+
+    Args:
+        size: rows and columns of the images for which it holds; None: of any.
+        mend: what to do about images of another size, for messages.
+    """
+
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    metre: float
+    size: tuple[int, int] | None = None
+    mend: str = "give the calibration of these images"
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([*self.focal, *self.centre, self.metre]).all() and min(*self.focal, self.metre) > 0):
+            raise ValueError("focal lengths and the depth of 1 m are numbers above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One depth image.
+
+    Args:
+        name: of the file or the part of it, for messages.
+        depth: a file of 16 bits, or (h, w) values, 0 or nan where nothing was measured.
+        pose: (4, 4) camera in the fixed frame; None or not finite: not known.
+        color: a file, or (h, w, 3) uint8.
+        lens: the camera of the colours; None: they show what the depth image shows.
+        done: share of all frames.
+    """
+
+    name: Path | str
+    depth: Path | Array
+    camera: Camera
+    pose: Array | None
+    color: Path | Array | None = None
+    lens: Camera | None = None
+    done: float = 0.0
+
+
+def posed_scans(path: Path, frames: Iterable[Frame | None], said: list[str]) -> Iterator[PosedScan]:
+    """The scan of each frame; those without a pose are left out, and counted in what is said.
+
+    Args:
+        path: of the recording, for messages.
+        frames: read one at a time; None: an image without a pose.
+        said: takes warnings.
+
+    Raises:
+        InputError: no frame has a pose, or one can't be used.
+    """
+    count = lost = 0
+    for frame in frames:
+        count += 1
+        if frame is None or frame.pose is None or not np.isfinite(frame.pose).all():
+            lost += 1
+        elif len(no_rotations(frame.pose[None])):
+            raise InputError(f"{frame.name}: its pose is not a rotation and a place; mend it, or remove the image")
+        else:
+            yield _scan(frame)
+    if lost == count:
+        raise InputError(f"{path}: none of its {count:,} depth images has a pose that can be used; give another recording")
+    if lost:
+        said.append(f"{lost:,} of {count:,} depth images have no pose that can be used and are left out")
+
+
+def _scan(frame: Frame) -> PosedScan:
+    """The points of one frame as its camera sees them."""
+    depth = read_depth(frame.depth) if isinstance(frame.depth, Path) else frame.depth
+    points, rows, columns = depth_points(frame.name, depth, frame.camera)
+    return PosedScan(points, frame.pose, _colors(frame, points, rows, columns, depth.shape), done=frame.done)
+
+
+def depth_points(name: Path | str, depth: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    """(n, 3) points in front of a camera, m, and the rows and columns (n,) of their pixels; not every pixel becomes one.
+
+    Args:
+        name: of the image, for messages.
+        depth: (h, w) values along the camera's axis; 0 or not finite where nothing was measured.
+        camera: that took it.
+
+    Raises:
+        InputError: the camera can't be that of an image of this size.
+    """
+    _check_camera(name, camera, depth.shape)
+    step = max(1, round(min(camera.focal) * SPACING_AT_4_M / 4.0))
+    rows, columns = np.nonzero(depth[::step, ::step] > 0)
+    rows, columns = rows * step, columns * step
+    z = depth[rows, columns] / camera.metre
+    close = z <= FARTHEST
+    rows, columns, z = rows[close], columns[close], z[close]
+    x, y = ((v - c) / f * z for v, c, f in zip((columns, rows), camera.centre, camera.focal, strict=True))
+    return np.stack([x, y, z], axis=1), rows, columns
+
+
+def _check_camera(name: Path | str, camera: Camera, shape: tuple[int, ...]) -> None:
+    """Refuse a camera that can't be that of an image of this shape.
+
+    Raises:
+        InputError: it is one for another size.
+    """
+    height, width = shape
+    if not height * width:
+        raise InputError(f"{name}: has no pixels; record it again")
+    if camera.size is not None and camera.size != shape:
+        theirs = f"its camera {camera.size[1]} x {camera.size[0]}"
+        raise InputError(f"{name}: has {width} x {height} pixels, {theirs}; {camera.mend}")
+    shares = [c / n for c, n in zip(camera.centre, (width, height), strict=True)]
+    wide = [f / width for f in camera.focal]
+    if not (MIDDLE[0] <= min(shares) <= max(shares) <= MIDDLE[1] and FOCAL_SHARE[0] <= min(wide) <= max(wide) <= FOCAL_SHARE[1]):
+        stated = f"focal lengths {camera.focal[0]:g} {camera.focal[1]:g}, centre {camera.centre[0]:g} {camera.centre[1]:g}"
+        raise InputError(f"{name}: has {width} x {height} pixels, and a camera of {stated} can't be its own; {camera.mend}")
+
+
+def _colors(frame: Frame, points: Array, rows: Array, columns: Array, shape: tuple[int, ...]) -> Array | None:
+    """(n, 3) uint8 of the points; None where the colours show something else than the depth image."""
+    shown = read_color(frame.color) if isinstance(frame.color, Path) else frame.color
+    if shown is None:
+        return None
+    height, width = shown.shape[:2]
+    if frame.lens is None:
+        if abs(height * shape[1] / (width * shape[0]) - 1) > ASPECT_TOLERANCE:
+            return None
+        return shown[rows * height // shape[0], columns * width // shape[1]]
+    (fx, fy), (cx, cy) = frame.lens.focal, frame.lens.centre
+    u = np.rint(points[:, 0] / points[:, 2] * fx + cx).astype(np.int64).clip(0, width - 1)
+    v = np.rint(points[:, 1] / points[:, 2] * fy + cy).astype(np.int64).clip(0, height - 1)
+    return shown[v, u]
+
+
+def read_depth(path: Path) -> Array:
+    """(h, w) int32 values of a 16-bit PNG or PGM.
+
+    Raises:
+        InputError: it is none, or is cut short.
+    """
+    image = read_pixels(path, path)
+    if image.ndim != 2 or image.dtype == np.uint8:
+        raise InputError(f"{path}: is no 16-bit depth image; other images than depth stand in its place")
+    return image.astype(np.int32)
+
+
+def read_color(source: Path | bytes, name: Path | str | None = None) -> Array | None:
+    """(h, w, 3) uint8 of a PNG or JPEG, in a file or as bytes (then with a name for messages); None where it has other values."""
+    image = read_pixels(source, name if name is not None else str(source))
+    if image.dtype != np.uint8:
+        return None
+    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image[..., :3]
+
+
+def read_pixels(source: Path | bytes, name: Path | str) -> Array:
+    """The values of a PNG, JPEG or PGM, in a file or as bytes.
+
+    Raises:
+        InputError: it is none, is cut short, or absurdly large.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # our own limit is stricter than the library's warning
+            stream = io.BytesIO(source) if isinstance(source, bytes) else source
+            with Image.open(stream, formats=("PNG", "JPEG", "PPM")) as image:
+                if image.size[0] * image.size[1] > PIXELS:
+                    raise InputError(f"{name}: has {image.size[0]} x {image.size[1]} pixels, too many for a frame; give another")
+                return np.asarray(image)
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise InputError(f"{name}: no such file, but its list names it; copy the folder again") from None
+    except Exception as error:
+        raise damaged(Path(name), "a PNG, JPEG or PGM image", error) from error
