@@ -237,7 +237,7 @@ def test_an_atlas_of_a_stranger_deletes_and_writes_nothing_elsewhere(tmp_path: P
     from topomerge.fusion.atlas.store import add, read_atlas
 
     folder = tmp_path / "atlas"
-    add(folder, [("house", building(2, 2))], lambda *_: "")
+    add(folder, [("house", building(2, 2))], lambda *_, **__: "")
     (tmp_path / "precious.txt").write_text("mine")
     (folder / "link").symlink_to(tmp_path)
     (folder / NEXT).mkdir()
