@@ -128,7 +128,9 @@ def row():
 @pytest.mark.parametrize("same", ["nothing", "storey"])
 def test_empty_rooms_of_one_size_are_not_believed(row, first, same):
     """Neither map shows the corridor whole. They share a pair of rooms, or none: nothing tells which of them is which."""
-    found = register(grid_of(part(row, (3.8, -9), (16.2, 19))), grid_of(part(row, (first, -9), (first + 8.4, 19)), MOVE), same=same)
+    found = register(
+        grid_of(part(row, (3.8, -9), (16.2, 19))), grid_of(part(row, (first, -9), (first + 8.4, 19)), MOVE), same=same
+    )
     assert not found.accepted and found.posterior["wing"] == max(found.posterior[n] for n in WRONG)
 
 
