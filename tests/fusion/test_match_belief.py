@@ -37,7 +37,7 @@ def halves():
 
 @pytest.fixture(scope="module")
 def matching(halves):
-    return match(*halves)
+    return match(*halves, method="attention")
 
 
 def seen_at(middle, log_odds) -> Places:
@@ -62,9 +62,9 @@ def test_features_by_hand(halves):
 
 
 def test_the_probability_is_that_of_the_model(halves, matching):
-    believed = believed_matches(matching, *halves, "consistent")
+    believed = believed_matches(matching, *halves, "attention")
     x = belief_features(matching, halves[0], places_of(matching, *halves))
-    assert believed.probability == pytest.approx(1 / (1 + np.exp(-x @ belief_weights("consistent"))))
+    assert believed.probability == pytest.approx(1 / (1 + np.exp(-x @ belief_weights("attention"))))
     assert np.array_equal(believed.rooms, matching.rooms) and believed.alternatives == matching.alternatives
 
 
@@ -84,23 +84,23 @@ def test_what_has_no_pose_or_no_cells_stays(halves, matching):
     a, b = halves
     empty = replace(a, grid=a.grid.with_cells(a.grid.cells[:0]), room=a.room[:0])
     for given in (replace(matching, transform=None), Matching(transform=Sim3())):
-        assert believed_matches(given, a, b, "consistent") is given
-    assert believed_matches(matching, empty, b, "consistent") is matching
-    assert believed_matches(matching, a, b, "growing") is matching
+        assert believed_matches(given, a, b, "attention") is given
+    assert believed_matches(matching, empty, b, "attention") is matching
+    assert all(believed_matches(matching, a, b, method) is matching for method in ("growing", "consistent"))
 
 
 def test_the_command_prints_them(halves, matching, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for m, name in zip(halves, "ab", strict=True):
         save_map(m, f"{name}.tmap")
-    assert cli(["match", "a.tmap", "b.tmap", "--json"]) == 0
+    assert cli(["match", "a.tmap", "b.tmap", "--method", "attention", "--json"]) == 0
     printed = [m["probability"] for m in json.loads(capsys.readouterr().out)["matches"]]
-    assert printed == pytest.approx(believed_matches(matching, *halves, "consistent").probability.tolist(), abs=1e-3)
+    assert printed == pytest.approx(believed_matches(matching, *halves, "attention").probability.tolist(), abs=1e-3)
 
 
-@pytest.mark.parametrize("spoiled", [{}, {"consistent": [1.0]}, {"consistent": [1.0, float("nan"), 0.0, 0.0]}])
+@pytest.mark.parametrize("spoiled", [{}, {"attention": [1.0]}, {"attention": [1.0, float("nan"), 0.0, 0.0]}])
 def test_damaged_weights_are_told(spoiled, tmp_path, monkeypatch):
     (tmp_path / BELIEF_FILE).write_text(json.dumps(spoiled))
     monkeypatch.setenv(VARIABLE, str(tmp_path))
-    with pytest.raises(InputError, match=f"{BELIEF_FILE}: consistent must be {len(BELIEF_NAMES)} numbers"):
-        belief_weights("consistent")
+    with pytest.raises(InputError, match=f"{BELIEF_FILE}: attention must be {len(BELIEF_NAMES)} numbers"):
+        belief_weights("attention")

@@ -99,7 +99,7 @@ def read(task: str) -> Any:
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "room_odds": lambda: np.array(room_weights()["entered"]),
         "match_odds": lambda: odds_weights("match"),
-        "match_belief": lambda: belief_weights("consistent"),
+        "match_belief": lambda: belief_weights("attention"),
         "feature_scale": lambda: scaled(np.ones((2, 18)), "matched"),
     }[task]()
 
@@ -162,7 +162,7 @@ def test_fits_learn_what_is_so(words) -> None:
     odds = train(settings_of(words("match_odds")), quiet)
     assert odds["val/match_accuracy"] > 0.7 and odds["val/hypothesis_accuracy"] > 0.7
     belief = train(settings_of(words("match_belief")), quiet)
-    assert belief["val/consistent_all_after_accuracy"] > 0.9 > 0.7 > belief["val/consistent_all_before_accuracy"]
+    assert belief["val/attention_all_after_accuracy"] > 0.9 > 0.7 > belief["val/attention_all_before_accuracy"]
     assert train(settings_of(words("feature_scale")), quiet)["val/recall@1"] > 0.9
     assert train(settings_of(words("door_classification", "epochs=8", "rate=0.02")), quiet)["val/auc"] > 0.9
 

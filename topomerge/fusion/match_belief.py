@@ -20,7 +20,7 @@ from topomerge.matching.result import Matching
 from topomerge.types import Array, TopometricMap
 
 BELIEF_FILE = "match_belief.json"
-BELIEVED_METHODS = ("consistent", "attention")  # that propose a pose, and were fitted
+BELIEVED_METHODS = ("attention",)  # that are told better so; walls decide for "consistent", whose odds are as good without
 BELIEF_NAMES = ("constant", "matching", "places", "room")
 SUREST = 1e-3  # probabilities of matching are that far from 0 and 1 at least
 ROOM_RIM = 1.5  # m around a room from which places speak for it, too: a tile is wider than most walls are apart

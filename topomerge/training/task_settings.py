@@ -153,7 +153,7 @@ class MatchBelief(TaskSettings):
     heldout: Recipe = field(default_factory=Recipe)
     pull: float = 0.5
     folds: int = 8
-    watch: str = "consistent_all_after_accuracy"
+    watch: str = "attention_all_after_accuracy"
 
 
 @dataclass
