@@ -65,9 +65,9 @@ def belief_weights(method: str) -> Array:
 
 def belief_features(matching: Matching, a: TopometricMap, seen: Places) -> Array:
     """(M, 4) 1, log odds by matching, what all places say, and what those around the room of a say (mean log odds; 0 of none)."""
-    told = seen.features
+    whole_features = seen.features
     p = np.clip(matching.probability, SUREST, 1 - SUREST)
-    whole = np.full(len(p), told["place_mean"] * np.log1p(told["place_area"] / PLACE_AREA))
+    whole = np.full(len(p), whole_features["place_mean"] * np.log1p(whole_features["place_area"] / PLACE_AREA))
     around = np.array([room_places(seen, a, room) for room in matching.rooms[:, 0].tolist()])
     return np.stack([np.ones(len(p)), np.log(p / (1 - p)), whole, around], axis=1)
 

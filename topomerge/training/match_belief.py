@@ -153,11 +153,11 @@ def belief_scores(rows: Sequence[MatchRows], guesses: dict[str, list[Array]]) ->
 
 
 def _scores(p: Array, y: Array) -> dict[str, float]:
-    told, sure = calibration(p, y), np.clip(p, 1e-4, 1 - 1e-4)
+    reliability, sure = calibration(p, y), np.clip(p, 1e-4, 1 - 1e-4)
     accuracy = float(((p > 0.5) == y).mean())
-    scores = {"error": told.error, "by_chance": told.by_chance, "count": float(len(p)), "accuracy": accuracy}
-    if told.above is not None:
-        scores |= {"error_above": told.above.error, "above_by_chance": told.above.by_chance}
+    scores = {"error": reliability.error, "by_chance": reliability.by_chance, "count": float(len(p)), "accuracy": accuracy}
+    if reliability.above is not None:
+        scores |= {"error_above": reliability.above.error, "above_by_chance": reliability.above.by_chance}
     scores["log_loss"] = float(-np.mean(np.log(np.where(y, sure, 1 - sure))))
     for least in SURE:
         at, right = p >= least, max(float(y.sum()), 1.0)
