@@ -101,6 +101,24 @@ def test_nothing_connected_is_status_two(run: Run, folder: Path) -> None:
     assert not list((folder / "two").glob("map_*")) and [p.name for p in (folder / "two" / "maps").iterdir()] == ["west.tmap"]
 
 
+def test_what_is_stated_of_the_maps_is_heard_and_stays(run: Run, folder: Path) -> None:
+    """West and east are joined, surer than where nothing is stated; the stranger stays apart; what was said holds for what is
+    taken out later."""
+    status, out, err = run("atlas", "add", "floor", "west.tmap", "east.tmap", "stranger.tmap", "--known", "storey")
+    assert status == 0 and err == "" and "2 maps belong together (west, east)" in out and "stranger stands apart" in out
+    plain, stated = (read_atlas(folder / name) for name in ("house", "floor"))
+    assert (plain.settings["same"], stated.settings["same"]) == ("nothing", "storey")
+    sure, surer = (
+        {tuple(link["maps"]): link["probability"] for link in json.loads((folder / name / "atlas.json").read_text())["links"]}
+        for name in ("house", "floor")
+    )
+    assert set(sure) == set(surer) and all(surer[pair] >= sure[pair] for pair in sure)
+    assert run("atlas", "remove", "floor", "stranger", "-q")[0] == 0
+    assert read_atlas(folder / "floor").settings["same"] == "storey"
+    status, out, err = run("atlas", "add", "new", "west.tmap", "--known", "house")
+    assert status == 1 and "--known" in err and not (folder / "new").exists()
+
+
 def test_three_maps_are_merged(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = read_registrations(folder / "house", read_atlas(folder / "house").settings)  # of the same maps
     monkeypatch.setattr("topomerge.fusion.merge.solve", lambda maps, settings, _: solve(maps, settings, made))

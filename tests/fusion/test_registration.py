@@ -8,6 +8,7 @@ import pytest
 from tests.fusion.plans_of import MOVE, doubled, grid_of, off, office, part
 from tests.scenes import HEIGHT, Scene
 from topomerge.errors import InputError
+from topomerge.fusion.posterior import FEW, WRONG
 from topomerge.fusion.registration import register
 from topomerge.types import Sim3, VoxelGrid
 
@@ -102,16 +103,66 @@ def test_maps_of_two_buildings_are_not_believed(points):
     assert not found.accepted and "not believed" in found.reason
 
 
-def test_a_repeated_room_is_not_believed():
-    """Eight rooms alike along a corridor that neither map shows whole: nothing tells which of them is which."""
+@pytest.mark.parametrize("same", ["nothing", "storey"])
+def test_a_mirrored_twin_is_not_believed(same):
+    """The same rooms the other way round, as semi-detached houses are: no turn lays them on each other."""
+    bare = office(furnished=False).points()
+    mirrored = bare * np.array([-1, 1, 1], np.float32)
+    found = register(grid_of(bare), grid_of(mirrored, MOVE), same=same)
+    assert not found.accepted and found.probability < 0.2 and found.reason.startswith("not believed")
+    assert sum(found.posterior.values()) == pytest.approx(1.0)
+
+
+@pytest.fixture(scope="module")
+def row():
+    """Eight empty rooms alike on both sides of a corridor."""
     scene = Scene().shell(0, 0, 32, 10)
     for y in (4, 6):
         scene.wall((0, y), (32, y), doors=tuple(2.0 + 4 * k for k in range(8)))
     for x in range(4, 32, 4):
         scene.wall((x, 0), (x, 4)).wall((x, 6), (x, 10))
-    points = scene.points()
-    found = register(grid_of(part(points, (3.8, -9), (16.2, 19))), grid_of(part(points, (11.8, -9), (24.2, 19)), MOVE))
-    assert not found.accepted
+    return scene.points()
+
+
+@pytest.mark.parametrize("first", [11.8, 19.8])
+@pytest.mark.parametrize("same", ["nothing", "storey"])
+def test_empty_rooms_of_one_size_are_not_believed(row, first, same):
+    """Neither map shows the corridor whole. They share a pair of rooms, or none: nothing tells which of them is which."""
+    found = register(
+        grid_of(part(row, (3.8, -9), (16.2, 19))), grid_of(part(row, (first, -9), (first + 8.4, 19)), MOVE), same=same
+    )
+    assert not found.accepted and found.posterior["wing"] == max(found.posterior[n] for n in WRONG)
+
+
+def test_one_empty_room_of_one_size_is_not_believed():
+    room = grid_of(Scene().shell(0, 0, 5, 4).points())
+    found = register(room, grid_of(Scene().shell(0, 0, 5, 4).points(), MOVE))
+    assert not found.accepted and found.posterior["here"] < 0.6
+    assert found.posterior["wing"] == max(found.posterior[n] for n in WRONG)
+
+
+def test_a_refusal_is_the_same_whichever_map_is_first(row):
+    a, b = grid_of(part(row, (3.8, -9), (16.2, 19))), grid_of(part(row, (11.8, -9), (24.2, 19)), MOVE)
+    there, back = register(a, b), register(b, a)
+    assert there.posterior == pytest.approx(back.posterior) and there.reason == back.reason
+
+
+def test_more_in_common_and_more_that_is_stated_never_lower_a_right_pose(points):
+    a = grid_of(part(points, high=(16, 99)))
+    believed = []
+    for low in (13, 10, 6):
+        b = grid_of(part(points, low=(low, -99)), MOVE)
+        each = [register(a, b, same=same) for same in ("nothing", "storey")]
+        assert off(each[0].transform, MOVE.inverse(), middle_in_b())[0] < 0.2 and each[1].transform == each[0].transform
+        assert each[0].accepted and each[0].probability <= each[1].probability
+        believed.append(each[0].probability)
+    assert believed == sorted(believed)
+
+
+def test_a_corner_in_common_is_not_believed(points):
+    """The maps share one square metre."""
+    found = register(grid_of(part(points, high=(6, 6))), grid_of(part(points, (5, 5), (12, 14)), MOVE))
+    assert not found.accepted and found.posterior["here"] <= FEW
 
 
 def test_storeys_of_one_plan_are_told_apart_by_the_other_one():

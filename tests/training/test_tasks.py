@@ -23,6 +23,7 @@ from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
 from topomerge.extraction.room_odds import room_weights
 from topomerge.fusion.evidence.network import weights as place_weights
+from topomerge.fusion.match_belief import belief_weights
 from topomerge.fusion.verify import model
 from topomerge.io.weight_files import VARIABLE, weights_file
 from topomerge.matching.odds import odds_weights
@@ -44,7 +45,7 @@ NETWORKS = {
     "room_matcher": ["epochs=2", "steps=2", "batch=2", "width=8", "layers=1"],
 }
 WITHOUT_MORE = {"merge_belief": ["lookalikes=none", "floor=0"]}  # data that takes minutes to make
-FITS = ("merge_belief", "room_odds", "match_odds", "feature_scale", "wall_doors")
+FITS = ("merge_belief", "room_odds", "match_odds", "match_belief", "feature_scale", "wall_doors")
 
 
 def quiet(text: str) -> None:
@@ -67,6 +68,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         ("merge_belief", "belief_rows", tiny.belief_rows),
         ("room_odds", "room_scans", tiny.room_scans),
         ("match_odds", "pair_evidence", tiny.evidence),
+        ("match_belief", "match_rows", tiny.match_rows),
         ("feature_scale", "pair_features", tiny.feature_pairs),
     ):
         monkeypatch.setattr(importlib.import_module(f"topomerge.training.{task}"), name, make)
@@ -97,6 +99,7 @@ def read(task: str) -> Any:
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "room_odds": lambda: np.array(room_weights()["entered"]),
         "match_odds": lambda: odds_weights("match"),
+        "match_belief": lambda: belief_weights("attention"),
         "feature_scale": lambda: scaled(np.ones((2, 18)), "matched"),
     }[task]()
 
@@ -158,6 +161,8 @@ def test_fits_learn_what_is_so(words) -> None:
     assert train(settings_of(words("merge_belief")), quiet)["val/right_first"] > 0.6
     odds = train(settings_of(words("match_odds")), quiet)
     assert odds["val/match_accuracy"] > 0.7 and odds["val/hypothesis_accuracy"] > 0.7
+    belief = train(settings_of(words("match_belief")), quiet)
+    assert belief["val/attention_all_after_accuracy"] > 0.9 > 0.7 > belief["val/attention_all_before_accuracy"]
     assert train(settings_of(words("feature_scale")), quiet)["val/recall@1"] > 0.9
     assert train(settings_of(words("door_classification", "epochs=8", "rate=0.02")), quiet)["val/auc"] > 0.9
 
@@ -219,6 +224,7 @@ SIMULATED = {
     "place_evidence": [*NETWORKS["place_evidence"], *SMALL_GRIDS],
     "merge_belief": [*SMALL_GRIDS, *WITHOUT_MORE["merge_belief"], "folds=2"],
     "match_odds": [*SMALL_PAIRS, "folds=2"],
+    "match_belief": [*SMALL_PAIRS, "folds=2"],
     "feature_scale": SMALL_PAIRS,
 }  # fmt: skip
 

@@ -28,6 +28,7 @@ def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert weights.main([f"runs={tmp_path}"]) == 0 and made[7:] == [
         "match_odds",
         "place_evidence",
+        "match_belief",
         "merge_belief",
         "embedding",
         "room_matcher",

@@ -20,9 +20,11 @@ from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.room_features import POSE_FEATURES, ROOM_FEATURES
 from topomerge.fusion.evidence.crops import LOOKED, SIDE
+from topomerge.fusion.match_belief import BELIEVED_METHODS
 from topomerge.io import archive
 from topomerge.matching.odds import hypothesis_features
 from topomerge.training.feature_scale import PairFeatures
+from topomerge.training.match_belief import MatchRows
 from topomerge.training.match_odds import Evidence
 from topomerge.training.packed import GraphPair
 from topomerge.training.room_matcher import Example, View
@@ -168,6 +170,16 @@ def evidence(*_: Any) -> list[Evidence]:
         rooms = np.column_stack([np.ones(8), one + rng.random(8), rng.random(8), np.zeros(8), np.zeros(8)])
         pairs.append(Evidence(f"b{k}", hypothesis_features(metres), right, rooms, one))
     return pairs
+
+
+def match_rows(*_: Any) -> list[MatchRows]:
+    """Matches that are as sure in each pair, and right in those whose places speak for it."""
+    rng, rows = np.random.default_rng(0), []
+    for k in range(12):
+        sure, right = rng.random(6), np.full(6, k % 2 > 0)
+        x = np.column_stack([np.ones(6), np.log(sure / (1 - sure)), np.full(6, 9.0 if k % 2 else -9.0), rng.random(6)])
+        rows.append(MatchRows(f"b{k}", k % 2 > 0, *(dict.fromkeys(BELIEVED_METHODS, v) for v in (x, sure, right))))
+    return rows
 
 
 def room_scans(*_: Any) -> list[dict[str, Any]]:

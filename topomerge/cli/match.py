@@ -12,6 +12,7 @@ from topomerge.cli.options import CLOUD_OPTIONS, CONTEXT_STEPS, DESCRIPTOR, json
 
 def match_command(args: argparse.Namespace) -> int:
     """`topomerge match`: print the matches of rooms with their probabilities, as tables or as JSON."""
+    from topomerge.fusion.match_belief import believed_matches
     from topomerge.io.listing import json_text
     from topomerge.matching.listing import matching_to_json, matching_to_text
     from topomerge.matching.match import check, match
@@ -22,6 +23,7 @@ def match_command(args: argparse.Namespace) -> int:
     alone = [path for path, topomap in ((args.a, a), (args.b, b)) if len(topomap.rooms) == 1]
     warn(f"{path}: has one room: only its shape and doors can be compared" for path in alone)
     matching = match(a, b, args.descriptor, args.method, k=args.k, scale_free=args.scale_of_b == "free")
+    matching = believed_matches(matching, a, b, args.method)
     sys.stdout.write(json_text(matching_to_json(matching, a, b)) if args.json else matching_to_text(matching, a, b) + "\n")
     return 0
 

@@ -24,6 +24,7 @@ from topomerge.evaluation.settings import Evaluation, Variant, variants
 from topomerge.fusion.merge import merge
 from topomerge.fusion.registration import Registration, register
 from topomerge.fusion.result import RoomMatch
+from topomerge.fusion.match_belief import believed_matches
 from topomerge.fusion.verify import model
 from topomerge.io import archive
 from topomerge.io.listing import plain
@@ -81,6 +82,7 @@ def matched(variant: Variant, method: str, maps: Maps, rows: tuple[Rows, Rows], 
     else:
         name, largest = ("assignment", np.inf) if method == "full" else (method, None)
         room_matches = match(*maps, given(maps, rows), name, scale_free=free, largest_cost=largest)
+        room_matches = believed_matches(room_matches, *maps, name)
         rooms, probability = room_matches.rooms, room_matches.probability
     return {"rooms": rooms.astype(np.int32), "probability": probability, "seconds": np.array(time.process_time() - began)}
 

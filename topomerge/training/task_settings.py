@@ -141,6 +141,22 @@ class MatchOdds(TaskSettings):
 
 
 @dataclass
+class MatchBelief(TaskSettings):
+    """Args:
+    pull: of all weights but the constant, to what matching says.
+    folds: of buildings, for the scores.
+    """
+
+    task: str = "match_belief"
+    name: str = "match_belief"
+    data: Recipe = field(default_factory=Recipe)
+    heldout: Recipe = field(default_factory=Recipe)
+    pull: float = 0.5
+    folds: int = 8
+    watch: str = "attention_all_after_accuracy"
+
+
+@dataclass
 class FeatureScale(TaskSettings):
     """Args:
     shrink: share of the features' own variances in the covariance of the differences: few rooms give a noisy one.

@@ -87,6 +87,7 @@ def test_an_item_of_a_cache_that_names_a_sealed_seed_is_refused() -> None:
         ("door_classification", "door_scans"),
         ("room_odds", "room_scans"),
         ("match_odds", "matching_train"),
+        ("match_belief", "matching_validation"),
         ("feature_scale", "matching_train"),
     ],
 )

@@ -73,6 +73,12 @@ def test_the_mean_and_the_worst_of_places_by_hand():
     assert (back.crops.parts == crops.parts[:, ::-1]).all() and (back.crops.middle[:, 0] == -1).all()
 
 
+def flipped(data: bytes) -> bytes:
+    """One byte in the middle, amid weights, changed."""
+    k = len(data) // 2
+    return data[:k] + bytes([data[k] ^ 0x55]) + data[k + 1 :]
+
+
 def test_a_file_that_is_no_network_is_refused(tmp_path):
     good = {name: values.astype(np.float16) for name, values in weights().items()}
     spoils = {
@@ -81,6 +87,8 @@ def test_a_file_that_is_no_network_is_refused(tmp_path):
         "nan": lambda p: archive.write({**good, "a.b": good["a.b"] * np.float16(np.nan)}, p),
         "shape": lambda p: archive.write({**good, "out.w": good["out.w"][1:]}, p),
         "text": lambda p: p.write_text("weights"),
+        "empty": lambda p: p.write_bytes(b""),
+        "flipped": lambda p: p.write_bytes(flipped(p.read_bytes())),
     }
     for name, spoil in spoils.items():
         path = tmp_path / f"{name}.npz"

@@ -1,0 +1,110 @@
+"""How likely matched rooms are one, with what both maps show of them: by hand, and on an office and a stranger."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.fusion.atlas.atlas_scenes import office_map, stranger
+from topomerge.cli.main import main as cli
+from topomerge.errors import InputError
+from topomerge.fusion.evidence.crops import LOOKED, SIDE, Crops
+from topomerge.fusion.evidence.places import Places
+from topomerge.fusion.match_belief import (
+    BELIEF_FILE,
+    BELIEF_NAMES,
+    BELIEVED_METHODS,
+    belief_features,
+    belief_weights,
+    believed_matches,
+    places_of,
+)
+from topomerge.fusion.verify import PLACE_AREA
+from topomerge.io.maps import save_map
+from topomerge.io.weight_files import VARIABLE
+from topomerge.matching.match import match
+from topomerge.matching.result import Matching
+from topomerge.types import Sim3
+
+
+@pytest.fixture(scope="module")
+def halves():
+    return office_map(0), office_map(2)
+
+
+@pytest.fixture(scope="module")
+def matching(halves):
+    return match(*halves, method="attention")
+
+
+def seen_at(middle, log_odds) -> Places:
+    """Places of 10 m2 each at middles (k, 3)."""
+    k = len(log_odds)
+    empty = np.zeros((k, 2, SIDE, SIDE), np.uint8)
+    looked = np.zeros((k, 2, LOOKED), np.float32)
+    return Places(
+        Crops(empty, empty, looked, np.array(middle, float).reshape(-1, 3), np.full(k, 10.0)), np.array(log_odds, float)
+    )
+
+
+def test_features_by_hand(halves):
+    """Two places: one in the middle of room 0, one far away."""
+    a = halves[0]
+    middle = [*(a.rooms["lo"][0] + a.rooms["hi"][0])[:2] / 2, a.storeys["floor"][0]]
+    pair = Matching(np.array([[0, 1]]), np.array([0.8]), Sim3())
+    x = belief_features(pair, a, seen_at([middle, [500.0, 0.0, 0.0]], [2.0, -1.0]))
+    assert x[0] == pytest.approx([1.0, np.log(4.0), 0.5 * np.log1p(20 / PLACE_AREA), 2.0])
+    above = belief_features(pair, a, seen_at([np.add(middle, (0, 0, 3.0))], [2.0]))
+    assert above[0, 3] == 0.0 and belief_features(pair, a, seen_at([], []))[0, 2:].tolist() == [0.0, 0.0]
+
+
+def test_the_probability_is_that_of_the_model(halves, matching):
+    believed = believed_matches(matching, *halves, "attention")
+    x = belief_features(matching, halves[0], places_of(matching, *halves))
+    assert believed.probability == pytest.approx(1 / (1 + np.exp(-x @ belief_weights("attention"))))
+    assert np.array_equal(believed.rooms, matching.rooms) and believed.alternatives == matching.alternatives
+
+
+def test_rooms_that_lie_right_are_believed_and_those_that_do_not_are_not(halves, matching):
+    """North lies right on west; east is laid 9 m off, as the rooms look alike; the third one is another building."""
+    west, east = halves
+    right, wrong, other = (
+        (m.probability, believed_matches(m, west, b, "attention").probability)
+        for m, b in ((match(west, b, method="attention"), b) for b in (office_map(3), east, stranger()))
+    )
+    assert np.median(right[1]) > np.median(right[0]) and (right[1] > 0.5).all()
+    assert (wrong[1] < wrong[0]).all() and np.median(wrong[1]) < 0.5 and (other[1] < 0.1).all()
+
+
+@pytest.mark.parametrize("method", BELIEVED_METHODS)
+def test_places_that_agree_never_lower_a_match(method):
+    assert (belief_weights(method)[1:] >= 0).all()
+
+
+def test_what_has_no_pose_or_no_cells_stays(halves, matching):
+    a, b = halves
+    empty = replace(a, grid=a.grid.with_cells(a.grid.cells[:0]), room=a.room[:0])
+    for given in (replace(matching, transform=None), Matching(transform=Sim3())):
+        assert believed_matches(given, a, b, "attention") is given
+    assert believed_matches(matching, empty, b, "attention") is matching
+    assert all(believed_matches(matching, a, b, method) is matching for method in ("growing", "consistent"))
+
+
+def test_the_command_prints_them(halves, matching, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for m, name in zip(halves, "ab", strict=True):
+        save_map(m, f"{name}.tmap")
+    assert cli(["match", "a.tmap", "b.tmap", "--method", "attention", "--json"]) == 0
+    printed = [m["probability"] for m in json.loads(capsys.readouterr().out)["matches"]]
+    assert printed == pytest.approx(believed_matches(matching, *halves, "attention").probability.tolist(), abs=1e-3)
+
+
+@pytest.mark.parametrize("spoiled", [{}, {"attention": [1.0]}, {"attention": [1.0, float("nan"), 0.0, 0.0]}])
+def test_damaged_weights_are_told(spoiled, tmp_path, monkeypatch):
+    (tmp_path / BELIEF_FILE).write_text(json.dumps(spoiled))
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    with pytest.raises(InputError, match=f"{BELIEF_FILE}: attention must be {len(BELIEF_NAMES)} numbers"):
+        belief_weights("attention")

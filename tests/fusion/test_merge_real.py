@@ -1,0 +1,27 @@
+"""What is stated of real maps never lowers a right pose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from topomerge.datasets.real import sources
+
+from topomerge.extraction.extract import extract
+from topomerge.fusion.registration import register
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("wanted", ["carmen/orebro-first-last", "utexas/gdc1-1s"])
+def test_a_stated_storey_never_lowers_a_right_pose_of_real_maps(data_dir: Path, wanted: str) -> None:
+    source, name = wanted.split("/")
+    pair = dict(sources.pair_makers(source, data_dir))[name]()
+    a, b = extract(pair.a), extract(pair.b)
+    each = [register(a, b, same=same) for same in ("nothing", "building", "storey")]
+    middle = b.grid.centroids().mean(axis=0)[None]
+    error = (each[0].transform.apply(middle) - pair.truth.apply(middle))[0, :2]
+    assert np.linalg.norm(error) < 1.0 and each[0].transform == each[1].transform == each[2].transform
+    believed = [found.probability for found in each]
+    assert believed == sorted(believed) and (not each[0].accepted or each[2].accepted)
+    assert all(sum(found.posterior.values()) == pytest.approx(1.0) for found in each)

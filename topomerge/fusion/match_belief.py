@@ -1,0 +1,81 @@
+"""How likely two rooms that `match` names are one, with what both maps show under the pose that it proposes.
+
+Logistic models of what matching says and of the network of places, fitted by ``train.py task=match_belief``; their weights stand
+in `match_belief.json`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from topomerge.errors import InputError
+from topomerge.fusion.evidence.places import MOST_ODDS, Places, places
+from topomerge.fusion.storey_plan import plans
+from topomerge.fusion.verify import PLACE_AREA
+from topomerge.io.weight_files import read_weights_json
+from topomerge.matching.plan_fields import PlanFields
+from topomerge.matching.result import Matching
+from topomerge.types import Array, TopometricMap
+
+BELIEF_FILE = "match_belief.json"
+BELIEVED_METHODS = ("attention",)  # that are told better so; walls decide for "consistent", whose odds are as good without
+BELIEF_NAMES = ("constant", "matching", "places", "room")
+SUREST = 1e-3  # probabilities of matching are that far from 0 and 1 at least
+ROOM_RIM = 1.5  # m around a room from which places speak for it, too: a tile is wider than most walls are apart
+SAME_FLOOR = 1.0  # m
+
+
+def believed_matches(matching: Matching, a: TopometricMap, b: TopometricMap, method: str) -> Matching:
+    """The same matches, with probabilities that the places of both maps have a say in.
+
+    Those of other methods than `BELIEVED_METHODS`, or without a pose, or of maps without cells, stay as they are.
+
+    Raises:
+        InputError: the weights are damaged.
+    """
+    if method not in BELIEVED_METHODS or matching.transform is None or not len(matching.rooms):
+        return matching
+    if not len(a.grid) or not len(b.grid):
+        return matching
+    x = belief_features(matching, a, places_of(matching, a, b))
+    return replace(matching, probability=1 / (1 + np.exp(-np.clip(x @ belief_weights(method), -50, 50))))
+
+
+def places_of(matching: Matching, a: TopometricMap, b: TopometricMap) -> Places:
+    """What both maps show of the same places under the pose of a matching that has one."""
+    assert matching.transform is not None
+    storeys = [[PlanFields(plan) for plan in plans(map)] for map in (a, b)]
+    return places(storeys[0], storeys[1], matching.transform)
+
+
+def belief_weights(method: str) -> Array:
+    """(4,) weights of `BELIEF_NAMES` for one of `BELIEVED_METHODS`.
+
+    Raises:
+        InputError: the file holds none of that length.
+    """
+    weights = np.array(read_weights_json("topomerge.fusion", BELIEF_FILE).get(method, ()), float)
+    if weights.shape != (len(BELIEF_NAMES),) or not np.isfinite(weights).all():
+        wanted = f"{method} must be {len(BELIEF_NAMES)} numbers"
+        raise InputError(f"{BELIEF_FILE}: {wanted}: run train.py task=match_belief export=package")
+    return weights
+
+
+def belief_features(matching: Matching, a: TopometricMap, seen: Places) -> Array:
+    """(M, 4) 1, log odds by matching, what all places say, and what those around the room of a say (mean log odds; 0 of none)."""
+    whole_features = seen.features
+    p = np.clip(matching.probability, SUREST, 1 - SUREST)
+    whole = np.full(len(p), whole_features["place_mean"] * np.log1p(whole_features["place_area"] / PLACE_AREA))
+    around = np.array([room_places(seen, a, room) for room in matching.rooms[:, 0].tolist()])
+    return np.stack([np.ones(len(p)), np.log(p / (1 - p)), whole, around], axis=1)
+
+
+def room_places(seen: Places, a: TopometricMap, room: int) -> float:
+    """Mean log odds of the places in and around a room of a, by the m2 that both maps saw of each; 0 of none."""
+    middle, row = seen.crops.middle, a.rooms[room]
+    near = ((middle[:, :2] > row["lo"][:2] - ROOM_RIM) & (middle[:, :2] < row["hi"][:2] + ROOM_RIM)).all(axis=1)
+    near &= np.abs(middle[:, 2] - a.storeys["floor"][row["storey"]]) < SAME_FLOOR
+    area = seen.crops.area[near]
+    return float(np.average(np.clip(seen.log_odds[near], -MOST_ODDS, MOST_ODDS), weights=area)) if len(area) else 0.0
