@@ -21,10 +21,10 @@ from topomerge.embedding.turns import Rows, aligned
 from topomerge.errors import InputError
 from topomerge.evaluation.describe import Inputs, Maps, described, trained
 from topomerge.evaluation.settings import Evaluation, Variant, variants
+from topomerge.fusion.match_belief import believed_matches
 from topomerge.fusion.merge import merge
 from topomerge.fusion.registration import Registration, register
 from topomerge.fusion.result import RoomMatch
-from topomerge.fusion.match_belief import believed_matches
 from topomerge.fusion.verify import model
 from topomerge.io import archive
 from topomerge.io.listing import plain

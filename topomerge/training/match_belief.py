@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
+
 from topomerge.datasets.core.derived import derive, read_derived
 from topomerge.datasets.pairs.evaluation_pair import load_evaluation_pair
 from topomerge.datasets.pairs.recipe import Recipe
-
 from topomerge.errors import InputError
 from topomerge.fusion.match_belief import BELIEF_NAMES, BELIEVED_METHODS, belief_features, places_of
 from topomerge.matching.match import match
