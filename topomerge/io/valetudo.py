@@ -57,7 +57,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     free, walls = np.pad(drawn.free, 1), np.pad(drawn.walls, 1)
     outline = ndimage.binary_dilation(free, np.ones((3, 3))) & ~free
     walled = float((outline & ndimage.binary_dilation(walls, np.ones((5, 5)))).sum() / max(outline.sum(), 1))
-    warnings = ()
+    warnings: tuple[str, ...] = ()
     if walled < WALLED:
         walls |= outline
         warnings = (f"{path}: draws walls along {walled:.0%} of its floor's outline; the outline was taken for walls",)
@@ -74,9 +74,8 @@ def robot_rooms(path: Path) -> RobotMap:
         InputError: it is no map of Valetudo, or one that can't be used.
     """
     about = _json(path)
-    cell = about.get("pixelSize")
-    layers = about.get("layers")
-    if not _number(cell) or not 0.5 <= cell <= 100 or not isinstance(layers, list):
+    cell, layers = _number(about.get("pixelSize")), about.get("layers")
+    if not 0.5 <= cell <= 100 or not isinstance(layers, list):
         raise InputError(f"{path}: has no layers, or no pixel size of 0.5 to 100 cm; save the map again")
     runs = [(layer.get("type"), _name(layer), _runs(path, layer)) for layer in layers if isinstance(layer, dict)]
     every = np.concatenate([np.zeros((0, 3), np.int64), *(r for _, _, r in runs)])
@@ -98,8 +97,9 @@ def robot_rooms(path: Path) -> RobotMap:
                 names.append(name)
                 rooms[mask] = len(names)
     free &= ~walls
-    turned = [np.flipud(a) for a in (walls, free, np.where(walls, 0, rooms))]
-    return RobotMap(*turned, tuple(names), cell / 100, np.array([low[0], -(low[1] + height)]) * cell / 100)
+    origin = np.array([low[0], -(low[1] + height)]) * cell / 100
+    rooms[walls] = 0
+    return RobotMap(np.flipud(walls), np.flipud(free), np.flipud(rooms), tuple(names), cell / 100, origin)
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -121,8 +121,9 @@ def _name(layer: dict[str, Any]) -> str:
     return str(about.get("name") or "")[:80] if isinstance(about, dict) else ""
 
 
-def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+def _number(value: object) -> float:
+    """The value, nan where it is no number."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else float("nan")
 
 
 def _runs(path: Path, layer: dict[str, Any]) -> Array:
