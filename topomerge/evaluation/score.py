@@ -215,7 +215,8 @@ def within(error: tuple[float, float, float], flat: bool, limits: tuple[float, f
 def merge_counts(pair: EvaluationPair, verdict: Mapping[str, Any], floors: Sequence[Array] = ()) -> Row:
     """Of a pair: `near`, `fine`: the best pose is right within 0.5 m and 5 degrees, 0.1 m and 1 degree; `merged`: believed and
     near; `false`: believed and not; `refused`: right but not believed; `mergeable`: the maps have something in common;
-    `every_room`: it puts every shared room within 0.1 m of its true place; `rooms_near`: so many of the `rooms_shared`;
+    `every_room`: it puts, not bent, every shared room within 0.1 m of its true place; `rooms_near`: so many of the
+    `rooms_shared`;
     `place`: where it puts the middle of what both saw, m, and its yaw, degrees.
 
     Args:

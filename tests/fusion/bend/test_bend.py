@@ -97,6 +97,16 @@ def test_drift_that_no_phone_has_is_not_explained(points, straight, bent_map):
     assert np.percentile(misfit(stiff, points), 90) > 0.1
 
 
+def test_the_pose_alone_lays_what_both_saw(points):
+    """What one of them saw alone follows its bending, but has no say in the pose (once .08 m off)."""
+    east = part(points, low=(14, -99))
+    a, b = prepare(grid_of(bowed(points, -240.0))), prepare(grid_of(bowed(east), MOVE))
+    bent = bend(a, b, MOVE.inverse(), drift=(PHONE, PHONE))
+    gap = (bent.transform.apply(MOVE.apply(bowed(east))) - bowed(east, -240.0))[:, :2]
+    assert np.ptp(gap[:, 0]) > 0.5
+    assert np.linalg.norm(gap.mean(axis=0)) < 0.03
+
+
 def test_relative_and_back_undo_each_other(points, straight, bent_map):
     both = bend(straight, bent_map, MOVE.inverse(), drift=(PHONE, PHONE))
     places = MOVE.apply(bowed(points))[::50]

@@ -42,6 +42,7 @@ class Alignment:
         self.pairs = [pair for i, j in pairs for pair in ((i, j), (j, i))]
         self.moves = [np.zeros((len(m.pieces), 4)) for m in maps]
         self.drift_shares = [np.ones(2) for _ in self.maps]  # of shift and turn
+        self.registered = [np.zeros(len(m.pieces)) for m in maps]  # weight of what was measured of each piece last
         self.misfit = np.zeros(2)  # sums of weights, and of weighted squared distances of walls, m2
         self.first = np.cumsum([0, *(len(m.pieces) for m in maps)])
 
@@ -161,18 +162,23 @@ class Alignment:
         pose = replace(turned, translation=(float(at[0]), float(at[1]), 0.0)) @ self.poses[k]
         self.poses[k] = replace(pose, translation=(*pose.translation[:2], self.poses[k].translation[2]))
 
-    def fold(self) -> None:
-        """Let the poses of the maps take over what their pieces have moved alike; the first map stays where it is."""
-        for k in range(len(self.maps)):
-            self._fold(k)
+    def fold(self, shared: bool = False) -> None:
+        """Let the poses of the maps take over what their pieces have moved alike; the first map stays where it is.
+
+        Args:
+            shared: take over what the pieces that were registered have moved alike, so that the poses by themselves lay on each
+                other what several maps saw.
+        """
+        for k, (map, weights) in enumerate(zip(self.maps, self.registered, strict=True)):
+            many = np.bincount(map.pieces.owner, minlength=len(map.pieces)).astype(float)
+            self._fold(k, many * weights if shared and weights.any() else many)
         back = self.poses[0].inverse()
         self.poses = [back @ pose for pose in self.poses]
 
-    def _fold(self, k: int) -> None:
-        pieces, moves = self.maps[k].pieces, self.moves[k]
+    def _fold(self, k: int, weights: Array) -> None:
+        pieces, moves, many = self.maps[k].pieces, self.moves[k], weights[:, None]
         if not len(pieces):
             return
-        many = np.bincount(pieces.owner, minlength=len(pieces))[:, None].astype(float)
         anchors = self.anchors(k)
         middle = (many * anchors).sum(axis=0) / many.sum()
         x, y = (anchors - middle).T
@@ -193,8 +199,11 @@ class Alignment:
         sigma = [_joint_sigma(p, d, self.poses[k].scale, self.scaled) for k, (p, d) in each]
         prior = [_prior(p, d, self.scaled and k > 0) for k, (p, d) in each]
         ends = [m.pieces.joints + n for m, n in zip(self.maps, self.first, strict=False)]
-        settled = settle(anchors, Joints(np.concatenate(ends), np.concatenate(sigma)), stacked(parts), np.concatenate(prior))
+        measured = stacked(parts)
+        settled = settle(anchors, Joints(np.concatenate(ends), np.concatenate(sigma)), measured, np.concatenate(prior))
         self.moves = np.split(settled.moves, self.first[1:-1])
+        weights = np.bincount(measured.piece, settled.weights, minlength=len(anchors))
+        self.registered = np.split(weights, self.first[1:-1])
         if estimated:
             self._estimate_drift(settled, np.repeat(np.arange(len(self.maps)), [len(e) for e in ends]))
         return settled

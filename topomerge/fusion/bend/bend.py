@@ -114,9 +114,11 @@ def bend(a: Prepared, b: Prepared, pose: Sim3, *, drift: tuple[Drift, Drift] | N
     for alignment, settled in _ever_stiffer((a, b), mended.poses, [(0, 1)], scaled, usual):
         if settled is None:
             return Bend(pose, (_rigid(a), _rigid(b)), reason=NO_WALLS_NEAR)
+        features = _features(alignment, settled)
+        alignment.fold(shared=True)
         bent = alignment.deformations(settled)
         if min(d.least_growth for d in bent) >= LEAST_GROWTH:
-            return Bend(alignment.poses[1], (bent[0], bent[1]), _features(alignment, settled))
+            return Bend(alignment.poses[1], (bent[0], bent[1]), features)
     return Bend(pose, (_rigid(a), _rigid(b)), reason=FOLDED)
 
 
@@ -145,6 +147,7 @@ def bend_together(
     for alignment, settled in _ever_stiffer([maps[name] for name in names], start, seen, scaled, usual):
         if settled is None:
             return dict(poses), {}, NO_WALLS_NEAR
+        alignment.fold(shared=True)
         bent = alignment.deformations(settled)
         if min(d.least_growth for d in bent) >= LEAST_GROWTH:
             moved = {name: first @ alignment.poses[place[name]] for name in names}
