@@ -13,7 +13,8 @@ from topomerge.datasets.plans.raster import NARROW_CONTACT, contacts, flood, out
 from topomerge.datasets.simulation.floor_truth import OUTSIDE_ROOMS, TRUTH_CELL, TRUTH_MARGIN, Truth, judged
 
 from topomerge.errors import InputError
-from topomerge.io.valetudo import robot_rooms
+from topomerge.io.json_map import what_is_in
+from topomerge.io.valetudo import is_robot_map, robot_rooms
 from topomerge.types import Array, TrueRoom
 
 SMALLEST_HOME_ROOM = 0.8  # m2
@@ -32,7 +33,10 @@ def home_truth(path: Path, points: Array) -> tuple[Truth, tuple[TrueRoom, ...]]:
     Raises:
         InputError: the robot tells fewer than two rooms apart.
     """
-    drawn = robot_rooms(path)
+    about = what_is_in(path)
+    if not is_robot_map(about):
+        raise InputError(f"{path}: is no map of Valetudo; give one that a robot drew")
+    drawn = robot_rooms(path, about)
     sizes = np.bincount(drawn.rooms.ravel())[1:] * drawn.resolution**2
     large = 1 + np.flatnonzero(sizes >= SMALLEST_HOME_ROOM)
     if len(large) < FEWEST_HOME_ROOMS:

@@ -144,11 +144,12 @@ def write_corpus(folder: Path) -> dict[str, Path]:
 
 
 def write_walks(folder: Path) -> dict[str, Path]:
-    """Bags of either version of ROS, a full OctoMap, recordings of depth cameras, a vacuum robot's map and an octree."""
+    """Bags of either version of ROS, a full OctoMap, recordings of depth cameras, a vacuum robot's map, a scene graph and an octree."""
     from tests.io.bags import walk_messages, write_bag
     from tests.io.octrees import room_tree, write_copc
     from tests.io.rgbd import camera_poses, write_sens
     from tests.io.rtabmap_bases import write_rtabmap
+    from tests.io.scene_graphs import write_scene_graph
     from tests.io.test_read_rtabmap import depth_nodes, scan_nodes
     from tests.io.test_read_valetudo import saved, two_rooms
     from tests.io.walks import room_walk
@@ -157,6 +158,7 @@ def write_walks(folder: Path) -> dict[str, Path]:
     nodes = [samples.full_node(0.4, 1)] * 15 + [samples.full_node(0.4, 7)] + [samples.full_node(odds, 0) for odds in (1, -1, 2)]
     found["full.ot"].write_bytes(samples.FULL_OCTOMAP_HEADER + b"".join(nodes))
     found["home.json"] = saved(folder, two_rooms())
+    found["scene.json"] = write_scene_graph(folder / "scene.json")
     found["cloud.copc.laz"] = write_copc(folder / "cloud.copc.laz", room_tree())
     found["room.sens"] = write_sens(folder / "room.sens", camera_poses())
     found["scans.db"] = write_rtabmap(folder / "scans.db", scan_nodes(room_walk()))

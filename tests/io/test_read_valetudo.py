@@ -59,13 +59,13 @@ def test_walls_and_floor_stand_where_the_robot_drew_them(tmp_path: Path) -> None
 def test_y_points_up_as_in_the_app(tmp_path: Path) -> None:
     about = two_rooms()
     about["layers"][2]["compressedPixels"] = run((LEFT[1], RIGHT[0]), ROWS[0])  # a way along the upper rim of the picture
-    drawn = robot_rooms(saved(tmp_path, about))
+    drawn = robot_rooms(tmp_path, about)
     middle = drawn.free[:, (LEFT[1] + 3) - (LEFT[0] - 1)]
     assert np.flatnonzero(middle).tolist() == [len(middle) - 2]
 
 
 def test_the_robots_own_rooms(tmp_path: Path) -> None:
-    drawn = robot_rooms(saved(tmp_path, two_rooms()))
+    drawn = robot_rooms(tmp_path, two_rooms())
     assert drawn.names == ("Bath", "") and drawn.resolution == 0.1
     assert np.bincount(drawn.rooms.ravel()).tolist()[1:] == [100, 100] and drawn.free.sum() >= 200
     assert not (drawn.walls & drawn.free).any()
@@ -98,8 +98,8 @@ def test_a_home_becomes_rooms(tmp_path: Path) -> None:
     [
         ("{", "damaged"),
         ("[" * 100_000, "damaged"),
-        ([1, 2], "is no map of Valetudo"),
-        ({"rooms": []}, "is no map of Valetudo"),
+        ([1, 2], "neither a map of Valetudo"),
+        ({"rooms": []}, "neither a map of Valetudo"),
         (two_rooms(pixelSize=0), "pixel size"),
         (two_rooms(pixelSize="5"), "pixel size"),
         (two_rooms(pixelSize=float("nan")), "pixel size"),

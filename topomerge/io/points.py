@@ -54,7 +54,7 @@ FORMATS = (
     Format("an OctoMap", "octomap", (".bt", ".ot")),
     Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc"),
     Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic")),
-    Format("a vacuum robot's map", "valetudo", (".json",), fixed=True),
+    Format("a map in JSON", "json_map", (".json",), fixed=True),
     Format("an RTAB-Map database", "rtabmap", (".db",)),
     Format("a ScanNet recording", "sens", (".sens",)),
     Format("a floor plan", "grid", (".yaml", ".yml", ".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"), fixed=True),

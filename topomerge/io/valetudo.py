@@ -8,8 +8,7 @@ Source: https://valetudo.cloud (map data format); `pixels` lists x, y, `compress
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array
 
 KIND = "a vacuum robot's map"
-LARGEST_DRAWING = 1 << 28  # bytes
 FREE_LAYERS = ("floor", "segment")
 WALLED = 0.3  # share of the floor's outline along which robots that draw walls have one: they have 0.5 to 1, the others under 0.1
 
@@ -49,11 +47,16 @@ class RobotMap:
     origin: Array
 
 
-def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
+def is_robot_map(about: object) -> bool:
+    """Is this a map of Valetudo?"""
+    return isinstance(about, dict) and about.get("__class") == "ValetudoMap"
+
+
+def pieces(path: Path, about: Mapping[str, Any], options: ReadOptions) -> Iterator[Piece]:
     """Floor points, then walls layer by layer, in metres."""
     if options.resolution is not None:
         raise InputError(f"{path}: states its own resolution; leave --resolution out")
-    drawn = robot_rooms(path)
+    drawn = robot_rooms(path, about)
     free, walls = np.pad(drawn.free, 1), np.pad(drawn.walls, 1)
     outline = ndimage.binary_dilation(free, np.ones((3, 3))) & ~free
     walled = float((outline & ndimage.binary_dilation(walls, np.ones((5, 5)))).sum() / max(outline.sum(), 1))
@@ -67,13 +70,16 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     yield from grid.extrude(path, np.flipud(walls), np.flipud(free), plan, options)
 
 
-def robot_rooms(path: Path) -> RobotMap:
+def robot_rooms(path: Path, about: Mapping[str, Any]) -> RobotMap:
     """The walls, the floor and the robot's own rooms.
 
+    Args:
+        path: of the file, for messages.
+        about: what is in it (`is_robot_map`).
+
     Raises:
-        InputError: it is no map of Valetudo, or one that can't be used.
+        InputError: the map can't be used.
     """
-    about = _json(path)
     cell, layers = _number(about.get("pixelSize")), about.get("layers")
     if not 0.5 <= cell <= 100 or not isinstance(layers, list):
         raise InputError(f"{path}: has no layers, or no pixel size of 0.5 to 100 cm; save the map again")
@@ -100,20 +106,6 @@ def robot_rooms(path: Path) -> RobotMap:
     origin = np.array([low[0], -(low[1] + height)]) * cell / 100
     rooms[walls] = 0
     return RobotMap(np.flipud(walls), np.flipud(free), np.flipud(rooms), tuple(names), cell / 100, origin)
-
-
-def _json(path: Path) -> dict[str, Any]:
-    if path.stat().st_size > LARGEST_DRAWING:
-        raise InputError(f"{path}: is too large for {KIND}; give the map itself")
-    try:
-        about = json.loads(path.read_bytes())
-    except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise damaged(path, KIND, error) from error
-    if not isinstance(about, dict) or about.get("__class") != "ValetudoMap":
-        raise InputError(
-            f"{path}: is no map of Valetudo, the only JSON that can be read; give the scan or the map that it tells of"
-        )
-    return about
 
 
 def _name(layer: dict[str, Any]) -> str:
