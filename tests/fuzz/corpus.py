@@ -144,7 +144,7 @@ def write_corpus(folder: Path) -> dict[str, Path]:
 
 
 def write_walks(folder: Path) -> dict[str, Path]:
-    """Bags of either version of ROS, a full OctoMap, recordings of depth cameras, a vacuum robot's map, a scene graph and an octree."""
+    """Bags of either version of ROS, a full OctoMap, recordings of depth cameras, maps in JSON and an octree."""
     from tests.io.bags import walk_messages, write_bag
     from tests.io.octrees import room_tree, write_copc
     from tests.io.rgbd import camera_poses, write_sens

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import topomerge as tm
-from tests.fusion.plans_of import MOVE, grid_of, office, off, part
+from tests.fusion.plans_of import MOVE, grid_of, off, office, part
 from tests.io.scene_graphs import box_mesh, scene_graph, write_scene_graph
 from topomerge.errors import InputError
 from topomerge.io import read_points
@@ -82,7 +82,10 @@ NOWHERE = np.where(np.arange(24).reshape(8, 3) == 4, np.nan, VERTICES)
         (scene_graph(VERTICES, FACES + 0.5), "a face of its mesh names a vertex that does not exist"),
         (scene_graph(VERTICES[:, :2], FACES), "points of its mesh are no rows of three numbers"),
         (scene_graph(VERTICES, FACES, points=[[1, 2, "x"]]), "points of its mesh are no rows of three numbers"),
-        (scene_graph(VERTICES) | {"mesh": {"points": VERTICES.tolist(), "faces": [[0, 1, 2], [1]]}}, "faces of its mesh are no rows of three numbers"),
+        (
+            scene_graph(VERTICES) | {"mesh": {"points": VERTICES.tolist(), "faces": [[0, 1, 2], [1]]}},
+            "faces of its mesh are no rows of three numbers",
+        ),
         (scene_graph(VERTICES, FACES, colors=[{"r": 1, "g": 2}], has_colors=True), "colors of its mesh are none"),
         (scene_graph(VERTICES, FACES, colors=[{"r": 1, "g": 2, "b": 3}], has_colors=True), "8 points and 1 colors"),
         (scene_graph(1e9 * VERTICES, FACES), "triangle of"),

@@ -41,6 +41,7 @@ def _export_options(args: argparse.Namespace, names: list[str]) -> dict[str, Any
     from topomerge.io.exports import FORMATS
 
     options = given(args, "origin", "storey")
+    frames = [name for text in given(args, "frames").values() for name in text.split(",")]
     for key in options:
         able = [name for name, form in FORMATS.items() if key in form.options]
         if not set(able) & set(names):
@@ -49,6 +50,13 @@ def _export_options(args: argparse.Namespace, names: list[str]) -> dict[str, Any
         from topomerge.io.exports.geojson import parse_origin
 
         options["origin"] = parse_origin(options["origin"])
+    if "tf2" in names:
+        from topomerge.io.exports.tf2 import frame_poses
+
+        path = Path(args.input)
+        options["transforms"] = frame_poses(path if path.is_dir() else path.parent, frames)
+    elif frames:
+        raise InputError(f"--frames: means nothing for {', '.join(names)}; it is for tf2")
     return options
 
 
@@ -97,7 +105,7 @@ EXPORT = Command(
             required=True,
             metavar="FORMAT[,FORMAT]",
             default=None,
-            help="graphml, geojson, indoorgml, dsg (Spark-DSG), ros (map_server grids, Nav2 routes), ply, las, ifc",
+            help="graphml, geojson, indoorgml, dsg (Spark-DSG), ros (grids, keepout, Nav2 routes), rviz, tf2, ply, las, ifc",
         ),
         option(
             "-o",
@@ -111,6 +119,7 @@ EXPORT = Command(
             metavar="LAT,LON[,HEADING]",
             help="geojson: where (0, 0) of the map lies, and how far its y axis is turned clockwise from north, degrees",
         ),
+        option("--frames", metavar="NAME,NAME", help="tf2: names of the maps' frames, in their order (default: their files')"),
         option("--storey", type=count, metavar="N", help="geojson, ros: only this storey"),
         quiet(),
     ),

@@ -1,4 +1,4 @@
-"""Maps in JSON: of vacuum robots (`valetudo.py`), and scene graphs with their mesh (`scene_graph.py`). What is in it tells which."""
+"""Maps in JSON: of vacuum robots (`valetudo.py`), scene graphs with their mesh (`scene_graph.py`). What is in it tells which."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from topomerge.io import scene_graph, valetudo
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import Piece, damaged
 
-LARGEST_JSON = 1 << 28  # bytes: the mesh of a floor of 3,000 m2 in faces of 10 cm
+LARGEST_MAP_JSON = 1 << 28  # bytes: the mesh of a floor of 3,000 m2 in faces of 10 cm
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -37,8 +37,8 @@ def what_is_in(path: Path) -> Any:
     Raises:
         InputError: it is none, or too large.
     """
-    if path.stat().st_size > LARGEST_JSON:
-        most = f"more than {LARGEST_JSON >> 20} MB, too many for a map in JSON"
+    if path.stat().st_size > LARGEST_MAP_JSON:
+        most = f"more than {LARGEST_MAP_JSON >> 20} MB, too many for a map in JSON"
         raise InputError(f"{path}: has {most}; give the scan that it was made of")
     try:
         return json.loads(path.read_bytes())

@@ -19,7 +19,7 @@ from topomerge.io.options import ReadOptions
 from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array
 
-KIND = "a scene graph"
+GRAPH_KIND = "a scene graph"
 
 
 def is_scene_graph(about: object) -> bool:
@@ -42,7 +42,7 @@ def pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> Iterat
     vertices = _table(path, mesh["points"], "points")
     faces = _table(path, mesh.get("faces") or np.zeros((0, 3)), "faces")
     if not np.isfinite(faces).all() or (faces != np.round(faces)).any():
-        raise damaged(path, KIND, "a face of its mesh names a vertex that does not exist")
+        raise damaged(path, GRAPH_KIND, "a face of its mesh names a vertex that does not exist")
     colors = _colors(path, mesh, len(vertices))
     yield Piece(vertices, colors, done=0.5)
     yield from sample(path, vertices, faces.astype(np.int64), options, colors)
@@ -53,9 +53,9 @@ def _table(path: Path, rows: Any, name: str) -> Array:
     try:
         table = np.array(rows, np.float64)
     except (TypeError, ValueError) as error:
-        raise damaged(path, KIND, f"{name} of its mesh are no rows of three numbers") from error
+        raise damaged(path, GRAPH_KIND, f"{name} of its mesh are no rows of three numbers") from error
     if table.ndim != 2 or table.shape[1] != 3:
-        raise damaged(path, KIND, f"{name} of its mesh are no rows of three numbers")
+        raise damaged(path, GRAPH_KIND, f"{name} of its mesh are no rows of three numbers")
     return table
 
 
@@ -67,7 +67,7 @@ def _colors(path: Path, mesh: Mapping[str, Any], many: int) -> Array | None:
     try:
         table = np.array([[c["r"], c["g"], c["b"]] for c in listed], np.float64)
     except (KeyError, TypeError, ValueError) as error:
-        raise damaged(path, KIND, "colors of its mesh are none") from error
+        raise damaged(path, GRAPH_KIND, "colors of its mesh are none") from error
     if table.shape != (many, 3):
-        raise damaged(path, KIND, f"its mesh has {many:,} points and {len(table):,} colors")
+        raise damaged(path, GRAPH_KIND, f"its mesh has {many:,} points and {len(table):,} colors")
     return np.nan_to_num(table).clip(0, 255).astype(np.uint8)

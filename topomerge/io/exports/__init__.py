@@ -37,6 +37,8 @@ FORMATS = {
     "indoorgml": Format((".gml", ".indoorgml", ".xml"), "indoorgml"),
     "dsg": Format((".dsg.json", ".json"), "dsg"),
     "ros": Format((), "ros", folder=True, options=("storey",)),
+    "rviz": Format((".mcap",), "rviz", needs=("rosbags", "ros")),
+    "tf2": Format((".launch.xml", ".xml"), "tf2", options=("transforms",)),
     "ply": Format((".ply",), "ply"),
     "las": Format((".las", ".laz"), "las", needs=("laspy", "las")),
     "ifc": Format((".ifc",), "ifc", needs=("ifcopenshell", "ifc")),
@@ -90,9 +92,10 @@ def save_export(map: TopometricMap, name: str, path: str | Path, **options: Any)
 
     Args:
         map: any map.
-        name: graphml, geojson, indoorgml, dsg, ros, ply, las or ifc.
+        name: graphml, geojson, indoorgml, dsg, ros, rviz, tf2, ply, las or ifc.
         path: the file; for ros the folder, which is made.
-        options: `storey` (geojson, ros) a number; `origin` (geojson) "latitude,longitude" or "latitude,longitude,heading".
+        options: `storey` (geojson, ros) a number; `origin` (geojson) "latitude,longitude" or "latitude,longitude,heading";
+            `transforms` (tf2) as `topomerge.io.exports.tf2.frame_poses` gives them.
 
     Returns:
         The files that were written.

@@ -1,12 +1,13 @@
-"""For robots: a map_server grid of each storey (image and yaml) and a route graph for Nav2.
+"""For robots: a map_server grid of each storey (image and yaml), where not to go, and a route graph for Nav2.
 
 In the image 254 is free, 0 occupied and 205 unknown. Sources: http://wiki.ros.org/map_server; the graphs that nav2_route's
-GeoJsonGraphFileLoader reads.
+GeoJsonGraphFileLoader reads; the masks of nav2_costmap_2d's KeepoutFilter.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -18,11 +19,13 @@ from topomerge.io.exports.occupancy import Occupancy, storey_occupancy
 from topomerge.io.exports.route import Route, storey_route
 from topomerge.types import TopometricMap
 
+LIKELY_OUTSIDE = 0.5  # probability from which a room is kept out of
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 
 
 def files(map: TopometricMap, folder: Path, stem: str, storey: int | None = None) -> list[tuple[Path, partial[None]]]:
-    """What stands in the folder: for each storey `storey_0.pgm` and `.yaml`, and `storey_0_route.geojson` where there are routes.
+    """What stands in the folder: for each storey `storey_0.pgm` and `.yaml`, `storey_0_keepout.pgm` and `.yaml` where floor is
+    probably outside, and `storey_0_route.geojson` where there are routes.
 
     Numbers of nodes and edges are unique over all storeys. Where stairs begin or end, a node says in its metadata to which room
     of which storey they lead.
@@ -43,11 +46,25 @@ def files(map: TopometricMap, folder: Path, stem: str, storey: int | None = None
         if storey not in (None, s):
             continue
         name = f"{stem}storey_{s}"
-        outputs.append((folder / f"{name}.pgm", partial(_save_image, grid)))
-        outputs.append((folder / f"{name}.yaml", partial(_save_yaml, grid, f"{name}.pgm")))
+        outputs += _images(folder, name, grid)
+        keepout = _keepout(map, grid)
+        if keepout.occupied.any():
+            outputs += _images(folder, f"{name}_keepout", keepout)
         if route.edges:
             outputs.append((folder / f"{name}_route.geojson", partial(_save_route, route, name)))
     return outputs
+
+
+def _images(folder: Path, name: str, grid: Occupancy) -> list[tuple[Path, partial[None]]]:
+    """A grid's image and what says where it lies."""
+    image = f"{name}.pgm"
+    return [(folder / image, partial(_save_image, grid)), (folder / f"{name}.yaml", partial(_save_yaml, grid, image))]
+
+
+def _keepout(map: TopometricMap, grid: Occupancy) -> Occupancy:
+    """Occupied: the floor of rooms that are probably outside; everything else is free."""
+    outside = np.append(map.rooms["outside"] >= LIKELY_OUTSIDE, False)[grid.room]  # room -1: the last one
+    return replace(grid, free=~outside, occupied=outside)
 
 
 def _save_image(grid: Occupancy, path: Path) -> None:

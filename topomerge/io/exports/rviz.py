@@ -1,0 +1,157 @@
+"""A map as markers for RViz: a bag of ROS 2 (MCAP) with an array of markers for each kind of thing, latched.
+
+``ros2 bag play map.mcap`` with RViz' fixed frame `map`; Foxglove opens the file as it is. Topics: `/topomerge/rooms` (floor as
+flat cells in the room's colour), `/topomerge/names`, `/topomerge/doors` (from jamb to jamb; shut ones red), `/topomerge/graph`
+(from the middle of each room to its doors). Namespaces are storeys, so that RViz can hide one.
+Sources: visualization_msgs/Marker; the names of QoS in rosbag2.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topomerge.io.atomic import replacing
+from topomerge.io.palette import room_colours
+from topomerge.structure.floors import floor_polygons, inside, jambs
+from topomerge.types import Array, TopometricMap
+
+FRAME = "map"
+BAG_VERSION = 8  # of rosbag2's metadata: Iron and later, read by Humble
+TOLD_AT = 10**9  # ns, when all is told
+CELL_HEIGHT = 0.02  # m, height of a cell of a floor
+LETTERS = 0.4  # m
+LINE = 0.06  # m
+ABOVE_FLOOR = 0.05  # m above the floor, so that lines are not hidden by it
+SOLID = 0.8
+SHUT, OPEN, WAY, WHITE = (200, 40, 40), (40, 140, 60), (90, 90, 90), (255, 255, 255)
+ARRAY, MARKER = "visualization_msgs/msg/MarkerArray", "visualization_msgs/msg/Marker"
+
+
+def save(map: TopometricMap, path: Path) -> None:
+    """Write the bag. The same map gives the same bytes.
+
+    Raises:
+        InputError: the path can't be written.
+    """
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    markers = _Markers()
+    with tempfile.TemporaryDirectory() as made:
+        with Writer(Path(made) / "bag", version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
+            for topic, listed in _topics(map, markers):
+                to = bag.add_connection(f"/topomerge/{topic}", ARRAY, typestore=markers.store, offered_qos_profiles=[_latched()])
+                bag.write(to, TOLD_AT, markers.store.serialize_cdr(markers.array(listed), ARRAY))
+        (file,) = (Path(made) / "bag").glob("*.mcap")
+        with replacing(path) as beside:
+            beside.write_bytes(file.read_bytes())
+
+
+def _topics(map: TopometricMap, markers: _Markers) -> Iterator[tuple[str, list[Any]]]:
+    colours, floors = room_colours(map), floor_polygons(map)
+    middles = np.array(
+        [[*inside(f, r["centroid"]), r["centroid"][2] + ABOVE_FLOOR] for f, r in zip(floors, map.rooms, strict=True)]
+    )
+    storeys = map.rooms["storey"].tolist()
+    points, size = map.navigable.centroids(), map.navigable.edge
+    flat = (size, size, CELL_HEIGHT)
+    of_rooms = [(s, r) for r, s in enumerate(storeys)]
+    yield "rooms", [markers.one("CUBE_LIST", at, points[map.navigable_room == at[1]], colours[at[1]], flat) for at in of_rooms]
+    label = partial(markers.one, "TEXT_VIEW_FACING", points=np.zeros((0, 3)), colour=WHITE, scale=(0, 0, LETTERS))
+    yield "names", [label(at, text=str(at[1]), middle=middles[at[1]]) for at in of_rooms]
+    doors, ways = [], []
+    for k, edge in enumerate(map.edges):
+        a, b = edge["rooms"].tolist()
+        at, centre = (storeys[a], k), edge["centre"] + (0, 0, ABOVE_FLOOR)
+        colour = OPEN if edge["open"] else SHUT
+        doors.append(markers.one("LINE_LIST", at, jambs(edge) + (0, 0, ABOVE_FLOOR), colour, (2 * LINE, 0, 0)))
+        ends = np.array([middles[a], centre, centre, middles[b]])
+        ways.append(markers.one("LINE_LIST", at, ends, WAY, (LINE, 0, 0)))
+    yield "doors", doors
+    yield "graph", ways
+
+
+def _latched() -> Any:
+    """Reliable and transient local: who comes late gets the newest message, as of a latched topic."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    never = QosTime(9223372036, 854775807)
+    newest = QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL
+    return Qos(*newest, never, never, QosLiveliness.AUTOMATIC, never, False)
+
+
+class _Markers:
+    """Makes messages of ROS 2."""
+
+    @cached_property
+    def store(self) -> Any:
+        """The types of messages."""
+        from rosbags.typesys import Stores, get_typestore
+
+        return get_typestore(Stores.ROS2_HUMBLE)
+
+    def array(self, markers: list[Any]) -> Any:
+        """A MarkerArray."""
+        return self._of(ARRAY, markers=markers)
+
+    def one(
+        self,
+        kind: str,
+        at: tuple[int, int],
+        points: Array,
+        colour: Any,
+        scale: Sequence[float],
+        text: str = "",
+        middle: Any = None,
+    ) -> Any:
+        """A marker.
+
+        Args:
+            kind: CUBE_LIST, LINE_LIST or TEXT_VIEW_FACING.
+            at: storey, and a number that no other one of its topic has.
+            points: (n, 3) m.
+            colour: (3,) 0..255.
+            scale: m; what it means depends on the kind.
+            middle: (3,) m, of a text.
+        """
+        red, green, blue = (float(c) / 255 for c in colour)
+        x, y, z = (0.0, 0.0, 0.0) if middle is None else (float(v) for v in middle)
+        still = self._of("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+        none = np.zeros(0, np.uint8)
+        picture = self._of("sensor_msgs/msg/CompressedImage", header=self._header(""), format="", data=none)
+        return self._of(
+            MARKER,
+            header=self._header(FRAME),
+            ns=f"storey_{at[0]}",
+            id=at[1],
+            type=getattr(self.store.types[MARKER], kind),
+            action=0,
+            pose=self._of("geometry_msgs/msg/Pose", position=self._point("Point", x, y, z), orientation=still),
+            scale=self._point("Vector3", *scale),
+            color=self._of("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=SOLID),
+            lifetime=self._of("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+            frame_locked=False,
+            points=[self._point("Point", *p) for p in points.tolist()],
+            colors=[],
+            texture_resource="",
+            texture=picture,
+            uv_coordinates=[],
+            text=text,
+            mesh_resource="",
+            mesh_file=self._of("visualization_msgs/msg/MeshFile", filename="", data=none),
+            mesh_use_embedded_materials=False,
+        )
+
+    def _header(self, frame: str) -> Any:
+        return self._of("std_msgs/msg/Header", stamp=self._of("builtin_interfaces/msg/Time", sec=0, nanosec=0), frame_id=frame)
+
+    def _point(self, kind: str, x: float, y: float, z: float) -> Any:
+        return self._of(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
+
+    def _of(self, kind: str, **values: Any) -> Any:
+        return self.store.types[kind](**values)

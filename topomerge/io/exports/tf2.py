@@ -1,0 +1,105 @@
+"""Where the maps of a merge or an atlas lie, for ROS 2: a launch file that publishes their frames by tf2's static transforms.
+
+``ros2 launch merged.launch.xml``. The frame of a map is that of its file; the parent is the first map's. A bent merge has more to
+say than one transform: this one lays what both maps saw on each other. Source: the arguments of static_transform_publisher.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+from topomerge.types import Sim3, TopometricMap
+
+LISTINGS = ("merge.json", "atlas.json")
+SAME_SCALE = 1e-6
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """The pose of a map's frame in that of another one: it takes points of the child into the parent."""
+
+    parent: str
+    child: str
+    pose: Sim3
+
+
+def save(map: TopometricMap, path: Path, transforms: Sequence[FramePose] = ()) -> None:
+    """Write a launch file in XML.
+
+    Raises:
+        InputError: there are no transforms, or one scales.
+    """
+    if not transforms:
+        raise InputError("tf2: needs to know where maps lie; give the folder of a merge or an atlas that brought some together")
+    nodes = [_node(k, transform) for k, transform in enumerate(transforms)]
+    with replacing(path) as beside:
+        beside.write_text("\n".join(["<launch>", *nodes, "</launch>"]) + "\n", encoding="utf-8")
+
+
+def _node(number: int, transform: FramePose) -> str:
+    pose = transform.pose
+    if abs(pose.scale - 1) > SAME_SCALE:
+        at = f"{transform.child} is {pose.scale:.4g} times as large in the frame of {transform.parent}"
+        raise InputError(f"tf2: {at}, and transforms of ROS can't scale; read it again with --scale {pose.scale:.6g}")
+    place = dict(zip(("x", "y", "z"), pose.translation, strict=True))
+    turn = {"qx": 0.0, "qy": 0.0, "qz": math.sin(pose.yaw / 2), "qw": math.cos(pose.yaw / 2)}
+    words = [f"--{name} {float(value)!r}" for name, value in {**place, **turn}.items()]
+    words += [f"--frame-id {transform.parent}", f"--child-frame-id {transform.child}"]
+    node = f'pkg="tf2_ros" exec="static_transform_publisher" name="map_frame_{number}"'
+    return f"  <node {node} args={quoteattr(' '.join(words))}/>"
+
+
+def frame_poses(folder: Path, names: Sequence[str] = ()) -> list[FramePose]:
+    """What the listing of a merge or an atlas says.
+
+    Args:
+        folder: that of the merge or the atlas.
+        names: of the frames of all its maps, in their order; without, the names of their files.
+
+    Raises:
+        InputError: it is no such folder, its listing is damaged, or there are not as many names as maps.
+    """
+    file = next((folder / name for name in LISTINGS if (folder / name).is_file()), None)
+    if file is None:
+        raise InputError(f"{folder}: is no folder of a merge or an atlas ({' or '.join(LISTINGS)} is missing); tf2 needs one")
+    try:
+        listing: Any = json.loads(file.read_text(encoding="utf-8"))
+        sources = [str(m.get("name") or m["source"]) for m in listing["maps"]]
+        frames = _frames(sources, names)
+        poses = sorted((int(k), int(t["into"]), _pose(t)) for k, t in listing["transforms"].items())
+        return [FramePose(frames[into], frames[k], pose) for k, into, pose in poses]
+    except InputError:
+        raise
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(f"{file}: damaged ({' '.join(str(error).split())[:100]}); merge the maps again") from error
+
+
+def _pose(entry: Mapping[str, Any]) -> Sim3:
+    """Of an entry of `transforms` (docs/outputs.md)."""
+    x, y, z = (float(row[3]) for row in entry["matrix"][:3])
+    return Sim3(math.radians(float(entry["yaw_deg"])), (x, y, z), float(entry["scale"]))
+
+
+def _frames(sources: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Names of frames, no two alike: letters, digits, `_` and `/`, as ROS has them."""
+    if names and len(names) != len(sources):
+        raise InputError(
+            f"--frames: gives {len(names)} names, but there are {len(sources)} maps; give one for each, in their order"
+        )
+    wrong = [name for name in names if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_/]*", name)]
+    if wrong or len(set(names)) < len(names):
+        what = f"{wrong[0]!r} is no name of a frame" if wrong else "two frames have one name"
+        raise InputError(f"--frames: {what}; take letters, digits and _, another one for each map")
+    if names:
+        return list(names)
+    plain = [re.sub(r"[^A-Za-z0-9_]", "_", Path(source).name.partition(".")[0]) for source in sources]
+    return plain if all(plain) and len(set(plain)) == len(plain) else [f"map_{k}" for k in range(len(sources))]
