@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, say, warn
-from topomerge.cli.options import ATLAS_OPTIONS, CLOUD_OPTIONS, atlas_choices, json_option, map_from, quiet
+from topomerge.cli.options import ATLAS_OPTIONS, CLOUD_OPTIONS, atlas_choices, count, json_option, map_from, quiet
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
     from topomerge.fusion.atlas.result import AtlasResult
+    from topomerge.fusion.atlas.workers import Workers
 
 
 ROOMS_SHOWN = 8  # pairs of rooms of a map that `find` prints
@@ -38,10 +39,19 @@ def _add(args: argparse.Namespace) -> int:
     if not args.items:
         raise InputError(f"{args.folder}: name the maps or clouds to add: topomerge atlas add {args.folder} MAP ...")
     check_folder(args.folder)
-    choices = atlas_choices(args)
+    choices, workers = atlas_choices(args), _workers(args)
     check_inputs(args.items)
     maps = [(Path(path).stem, replace(map_from(path, args), source=path)) for path in args.items]
-    return _report(add(args.folder, maps, atlas_html, **choices), args)
+    return _report(add(args.folder, maps, atlas_html, workers, **choices), args)
+
+
+def _workers(args: argparse.Namespace) -> Workers | None:
+    """Who registers pairs: None is this process."""
+    from topomerge.fusion.atlas.workers import cluster, processes
+
+    if args.cluster and args.jobs > 1:
+        raise InputError("--cluster and --jobs: give one of them; the workers of a cluster are its own")
+    return cluster(args.cluster) if args.cluster else processes(args.jobs) if args.jobs > 1 else None
 
 
 def _remove(args: argparse.Namespace) -> int:
@@ -127,6 +137,8 @@ ATLAS = Command(
         option("folder", metavar="DIR", help="the atlas"),
         option("items", nargs="*", metavar="MAP", help="of add, find: clouds or .tmap; of remove: names, as `list` prints them"),
         option("--first", type=int, default=5, metavar="N", help="of find: maps that are named (default 5)"),
+        option("--jobs", type=count, default=1, metavar="N", help="of add: register pairs in N processes (default 1)"),
+        option("--cluster", default="", metavar="ADDRESS", help="of add: register pairs on a Dask cluster, tcp://host:8786"),
         *ATLAS_OPTIONS,
         *CLOUD_OPTIONS,
         json_option("of list: print atlas.json; of find: the maps and rooms"),

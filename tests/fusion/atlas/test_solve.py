@@ -13,8 +13,8 @@ from topomerge.errors import InputError
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.memory import LOADED_AT_ONCE, map_key
 from topomerge.fusion.atlas.pairs import promise
+from topomerge.fusion.atlas.partners import partners_of
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.solve import partners_of
 from topomerge.fusion.pose_difference import pose_difference
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
@@ -143,7 +143,7 @@ def test_files_are_read_when_needed(maps, atlas, registrations, tmp_path):
 
 
 def test_of_many_maps_only_those_that_look_alike_are_registered(maps, atlas, registrations, monkeypatch):
-    monkeypatch.setattr("topomerge.fusion.atlas.solve.MOST_PARTNERS", 2)
+    monkeypatch.setattr("topomerge.fusion.atlas.partners.MOST_PARTNERS", 2)
     made = dict(registrations)
     result = tm.atlas(maps, registrations=made)
     assert result.components == atlas.components and right(result, {k: k for k in range(4)})

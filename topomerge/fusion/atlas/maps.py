@@ -52,6 +52,10 @@ class Maps:
     def __getitem__(self, k: int) -> TopometricMap:
         return self.memory.map(self.keys[k])
 
+    def file(self, k: int) -> Path | None:
+        """The file of a map; None of one in memory."""
+        return self.memory.file(self.keys[k])
+
     def prepared(self, k: int) -> Prepared:
         """Plans, for registration."""
         memory, key = self.memory, self.keys[k]

@@ -84,6 +84,11 @@ class Memory:
             return source
         return _recent(self._loaded, key, LOADED_AT_ONCE, lambda: load_map(source))
 
+    def file(self, key: str) -> Path | None:
+        """Where a map is loaded from; None of one that is given as it is."""
+        source = self._sources[key]
+        return None if isinstance(source, TopometricMap) else Path(source)
+
     def surface(self, key: str, make: Callable[[], Made]) -> Made:
         """The surface of a map, one of the last that were asked for or made now."""
         out: Made = _recent(self._surfaces, key, SURFACES_AT_ONCE, make)

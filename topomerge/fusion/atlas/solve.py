@@ -19,10 +19,11 @@ from topomerge.errors import InputError
 from topomerge.fusion.atlas.assembly import Assembler, Assembly, Link
 from topomerge.fusion.atlas.maps import Maps, bent_together
 from topomerge.fusion.atlas.memory import Facts, Memory
-from topomerge.fusion.atlas.neighbours import most_alike
-from topomerge.fusion.atlas.pairs import Checks, hypotheses, promise
+from topomerge.fusion.atlas.pairs import Checks, hypotheses
+from topomerge.fusion.atlas.partners import partners_of
 from topomerge.fusion.atlas.pose_graph import residual
 from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.atlas.workers import PairTask, Workers
 from topomerge.fusion.bend.bend import NEITHER_BENDS
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.inputs import check_cells, check_scale, check_units, link_threshold, without_rooms
@@ -32,7 +33,6 @@ from topomerge.types import Array, Sim3, TopometricMap
 
 SURE_LINK = 4.0  # log odds of a link, above which no further ones are looked for within its component
 ENOUGH_REGISTRATIONS = 3  # of a map, after which none within its component is made
-MOST_PARTNERS = 10  # maps that a map names to be searched in
 RegistrationsByPair = MutableMapping[tuple[str, str], tuple[PoseHypothesis, ...]]  # by the keys of both maps
 Proposed = Mapping[tuple[str, str], Sim3]  # T_ij by the keys of both maps, in any order
 
@@ -50,15 +50,17 @@ class AtlasSettings:
 
 @dataclass(frozen=True)
 class Pace:
-    """When an answer is wanted.
+    """When an answer is wanted, and who works on it.
 
     Args:
         seconds: after which no more pairs are registered; `AtlasResult.complete` says whether some are left.
         answered: is told how the maps lie before they are finely registered and bent.
+        workers: register the pairs of maps that are files; None: this process does.
     """
 
     seconds: float = np.inf
     answered: Callable[[AtlasResult], None] | None = None
+    workers: Workers | None = None
 
 
 def atlas(
@@ -124,7 +126,7 @@ def solve(
     ordered = Maps([maps[k] for k in order], settings.embedder, memory, [map_keys[k] for k in order])
     explorer = _Explorer(ordered, settings, threshold, {} if registrations is None else registrations, proposed or {})
     pace = pace or Pace()
-    assembly = explorer.explored(began + pace.seconds)
+    assembly = explorer.explored(began + pace.seconds, pace.workers)
     if pace.answered is not None:
         pace.answered(_result(assembly, explorer, names, order, rigid=True, fine=False))
     result = _result(assembly, explorer, names, order, settings.rigid)
@@ -177,7 +179,7 @@ class _Explorer:
     def __init__(
         self, maps: Maps, settings: AtlasSettings, threshold: float, registrations: RegistrationsByPair, proposed: Proposed
     ) -> None:
-        self.maps, self.scale, self.same = maps, settings.scale, settings.same
+        self.maps, self.scale, self.same, self.embedder = maps, settings.scale, settings.same, settings.embedder
         self.registrations, scaled = registrations, settings.scale == "free"
         self.proposed = {**proposed, **{(j, i): pose.inverse() for (i, j), pose in proposed.items()}}
         self.tried: dict[tuple[int, int], tuple[PoseHypothesis, ...]] = {}
@@ -187,7 +189,7 @@ class _Explorer:
         place = {key: k for k, key in enumerate(maps.keys)}
         self.partners = partners_of(maps, [(place[a], place[b]) for a, b in proposed if a in place and b in place])
 
-    def explored(self, end: float = np.inf) -> Assembly:
+    def explored(self, end: float = np.inf, workers: Workers | None = None) -> Assembly:
         """The assembly that more registrations would not change; after the end of the time that of those that were made."""
         while True:
             assembly = self.assembler.build()
@@ -196,7 +198,10 @@ class _Explorer:
             if not pairs:
                 self.complete = not any(self._next_pairs(assembly, counts))
                 return assembly
-            for i, j in sorted(pairs, key=lambda pair: (counts[list(pair)].min(), pair)):  # what nothing is known of comes first
+            in_turn = sorted(pairs, key=lambda pair: (counts[list(pair)].min(), pair))  # what nothing is known of comes first
+            if workers is not None and time.perf_counter() < end:
+                self._register_all(in_turn, workers)
+            for i, j in in_turn:
                 if self._is_registered(i, j) or time.perf_counter() < end:
                     self.tried[i, j] = self._registered(i, j)
 
@@ -219,29 +224,24 @@ class _Explorer:
     def _is_registered(self, i: int, j: int) -> bool:
         return (self.maps.keys[i], self.maps.keys[j]) in self.registrations
 
+    def _register_all(self, pairs: Sequence[tuple[int, int]], workers: Workers) -> None:
+        """Let workers register those pairs of files that were not yet."""
+        todo, tasks = [], []
+        for i, j in pairs:
+            files, keys = (self.maps.file(i), self.maps.file(j)), (self.maps.keys[i], self.maps.keys[j])
+            if not self._is_registered(i, j) and files[0] is not None and files[1] is not None:
+                proposed = (self.proposed[keys],) if keys in self.proposed else ()
+                tasks.append(PairTask((files[0], files[1]), self.embedder, self.scale, self.same, proposed))
+                todo.append(keys)
+        for number, ranked in workers(tasks) if tasks else ():
+            self.registrations[todo[number]] = ranked
+
     def _registered(self, i: int, j: int) -> tuple[PoseHypothesis, ...]:
         pair = (self.maps.keys[i], self.maps.keys[j])
         if pair not in self.registrations:
             tried = [self.proposed[pair]] if pair in self.proposed else []
             self.registrations[pair] = hypotheses(self.maps, i, j, self.scale, self.same, tried)
         return self.registrations[pair]
-
-
-def partners_of(maps: Maps, linked: Iterable[tuple[int, int]] = ()) -> list[list[int]]:
-    """For each map those that it may be searched in, most promising first: all others where they are few, else the ten that its
-    rooms look most like, those that name it and those that it is `linked` with. A map without rooms names the largest ones."""
-    count = len(maps)
-    if count <= MOST_PARTNERS + 1:
-        pairs = {(i, j) for j in range(count) for i in range(j)}
-    else:
-        by_area = sorted(range(count), key=lambda k: -maps.area(k))
-        named = enumerate(most_alike([maps.rows(k) for k in range(count)], MOST_PARTNERS))
-        pairs = {(min(k, m), max(k, m)) for k, of in named for m in of or [m for m in by_area if m != k][:MOST_PARTNERS]}
-    pairs |= {(min(pair), max(pair)) for pair in linked}
-    partners: list[dict[int, float]] = [{} for _ in range(count)]
-    for i, j in sorted(pairs):
-        partners[i][j] = partners[j][i] = promise(maps, i, j)
-    return [[m for _, m in sorted((-likely, m) for m, likely in of.items())] for of in partners]
 
 
 def _result(

@@ -29,10 +29,11 @@ from topomerge.fusion.atlas.assembly import Link
 from topomerge.fusion.atlas.folder import changing, link_or_copy
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.memory import Memory, map_key
-from topomerge.fusion.atlas.registration_cache import PAIRS_FILE, read_registrations, registrations_to_json
+from topomerge.fusion.atlas.registration_cache import PAIRS_FILE, Journal, registrations_to_json
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import AtlasSettings, Pace, Proposed, solve
 from topomerge.fusion.atlas.stored import ATLAS_FORMAT, Entry, Stored, check_folder, held_by, read_atlas
+from topomerge.fusion.atlas.workers import Workers
 from topomerge.fusion.result import transform_to_json
 from topomerge.io.listing import json_text, plain
 from topomerge.io.maps import load_map, save_map
@@ -62,13 +63,20 @@ class Change:
     seconds: float = float("inf")
 
 
-def add(folder: str | Path, maps: Sequence[tuple[str, TopometricMap]], report: Report, **settings: Any) -> AtlasResult:
+def add(
+    folder: str | Path,
+    maps: Sequence[tuple[str, TopometricMap]],
+    report: Report,
+    workers: Workers | None = None,
+    **settings: Any,
+) -> AtlasResult:
     """Add maps to an atlas; a new one where there is none. Waits for other processes that change it.
 
     Args:
         folder: of the atlas.
         maps: name, map; where a name is taken already, a number is put behind it.
         report: makes report.html (`topomerge.atlas_html`).
+        workers: register pairs in place of this process (`workers.processes`, `workers.cluster`).
         settings: ``scale``, ``threshold``, ``embedder`` of `atlas`; they stay those of the atlas.
 
     Raises:
@@ -88,7 +96,7 @@ def add(folder: str | Path, maps: Sequence[tuple[str, TopometricMap]], report: R
             new[entry.name] = m
         return Change(stored, new)
 
-    return change(folder, with_maps, report)
+    return change(folder, with_maps, report, workers=workers)
 
 
 def remove(folder: str | Path, names: Sequence[str], report: Report) -> AtlasResult:
@@ -130,6 +138,7 @@ def change(
     report: Report,
     memory: Memory | None = None,
     answered: Callable[[AtlasResult], None] | None = None,
+    workers: Workers | None = None,
 ) -> AtlasResult:
     """Put everything together and write it, all or nothing; what others changed before is in it.
 
@@ -137,7 +146,7 @@ def change(
         make: called with what the atlas holds when no other process can change it any more.
         report: as of `add`.
         memory: of what was made of its maps before.
-        answered: as of `solve.Pace`.
+        answered, workers: as of `solve.Pace`.
 
     Raises:
         InputError: what `make` says, or `atlas` of the maps; or the folder can't be written.
@@ -154,9 +163,9 @@ def change(
                 save_map(wanted.new[entry.name], place / entry.file)
         files = [place / e.file if e.name in wanted.new else folder / e.file for e in stored.entries]
         names, keys = [e.name for e in stored.entries], [e.key for e in stored.entries]
-        registrations = read_registrations(folder, stored.settings)
+        registrations = Journal(folder, stored.settings)
         choices, proposed = AtlasSettings(**stored.settings), {**before.lying(), **wanted.proposed}
-        atlas = solve(files, choices, registrations, names, keys, proposed, memory, Pace(wanted.seconds, answered))
+        atlas = solve(files, choices, registrations, names, keys, proposed, memory, Pace(wanted.seconds, answered, workers))
         atlas = atlas.in_frames({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
         joined, components = {}, []
         for n, members in enumerate(atlas.components):
@@ -174,6 +183,7 @@ def change(
         for name, text in (texts | dict(wanted.files)).items():
             _write(place / name, text)
         gone += sorted(set(before.files()) - set(replace(stored, listing=listing).files()))
+    registrations.end()
     return replace(atlas, maps=Maps([folder / e.file for e in stored.entries]))
 
 

@@ -1,0 +1,146 @@
+"""Pairs registered elsewhere: the same atlas as by one process; who dies is replaced, who is killed goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+import topomerge as tm
+from tests.fusion.atlas.atlas_scenes import NAMES, office_map
+from topomerge.errors import InputError
+from topomerge.fusion.atlas import workers
+from topomerge.fusion.atlas.registration_cache import JOURNAL_FILE, Journal
+from topomerge.fusion.atlas.store import add
+from topomerge.fusion.atlas.workers import Numbered, PairTask, register_pair
+from topomerge.matching.poses import PoseHypothesis
+
+PARTS = [(NAMES[k], office_map(k)) for k in range(3)]
+
+
+def listing_of(folder: Path) -> dict:
+    listing = json.loads((folder / "atlas.json").read_text(encoding="utf-8"))
+    return {key: value for key, value in listing.items() if key != "seconds"}
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory) -> Path:
+    """The atlas as one process makes it."""
+    folder = tmp_path_factory.mktemp("alone") / "house"
+    add(folder, PARTS, tm.atlas_html)
+    return folder
+
+
+def same_atlas(one: Path, other: Path) -> bool:
+    assert listing_of(one) == listing_of(other)
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in ("pairs.json", "merged_0.ply"))
+
+
+def backwards(tasks: Sequence[PairTask]) -> Iterator[Numbered]:
+    """A worker of this process that ends with the first task."""
+    for k in reversed(range(len(tasks))):
+        yield k, register_pair(tasks[k])
+
+
+def test_who_is_killed_goes_on_and_the_order_in_which_pairs_end_changes_nothing(alone, tmp_path):
+    asked: list[int] = []
+
+    def failing(tasks: Sequence[PairTask]) -> Iterator[Numbered]:
+        asked.append(len(tasks))
+        yield 0, register_pair(tasks[0])
+        raise KeyboardInterrupt
+
+    def going_on(tasks: Sequence[PairTask]) -> Iterator[Numbered]:
+        asked.append(len(tasks))
+        return backwards(tasks)
+
+    folder = tmp_path / "house"
+    with pytest.raises(KeyboardInterrupt):
+        add(folder, PARTS, tm.atlas_html, failing)
+    journal = folder / JOURNAL_FILE
+    assert len(journal.read_text().splitlines()) == 1 and not (folder / "atlas.json").exists()
+    journal.write_text(journal.read_text() + '{"stamp": "cut sh')  # as of a process that was killed while it wrote
+    add(folder, PARTS, tm.atlas_html, going_on)
+    assert asked[1] == asked[0] - 1 and same_atlas(alone, folder)
+    assert not journal.exists()
+
+
+def test_a_journal_is_heard_with_its_settings_only(tmp_path):
+    settings = {"scale": "fixed", "embedder": None, "same": "nothing"}
+    ranked = (PoseHypothesis(tm.Sim3(0.3, (1.0, 2.0, 0.0)), probability=0.7, features={"walls": 3.0}),)
+    Journal(tmp_path, settings)["a", "b"] = ranked
+    (again,) = Journal(tmp_path, settings)["a", "b"]
+    assert (again.transform, again.probability, again.features) == (ranked[0].transform, 0.7, {"walls": 3.0})
+    assert Journal(tmp_path, settings | {"same": "storey"}) == {}
+    (tmp_path / JOURNAL_FILE).write_text("no line of it\n[]\n{}\n")
+    assert Journal(tmp_path, settings) == {}
+    Journal(tmp_path, settings).end()
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_processes_give_the_same_atlas(alone, tmp_path):
+    add(tmp_path / "house", PARTS, tm.atlas_html, workers.processes(2))
+    assert same_atlas(alone, tmp_path / "house")
+
+
+@contextlib.contextmanager
+def dask(*words: str, folder: Path) -> Iterator[subprocess.Popen]:
+    """A scheduler or a worker."""
+    root = str(Path(__file__).parent.parent.parent.parent)
+    about = {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dask", *words], cwd=folder, env=about, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_atlas_though_a_worker_is_killed(alone, tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    words = ("--scheduler-file", str(file))
+    worker = ("worker", *words, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+    with dask("scheduler", *words, "--port", "0", "--no-dashboard", folder=tmp_path) as _:
+        while not file.exists():
+            time.sleep(0.2)
+        with dask(*worker, folder=tmp_path) as first, dask(*worker, folder=tmp_path):
+            address = json.loads(file.read_text())["address"]
+            with distributed.Client(address, set_as_default=False) as client:
+                client.wait_for_workers(2, timeout=60)
+            real = workers.cluster(address)
+
+            def killing(tasks: Sequence[PairTask]) -> Iterator[Numbered]:
+                for count, numbered in enumerate(real(tasks)):
+                    if count == 0:
+                        first.send_signal(signal.SIGKILL)
+                    yield numbered
+
+            add(tmp_path / "house", PARTS, tm.atlas_html, killing)
+            assert first.wait(10) == -signal.SIGKILL
+    assert same_atlas(alone, tmp_path / "house")
+
+
+def test_nobody_answers(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(workers, "CONNECTING", 0.5)
+    with pytest.raises(InputError, match=r"--cluster tcp://127\.0\.0\.1:9: no scheduler answers there"):
+        add(tmp_path / "house", PARTS, tm.atlas_html, workers.cluster("tcp://127.0.0.1:9"))
+
+
+def test_dask_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"needs Dask: pip install 'topomerge\[cluster\]'"):
+        workers.cluster("tcp://127.0.0.1:9")
