@@ -94,6 +94,15 @@ def test_copc_is_read_as_the_laz_that_it_is(tmp_path: Path) -> None:
         assert refusal_of(path).startswith(f"{path}: ") and refusal_of(path, spacing=0.5).startswith(f"{path}: ")
 
 
+def test_records_behind_the_points_are_not_needed(tmp_path: Path) -> None:
+    """A thousand million of them, or one of the largest number of bytes: the points are there."""
+    path = write_copc(tmp_path / "a.copc.laz", room_tree())
+    data = path.read_bytes()
+    for at, value in ((243, 2**32 - 1), (235, 2**63)):  # their number, their place
+        path.write_bytes(data[:at] + value.to_bytes(4 if at == 243 else 8, "little") + data[at + (4 if at == 243 else 8) :])
+        assert_same_points(read_points(path), room_tree())
+
+
 def test_bad_copc(tmp_path: Path) -> None:
     path = write_copc(tmp_path / "a.copc.laz", room_tree())
     data = path.read_bytes()

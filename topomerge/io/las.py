@@ -60,7 +60,8 @@ def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
     _check_head(path)
     done = 0
     # The parallel decoder believes the table of chunks and ends the process where a damaged one asks for too much memory.
-    with laspy.open(path, laz_backend=[laspy.LazBackend.Lazrs]) as reader:
+    # Records behind the points may be promised by the thousand million; nothing in them is needed.
+    with laspy.open(path, laz_backend=[laspy.LazBackend.Lazrs], read_evlrs=False) as reader:
         header = reader.header
         promised, size = header.point_count, header.point_format.size
         room = path.stat().st_size - header.offset_to_point_data
