@@ -87,7 +87,7 @@ def test_a_wrong_hypothesis_in_a_cycle_is_thrown_out_and_named(maps, registratio
     def ranked(inner: Maps, i: int, j: int) -> float:
         return 1e6 if {id(inner[i]), id(inner[j])} == first else promise(inner, i, j)
 
-    monkeypatch.setattr("topomerge.fusion.atlas.solve.promise", ranked)
+    monkeypatch.setattr("topomerge.fusion.atlas.partners.promise", ranked)
     result = tm.atlas(maps, registrations=poisoned(maps, registrations, 0, 3, SHIFTED, p))
     assert result.components == ((0, 1, 2, 3),) and right(result, {k: k for k in range(4)})
     assert [link.maps for link in result.rejected] == [(0, 3)] and result.rejected[0].hypothesis.probability == p

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from topomerge.structure.floors import floor_polygons, inside, jambs
 from topomerge.types import Array, TopometricMap
 
 FRAME = "map"
-BAG_VERSION = 8  # of rosbag2's metadata: Iron and later, read by Humble
+BAG_VERSION: Literal[8] = 8  # of rosbag2's metadata: Iron and later, read by Humble
 TOLD_AT = 10**9  # ns, when all is told
 CELL_HEIGHT = 0.02  # m, height of a cell of a floor
 LETTERS = 0.4  # m
