@@ -123,6 +123,8 @@ def bag_files(path: Path) -> list[Path]:
 
 def _readers(path: Path) -> list[Any]:
     files = bag_files(path)
+    if not files:
+        raise InputError(f"{path}: holds no bag (metadata.yaml is no regular file); copy the folder again")
     if len({p.suffix == ".bag" for p in files}) > 1:
         raise InputError(f"{path}: holds bags of ROS 1 and of ROS 2; give one of them")
     if files[0].suffix == ".bag":

@@ -83,12 +83,13 @@ def coarse_records(path: Path, octree: Octree, options: ReadOptions) -> Iterator
 
 def _nodes(path: Path, stream: IO[bytes], octree: Octree, deepest: int) -> Iterator[tuple[int, int, int]]:
     """Place, bytes and points of each node down to a level."""
-    whole = path.stat().st_size
+    whole = left = path.stat().st_size
     pages, seen = [(octree.place, octree.size)], {octree.place}
     while pages:
         place, size = pages.pop()
         if size > LARGEST_PAGE or size % ENTRY.size or place + size > whole:
             raise damaged(path, COPC_KIND, f"a page of {size:,} bytes at {place:,} of {whole:,}")
+        left -= size
         stream.seek(place)
         for level, _, _, _, start, length, count in list(ENTRY.iter_unpack(stream.read(size))):
             if not 0 <= level <= MOST_LEVELS or count < -1 or length < 0 or (count and start + length > whole):
@@ -97,6 +98,9 @@ def _nodes(path: Path, stream: IO[bytes], octree: Octree, deepest: int) -> Itera
                 raise InputError(f"{path}: has a node of {count:,} points, too many for one; read it without --spacing")
             if level > deepest or count == 0:
                 continue
+            left -= length if count > 0 else 0
+            if left < 0:  # pages and nodes that are named again and again are endless work
+                raise damaged(path, COPC_KIND, f"its pages and nodes have more than the {whole:,} bytes of the file")
             if count > 0:
                 yield start, length, count
             elif start in seen:

@@ -117,7 +117,8 @@ def depth_points(name: Path | str, depth: Array, camera: Camera) -> tuple[Array,
     step = max(1, round(min(camera.focal) * SPACING_AT_4_M / 4.0))
     rows, columns = np.nonzero(depth[::step, ::step] > 0)
     rows, columns = rows * step, columns * step
-    z = depth[rows, columns] / camera.metre
+    with np.errstate(over="ignore"):  # too far to be counted
+        z = depth[rows, columns] / camera.metre
     close = z <= FARTHEST
     rows, columns, z = rows[close], columns[close], z[close]
     x, y = ((v - c) / f * z for v, c, f in zip((columns, rows), camera.centre, camera.focal, strict=True))
@@ -154,8 +155,8 @@ def _colors(frame: Frame, points: Array, rows: Array, columns: Array, shape: tup
             return None
         return shown[rows * height // shape[0], columns * width // shape[1]]
     (fx, fy), (cx, cy) = frame.lens.focal, frame.lens.centre
-    u = np.rint(points[:, 0] / points[:, 2] * fx + cx).astype(np.int64).clip(0, width - 1)
-    v = np.rint(points[:, 1] / points[:, 2] * fy + cy).astype(np.int64).clip(0, height - 1)
+    u = np.rint(points[:, 0] / points[:, 2] * fx + cx).clip(0, width - 1).astype(np.int64)
+    v = np.rint(points[:, 1] / points[:, 2] * fy + cy).clip(0, height - 1).astype(np.int64)
     return shown[v, u]
 
 
@@ -187,6 +188,8 @@ def read_pixels(source: Path | bytes, name: Path | str) -> Array:
     """
     from PIL import Image
 
+    if not isinstance(source, bytes) and source.exists() and not source.is_file():  # nobody may write into a pipe
+        raise InputError(f"{name}: is no regular file (a folder, a pipe or a device); copy the image there")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # our own limit is stricter than the library's warning

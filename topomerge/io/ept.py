@@ -71,7 +71,7 @@ def _tiles(file: Path) -> Tiles:
         schema = {str(field["name"]).lower(): field for field in values["schema"]}
         layout = np.dtype([(name, f"<{NUMBER_KINDS[field['type']]}{int(field['size'])}") for name, field in schema.items()])
         scale, offset = (np.array([float(schema[a].get(n, d)) for a in "xyz"]) for n, d in (("scale", 1.0), ("offset", 0.0)))
-        spacing = float(bounds[1, 0] - bounds[0, 0]) / max(float(values.get("span", 128)), 1.0)
+        spacing = (float(bounds[1, 0]) - float(bounds[0, 0])) / max(float(values.get("span", 128)), 1.0)
         points = int(values.get("points", 0))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise damaged(file, EPT_KIND, f"its bounds or schema: {error}") from error
@@ -106,12 +106,18 @@ def _points(node: Path, tiles: Tiles, count: int, options: ReadOptions) -> Itera
         return
     check_node(node)
     room = min(count * tiles.layout.itemsize, LARGEST_NODE)
+    if tiles.suffix == "bin" and node.stat().st_size > room:
+        raise _too_long(node, count)
     data = _unpacked(node, room) if tiles.suffix == "zst" else node.read_bytes()
     if len(data) > room:
-        raise damaged(node, EPT_KIND, f"more than the {count:,} points that its hierarchy promises")
+        raise _too_long(node, count)
     rows = packed_rows(node, data, tiles.layout, count)
     xyz = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
     yield Piece(xyz * tiles.scale + tiles.offset, packed_colors(rows))
+
+
+def _too_long(node: Path, count: int) -> InputError:
+    return damaged(node, EPT_KIND, f"more than the {count:,} points that its hierarchy promises")
 
 
 def _unpacked(node: Path, room: int) -> bytes:

@@ -44,9 +44,10 @@ def load_json(path: Path, kind: str) -> dict[str, Any]:
 
 def deepest_level(root_spacing: float, options: ReadOptions) -> int:
     """The level whose points are as close as `options.spacing` asks for; levels halve the distance. Not asked for: all levels."""
-    if options.spacing is None or not (math.isfinite(root_spacing) and root_spacing > 0):
+    if options.spacing is None or not root_spacing > 0:
         return sys.maxsize
-    return max(0, math.ceil(math.log2(root_spacing * options.factor / options.spacing) - 1e-9))
+    ratio = root_spacing * options.factor / options.spacing
+    return max(0, math.ceil(math.log2(ratio) - 1e-9)) if 0 < ratio < math.inf else sys.maxsize
 
 
 def check_node(path: Path) -> None:

@@ -154,12 +154,14 @@ def format_of(path: Path) -> Format:
 def _folder_format(path: Path) -> Format:
     """What a folder holds: a ROS 2 bag or parts of a bag, an octree of files, RGB-D images, or scans."""
     bag = next(f for f in FORMATS if f.module == "bag")
-    names = [p.name for p in path.iterdir()]
+    names = [p.name for p in path.iterdir() if not p.name.startswith(".")]
     if "metadata.yaml" in names or any(n.endswith(bag.suffixes) for n in names):
         return bag
     octree = next((OCTREES[name] for name in OCTREES if name in names), None)
     if octree is not None:
         return octree
+    if {"metadata.json", "octree.bin"} <= set(names):
+        raise InputError(f"{path}: is a Potree 2 point cloud, which is not read; give the LAS or LAZ file that it was made of")
     if "depth.txt" in names:
         return RGBD_FOLDER
     from topomerge.io.rgbd_folders import layout_of

@@ -66,7 +66,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
 def _octree(file: Path) -> Octree:
     values = load_json(file, POTREE_KIND)
     version = str(values.get("version", "none"))
-    if not re.fullmatch(r"1\.\d+(\.\d+)?", version) or not VERSIONS[0] <= int(version.split(".")[1]) <= VERSIONS[1]:
+    if not re.fullmatch(r"1\.\d{1,3}(\.\d+)?", version) or not VERSIONS[0] <= int(version.split(".")[1]) <= VERSIONS[1]:
         able = " to ".join(f"1.{v}" for v in VERSIONS)
         raise InputError(f"{file}: is of version {version[:20]} of Potree, only {able} are read; convert the cloud again")
     try:
@@ -81,7 +81,8 @@ def _octree(file: Path) -> Octree:
         raise
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise damaged(file, POTREE_KIND, f"{type(error).__name__}: {error}") from error
-    edge = float((high - low).max())
+    with np.errstate(over="ignore", invalid="ignore"):  # what is too wide is refused below
+        edge = float((high - low).max())
     if not (np.isfinite([*low, *high, edge, scale]).all() and edge > 0 and scale > 0 and (listed or step > 0)):
         raise damaged(file, POTREE_KIND, "its bounding box, scale or hierarchyStepSize can't be used")
     if inside.is_absolute() or ".." in inside.parts:
@@ -115,6 +116,8 @@ def _layout(file: Path, attributes: Any) -> tuple[str, np.dtype[Any] | None]:
 def _nodes(octree: Octree, deepest: int) -> Iterator[tuple[str, int]]:
     """Name and number of points of each node; a file of the hierarchy is read when its turn comes."""
     if octree.listed:
+        if len(dict(octree.listed)) < len(octree.listed):
+            raise damaged(octree.folder, POTREE_KIND, "a node is listed twice")
         for name, count in octree.listed:
             if not NODE_NAME.fullmatch(name) or len(name) - 1 > MOST_LEVELS or count < 0:
                 raise damaged(octree.folder, POTREE_KIND, f"a node {name[:40]!r} with {count} points")

@@ -101,7 +101,7 @@ def _replica_camera(folder: Path) -> Camera:
         values: Any = json.loads(text)["camera"]
         fx, fy, cx, cy, metre, width, height = (float(values[k]) for k in ("fx", "fy", "cx", "cy", "scale", "w", "h"))
         return Camera((fx, fy), (cx, cy), metre, (int(height), int(width)), f"mend {file.name}")
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(f"{file}: does not say w h fx fy cx cy and scale of a camera ({error}); mend it") from error
 
 
@@ -176,9 +176,12 @@ def _arkit_trajectory(path: Path) -> Trajectory:
 
 def _arkit_time(file: Path) -> float:
     try:
-        return float(file.stem.rpartition("_")[2])
-    except ValueError as error:
-        raise InputError(f"{file}: has no time (s) at the end of its name; copy it again under its own") from error
+        time = float(file.stem.rpartition("_")[2])
+    except ValueError:
+        time = np.nan
+    if not np.isfinite(time):
+        raise InputError(f"{file}: has no time (s) at the end of its name; copy it again under its own")
+    return time
 
 
 def _pincam(path: Path) -> Camera:
@@ -235,7 +238,8 @@ def _text(path: Path) -> str:
 
 def _images(folder: Path, pattern: str) -> Iterator[tuple[Path, float]]:
     """The files of a pattern in the order of their numbers, with the share that is read after each."""
-    files = sorted(folder.glob(pattern), key=lambda p: ([int(n) for n in re.findall(r"\d+", p.stem)], p.name))
+    shown = (p for p in folder.glob(pattern) if not p.name.startswith("."))  # macOS leaves "._" files beside those that it copies
+    files = sorted(shown, key=lambda p: ([int(n) for n in re.findall(r"\d+", p.stem)], p.name))
     if not files:
         raise InputError(f"{folder}: holds no {pattern}; copy it again")
     for number, file in enumerate(files, 1):

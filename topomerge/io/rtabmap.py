@@ -70,8 +70,10 @@ def _version(path: Path, base: sqlite3.Connection) -> tuple[int, ...]:
     tables = dict(base.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     if any(not re.match(r"(?i)\s*CREATE\s+TABLE\s", str(tables.get(name, ""))) for name in BASE_TABLES):
         raise InputError(f"{path}: is no RTAB-Map database (it has no tables {', '.join(BASE_TABLES)}); check the file's name")
+    if any(re.search(r"(?i)\bAS\b", str(tables[name])) for name in BASE_TABLES):  # a few bytes would be gigabytes
+        raise InputError(f"{path}: has a table that computes its columns, which RTAB-Map never has; copy the database again")
     text = str((base.execute("SELECT version FROM Admin").fetchone() or ("none",))[0])
-    version = tuple(int(n) for n in re.findall(r"\d+", text)[:3])
+    version = tuple(int(n) for n in re.findall(r"\d{1,9}", text)[:3])
     if version < OLDEST or version[:2] > NEWEST:
         able = f"{'.'.join(map(str, OLDEST))} to {'.'.join(map(str, NEWEST))}"
         raise InputError(
@@ -88,6 +90,7 @@ def _poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said:
     """
     row = base.execute("SELECT opt_ids, opt_poses FROM Admin").fetchone() if version >= OPTIMISED_SINCE else None
     if row is not None and row[0] and row[1]:
+        blobs.check_bytes(f"{path}: the optimised poses", *row)
         ids = blobs.matrix(row[0], f"{path}: opt_ids").ravel()
         numbers = blobs.matrix(row[1], f"{path}: opt_poses").ravel()
         if len(numbers) != blobs.POSE_NUMBERS * len(ids) or ids.dtype != np.int32 or numbers.dtype != np.float32:
@@ -100,7 +103,9 @@ def _poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said:
             raise InputError(
                 f"{path}: holds {sessions:,} sessions and no optimised poses that join them; open it in RTAB-Map and save it"
             )
-        poses = {int(i): blobs.pose_of(blob) for i, blob in base.execute("SELECT id, pose FROM Node")}
+        rows = base.execute("SELECT id, pose FROM Node").fetchall()
+        blobs.check_bytes(f"{path}: the poses", *(blob for _, blob in rows))
+        poses = {int(i): blobs.pose_of(blob) for i, blob in rows}
         said.append("it has no optimised poses: those of the odometry are taken, which drift")
     for node, pose in poses.items():
         if pose is not None and len(no_rotations(pose[None])):
@@ -118,6 +123,7 @@ def _kind(path: Path, base: sqlite3.Connection, version: tuple[int, ...]) -> str
     """
     flat = False
     for node, info, blob in base.execute("SELECT id, scan_info, scan FROM Data WHERE LENGTH(scan) > 4 ORDER BY id LIMIT 1"):
+        blobs.check_bytes(f"{path}: node {node}", info, blob)
         form, _ = blobs.scan_format(info, version)
         channels = blobs.matrix(blob, f"{path}: the scan of node {node}").shape[2]
         flat = form in blobs.FLAT_SCANS or (form == 0 and channels in blobs.FLAT_CHANNELS)
@@ -137,6 +143,7 @@ def _scans(
     count, lost = base.execute("SELECT COUNT(*) FROM Data WHERE LENGTH(scan) > 4").fetchone()[0], 0
     rows = base.execute("SELECT id, scan_info, scan FROM Data WHERE LENGTH(scan) > 4 ORDER BY id")
     for number, (node, info, blob) in enumerate(rows, 1):
+        blobs.check_bytes(f"{path}: node {node}", info, blob)
         pose = poses.get(node)
         if pose is None:
             lost += 1
@@ -157,6 +164,7 @@ def _frames(path: Path, base: sqlite3.Connection, version: tuple[int, ...], pose
     count = base.execute("SELECT COUNT(*) FROM Data WHERE LENGTH(depth) > 4").fetchone()[0]
     rows = base.execute("SELECT id, calibration, depth, image FROM Data WHERE LENGTH(depth) > 4 ORDER BY id")
     for number, (node, calibration, blob, image) in enumerate(rows, 1):
+        blobs.check_bytes(f"{path}: node {node}", calibration, blob, image)
         pose = poses.get(node)
         if pose is None:
             yield None

@@ -46,6 +46,13 @@ class MountedCamera:
         return Camera((fx * share[1], fy * share[0]), (cx * share[1], cy * share[0]), metre)
 
 
+def check_bytes(what: str, *cells: object) -> None:
+    """Raise an InputError where a cell is neither empty nor bytes: text in the place of an image would be taken for a file's name."""
+    odd = next((cell for cell in cells if not isinstance(cell, bytes | None)), None)
+    if odd is not None:
+        raise InputError(f"{what} has text or a number where bytes belong ({type(odd).__name__}); it is damaged")
+
+
 def pose_of(blob: bytes | None) -> Array | None:
     """(4, 4) float64 of twelve floats; None where it is empty or RTAB-Map's null: all zero, or not finite."""
     if blob is None or len(blob) != 4 * POSE_NUMBERS:

@@ -89,19 +89,20 @@ def robot_rooms(path: Path, about: Mapping[str, Any]) -> RobotMap:
         raise InputError(f"{path}: shows neither floor nor walls; let the robot drive first")
     low = every[:, :2].min(axis=0)
     width, height = (np.maximum(every[:, 0] + every[:, 2], every[:, 0] + 1).max(), every[:, 1].max() + 1) - low
+    if int(every[:, 2].sum()) > grid.PIXELS:
+        raise damaged(path, KIND, f"its layers together have more than {grid.PIXELS:,} pixels")
     if width * height > grid.PIXELS:
         raise InputError(f"{path}: spans {width} by {height} pixels, more than {grid.PIXELS:,}; it is damaged")
     walls, free = np.zeros((height, width), bool), np.zeros((height, width), bool)
     rooms, names = np.zeros((height, width), np.int32), []
     for kind, name, run in runs:
-        mask = _painted(run, low, (int(height), int(width)))
         if kind == "wall":
-            walls |= mask
+            _paint(walls, run, low, True)
         elif kind in FREE_LAYERS:
-            free |= mask
+            _paint(free, run, low, True)
             if kind == "segment":
                 names.append(name)
-                rooms[mask] = len(names)
+                _paint(rooms, run, low, len(names))
     free &= ~walls
     origin = np.array([low[0], -(low[1] + height)]) * cell / 100
     rooms[walls] = 0
@@ -139,11 +140,9 @@ def _runs(path: Path, layer: dict[str, Any]) -> Array:
     return runs
 
 
-def _painted(runs: Array, low: Array, shape: tuple[int, int]) -> Array:
-    """(h, w) bool, top row first."""
-    count = runs[:, 2]
-    first = (runs[:, 1] - low[1]) * shape[1] + runs[:, 0] - low[0]
-    within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-    mask = np.zeros(shape[0] * shape[1], bool)
-    mask[np.repeat(first, count) + within] = True
-    return mask.reshape(shape)
+def _paint(picture: Array, runs: Array, low: Array, value: int) -> None:
+    """Give the pixels of runs a value, in a picture (h, w) whose top row comes first; work and memory are those of the runs."""
+    flat = picture.reshape(-1)
+    first = (runs[:, 1] - low[1]) * picture.shape[1] + runs[:, 0] - low[0]
+    for start, end in zip(first.tolist(), (first + runs[:, 2]).tolist(), strict=True):
+        flat[start:end] = value
