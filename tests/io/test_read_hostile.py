@@ -35,7 +35,7 @@ def test_a_robots_map_that_paints_the_same_pixels_again_and_again(tmp_path: Path
 
 
 def test_many_layers_cost_what_their_pixels_do(tmp_path: Path) -> None:
-    drawn = robot_rooms(saved(tmp_path, layers([0, 0, 9], [0, 900, 9], *[[5, 5, 1]] * 20_000)))
+    drawn = robot_rooms(tmp_path, layers([0, 0, 9], [0, 900, 9], *[[5, 5, 1]] * 20_000))
     assert drawn.free.sum() == 19 and drawn.rooms.max() == 20_002
 
 
