@@ -47,7 +47,7 @@ class MountedCamera:
 
 
 def check_bytes(what: str, *cells: object) -> None:
-    """Raise an InputError where a cell is neither empty nor bytes: text in the place of an image would be taken for a file's name."""
+    """Raise an InputError where a cell is neither empty nor bytes: text in an image's place would be taken for a file's name."""
     odd = next((cell for cell in cells if not isinstance(cell, bytes | None)), None)
     if odd is not None:
         raise InputError(f"{what} has text or a number where bytes belong ({type(odd).__name__}); it is damaged")
