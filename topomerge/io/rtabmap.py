@@ -103,9 +103,9 @@ def _poses(path: Path, base: sqlite3.Connection, version: tuple[int, ...], said:
             raise InputError(
                 f"{path}: holds {sessions:,} sessions and no optimised poses that join them; open it in RTAB-Map and save it"
             )
-        rows = base.execute("SELECT id, pose FROM Node").fetchall()
-        blobs.check_bytes(f"{path}: the poses", *(blob for _, blob in rows))
-        poses = {int(i): blobs.pose_of(blob) for i, blob in rows}
+        nodes = base.execute("SELECT id, pose FROM Node").fetchall()
+        blobs.check_bytes(f"{path}: the poses", *(blob for _, blob in nodes))
+        poses = {int(i): blobs.pose_of(blob) for i, blob in nodes}
         said.append("it has no optimised poses: those of the odometry are taken, which drift")
     for node, pose in poses.items():
         if pose is not None and len(no_rotations(pose[None])):
