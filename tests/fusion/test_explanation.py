@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row, posterior_rows, why
-from topomerge.fusion.registration import Registration
+from topomerge.fusion.posterior import POSTERIOR, in_words
+from topomerge.fusion.registration import Registration, register
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
@@ -38,6 +42,17 @@ def test_the_sentence_says_verdict_evidence_and_rival():
     assert why(registration(0.9), 0.9, force=True) == f"merged: probability 0.90 reaches 0.90; {evidence}"
     assert why(registration(0.5), 0.9, force=True).endswith("joined all the same, as was asked for (--force)")
     assert why(Registration(None, 0.0, False, reason="no walls"), 0.9) == "not merged: no walls"
+
+
+def test_the_page_on_own_scans_names_what_a_refusal_says():
+    """Each phrase in its table of reasons is one that the program prints."""
+    page = (Path(__file__).parent.parent.parent / "docs" / "own-scan.md").read_text(encoding="utf-8")
+    rows = page.partition("| the reason says |")[2].partition("\n\n")[0].splitlines()[2:]
+    phrases = {phrase for row in rows for phrase in row.split("|")[1].split("`")[1::2]}
+    printed = [why(registration(0.6), 0.9), why(registration(0.5, walls=0.4), 0.9), inspect.getsource(register)]
+    printed.append(in_words({**dict.fromkeys(POSTERIOR, 0.0), "here": 0.5, "storey": 0.5}, 0.9))
+    assert len(phrases) >= 7
+    assert not [phrase for phrase in phrases if not any(phrase in text for text in printed)]
 
 
 def test_the_alternatives_in_words_most_probable_first():

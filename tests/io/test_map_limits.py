@@ -56,3 +56,22 @@ def test_a_storey_that_no_grid_holds() -> None:
     with pytest.raises(InputError, match=r"storey 0 spans 800 by 800 m in cells of 0.1 m: .*extract with larger cells"):
         storey_occupancy(strewn([(0, 0), (7_997, 7_997)], [0, 1]), 0)
     assert storey_occupancy(strewn([(0, 0), (30, 30)], [0, 1]), 0).free.shape == (33, 33)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value", "said"),
+    [
+        ("edges", "confidence", -7.0, "edges has a confidence that is not from 0 to 1"),
+        ("edges", "confidence", 1.5, "edges has a confidence that is not from 0 to 1"),
+        ("rooms", "area", -1.0, "rooms has an area below 0"),
+        ("storeys", "area", -1.0, "storeys has an area below 0"),
+    ],
+)
+def test_areas_and_probabilities_that_are_none(tmp_path: Path, table: str, column: str, value: float, said: str) -> None:
+    map = building(1, 2)
+    rows = getattr(map, table).copy()
+    rows[column][0] = value
+    path = tmp_path / "a.tmap"
+    save_map(replace(map, **{table: rows}), path)
+    with pytest.raises(InputError, match=said):
+        load_map(path)

@@ -179,6 +179,10 @@ def _table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
         limit = AREA_LIMIT if column in ("area", "volume") else COORDINATE_LIMIT
         if not (np.abs(values) <= limit).all():  # nan is not, either
             raise ValueError(f"{name} has a {column} that is no number or beyond {limit:.0e}")
+        if column == "area" and (values < 0).any():
+            raise ValueError(f"{name} has an area below 0")
+        if column == "confidence" and not ((values >= 0) & (values <= 1)).all():
+            raise ValueError(f"{name} has a confidence that is not from 0 to 1")
     return table.astype(dtype, copy=False)
 
 
