@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,9 +14,14 @@ from topomerge.fusion.bend import alignment
 from topomerge.fusion.bend.graph import settle
 
 
+@cache
+def of_six_rooms():
+    return bending_gtsam.problem(6)
+
+
 def test_both_get_the_factors_of_the_last_round_by_plan():
     before = alignment.settle
-    anchors, joints, measured, prior = bending_gtsam.problem(6)
+    anchors, joints, measured, prior = of_six_rooms()
     assert alignment.settle is before
     assert len(measured.piece) and measured.others.shape[1] == 1 and (measured.shares == 1).all()
     assert joints.pieces.max() < len(anchors) == len(prior)
@@ -37,6 +43,6 @@ def test_without_gtsam_it_says_what_to_install(monkeypatch):
 
 def test_gtsam_moves_the_pieces_to_where_ours_does():
     gtsam = pytest.importorskip("gtsam")
-    given = bending_gtsam.problem(6)
+    given = of_six_rooms()
     ours = settle(*given).moves
     assert np.abs(bending_gtsam.gtsam_moves(gtsam, given)[:, :2] - ours[:, :2]).max() < 0.003

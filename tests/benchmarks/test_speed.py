@@ -11,7 +11,7 @@ import pytest
 from benchmarks.speed.__main__ import SMALL, main
 
 ROOT = Path(__file__).parents[2]
-SLOW = set(SMALL) - {"start", "voxelise"}  # processes that load compiled code: a minute together
+SLOW = set(SMALL) - {"start"}  # processes that load compiled code: a minute together
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in SLOW else []) for n in SMALL])

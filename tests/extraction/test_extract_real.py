@@ -41,6 +41,7 @@ def test_an_octree_map_keeps_its_free_space(data_dir: Path) -> None:
     assert result.free is not None and len(result.free) == 2_610_011
 
 
+@pytest.mark.slow  # its rooms as they are drawn: tests/io/test_read_real.py
 def test_a_building_model(data_dir: Path) -> None:
     """Two flats of two storeys: every room that the model calls one and somebody can stand in lies in one room of its own."""
     cloud, result = duplex(data_dir), duplex_map(data_dir)

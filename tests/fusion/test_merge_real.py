@@ -12,6 +12,7 @@ from topomerge.extraction.extract import extract
 from topomerge.fusion.registration import register
 
 
+@pytest.mark.slow  # of simulated maps: test_registration
 @pytest.mark.data
 @pytest.mark.parametrize("wanted", ["carmen/orebro-first-last", "utexas/gdc1-1s"])
 def test_a_stated_storey_never_lowers_a_right_pose_of_real_maps(data_dir: Path, wanted: str) -> None:

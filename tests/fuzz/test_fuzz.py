@@ -20,8 +20,8 @@ def faults(folder: Path, seeds: range) -> tuple[int, list[str]]:
 
 
 def test_a_few_mutants_of_every_format(tmp_path: Path) -> None:
-    tried, wrong = faults(tmp_path / "a", range(5))
-    assert tried >= 140
+    tried, wrong = faults(tmp_path / "a", range(2))
+    assert tried >= 50
     assert not wrong, "\n".join(wrong)
 
 

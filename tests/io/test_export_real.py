@@ -28,7 +28,10 @@ MAPS: dict[str, Callable[[Path], TopometricMap]] = {
 }
 
 
-@pytest.mark.parametrize("name", MAPS)
+QUICK = "robot grid (Freiburg 101)"
+
+
+@pytest.mark.parametrize("name", [QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in MAPS if name != QUICK)])
 def test_dsg_of_a_real_building(data_dir: Path, tmp_path: Path, name: str) -> None:
     map = MAPS[name](data_dir)
     assert len(map.rooms) > 2 and len(map.edges) > 1

@@ -22,8 +22,11 @@ from topomerge.fusion.atlas.registration_cache import JOURNAL_FILE, Journal
 from topomerge.fusion.atlas.store import add
 from topomerge.fusion.atlas.workers import Numbered, PairTask, register_pair
 from topomerge.matching.poses import PoseHypothesis
+from topomerge.types import TopometricMap
 
-PARTS = [(NAMES[k], office_map(k)) for k in range(3)]
+
+def parts() -> list[tuple[str, TopometricMap]]:
+    return [(NAMES[k], office_map(k)) for k in range(3)]
 
 
 def listing_of(folder: Path) -> dict:
@@ -35,7 +38,7 @@ def listing_of(folder: Path) -> dict:
 def alone(tmp_path_factory) -> Path:
     """The atlas as one process makes it."""
     folder = tmp_path_factory.mktemp("alone") / "house"
-    add(folder, PARTS, tm.atlas_html)
+    add(folder, parts(), tm.atlas_html)
     return folder
 
 
@@ -64,11 +67,11 @@ def test_who_is_killed_goes_on_and_the_order_in_which_pairs_end_changes_nothing(
 
     folder = tmp_path / "house"
     with pytest.raises(KeyboardInterrupt):
-        add(folder, PARTS, tm.atlas_html, failing)
+        add(folder, parts(), tm.atlas_html, failing)
     journal = folder / JOURNAL_FILE
     assert len(journal.read_text().splitlines()) == 1 and not (folder / "atlas.json").exists()
     journal.write_text(journal.read_text() + '{"stamp": "cut sh')  # as of a process that was killed while it wrote
-    add(folder, PARTS, tm.atlas_html, going_on)
+    add(folder, parts(), tm.atlas_html, going_on)
     assert asked[1] == asked[0] - 1 and same_atlas(alone, folder)
     assert not journal.exists()
 
@@ -88,7 +91,7 @@ def test_a_journal_is_heard_with_its_settings_only(tmp_path):
 
 @pytest.mark.slow
 def test_processes_give_the_same_atlas(alone, tmp_path):
-    add(tmp_path / "house", PARTS, tm.atlas_html, workers.processes(2))
+    add(tmp_path / "house", parts(), tm.atlas_html, workers.processes(2))
     assert same_atlas(alone, tmp_path / "house")
 
 
@@ -128,7 +131,7 @@ def test_a_cluster_gives_the_same_atlas_though_a_worker_is_killed(alone, tmp_pat
                         first.send_signal(signal.SIGKILL)
                     yield numbered
 
-            add(tmp_path / "house", PARTS, tm.atlas_html, killing)
+            add(tmp_path / "house", parts(), tm.atlas_html, killing)
             assert first.wait(10) == -signal.SIGKILL
     assert same_atlas(alone, tmp_path / "house")
 
@@ -137,7 +140,7 @@ def test_nobody_answers(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers, "CONNECTING", 0.5)
     with pytest.raises(InputError, match=r"--cluster tcp://127\.0\.0\.1:9: no scheduler answers there"):
-        add(tmp_path / "house", PARTS, tm.atlas_html, workers.cluster("tcp://127.0.0.1:9"))
+        add(tmp_path / "house", parts(), tm.atlas_html, workers.cluster("tcp://127.0.0.1:9"))
 
 
 def test_dask_is_missing(monkeypatch):

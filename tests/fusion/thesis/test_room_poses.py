@@ -8,47 +8,12 @@ import numpy as np
 import pytest
 
 import topomerge as tm
-from tests.fusion.plans_of import MOVE, off, office, part
+from tests.fusion.plans_of import MOVE, off, part
 from tests.scenes import Scene
 from topomerge.errors import InputError
 from topomerge.fusion.thesis.room_poses import room_poses
 
 pytest.importorskip("open3d", exc_type=ImportError)
-
-
-@pytest.fixture(scope="module")
-def halves():
-    points = office().points()
-    west, east = part(points, high=(16, 99)), MOVE.apply(part(points, low=(5, -99)))
-    return tuple(tm.extract(p.astype(np.float32), name=n) for p, n in ((west, "a"), (east, "b")))
-
-
-@pytest.fixture(scope="module")
-def partners(halves):
-    """Rooms of a and b whose middles coincide under the true pose."""
-    a, b = (m.rooms["centroid"] for m in halves)
-    there = MOVE.inverse().apply(b)
-    apart = np.linalg.norm(a[:, None] - there[None], axis=2)
-    rooms = np.argwhere(apart < 0.3)
-    assert len(rooms) >= 3
-    return rooms
-
-
-def test_rooms_that_match_agree_about_the_pose(halves, partners):
-    clusters = room_poses(*halves, partners, np.ones(len(partners)))
-    metres, degrees = off(clusters[0][0], MOVE.inverse(), tuple(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0]))
-    assert metres < 0.1 and degrees < 0.5
-    assert [w for _, w in clusters] == sorted((w for _, w in clusters), reverse=True)
-
-
-def test_one_wrong_match_is_outvoted(halves, partners):
-    wrong = np.array([[partners[0, 0], partners[1, 1]]])
-    clusters = room_poses(*halves, np.concatenate([wrong, partners]), np.ones(len(partners) + 1))
-    assert off(clusters[0][0], MOVE.inverse(), (0.0, 0.0, 0.0))[1] < 0.5
-
-
-def test_no_matches_give_no_pose(halves):
-    assert room_poses(*halves, np.zeros((0, 2), np.int64), np.zeros(0)) == []
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +24,34 @@ def flats():
     return tuple(tm.extract(p.astype(np.float32), name=n) for p, n in ((points, "a"), (other, "b")))
 
 
+@pytest.fixture(scope="module")
+def partners(flats):
+    """Rooms of a and b whose middles lie near each other under the true pose."""
+    a, b = (m.rooms["centroid"] for m in flats)
+    there = MOVE.inverse().apply(b)
+    apart = np.linalg.norm(a[:, None] - there[None], axis=2)
+    rooms = np.argwhere(apart < 1.5)
+    assert len(rooms) >= 3
+    return rooms
+
+
+def test_rooms_that_match_agree_about_the_pose(flats, partners):
+    clusters = room_poses(*flats, partners, np.ones(len(partners)))
+    metres, degrees = off(clusters[0][0], MOVE.inverse(), tuple(MOVE.apply(np.array([[6.0, 4.0, 1.0]]))[0]))
+    assert metres < 0.1 and degrees < 0.5
+    assert [w for _, w in clusters] == sorted((w for _, w in clusters), reverse=True)
+
+
+def test_one_wrong_match_is_outvoted(flats, partners):
+    wrong = np.array([[partners[0, 0], partners[1, 1]]])
+    clusters = room_poses(*flats, np.concatenate([wrong, partners]), np.ones(len(partners) + 1))
+    assert off(clusters[0][0], MOVE.inverse(), (0.0, 0.0, 0.0))[1] < 0.5
+
+
+def test_no_matches_give_no_pose(flats):
+    assert room_poses(*flats, np.zeros((0, 2), np.int64), np.zeros(0)) == []
+
+
 def test_merge_by_rooms_alone(flats):
     result = tm.merge(flats, poses="rooms")
     metres, degrees = off(result.registration.transform, MOVE.inverse(), tuple(MOVE.apply(np.array([[6.0, 4.0, 1.0]]))[0]))
@@ -67,18 +60,18 @@ def test_merge_by_rooms_alone(flats):
     assert np.allclose((result.registration.transform @ back.registration.transform).matrix, np.eye(4), atol=1e-6)
 
 
-def test_merge_by_rooms_is_for_two_maps_of_one_scale(halves):
+def test_merge_by_rooms_is_for_two_maps_of_one_scale(flats):
     with pytest.raises(InputError, match="two maps of one scale"):
-        tm.merge(halves, poses="rooms", scale="free")
+        tm.merge(flats, poses="rooms", scale="free")
     with pytest.raises(InputError, match="two maps of one scale"):
-        tm.merge([*halves, halves[0]], poses="rooms")
+        tm.merge([*flats, flats[0]], poses="rooms")
     with pytest.raises(InputError, match="search or rooms, not 'thesis'"):
-        tm.merge(halves, poses="thesis")
+        tm.merge(flats, poses="thesis")
 
 
-def test_the_same_maps_give_the_same_poses(halves, partners):
-    first, *again = (room_poses(*halves, partners, np.ones(len(partners))) for _ in range(4))
-    assert all(poses == first for poses in again)
+def test_the_same_maps_give_the_same_poses(flats, partners):
+    first, again = (room_poses(*flats, partners, np.ones(len(partners))) for _ in range(2))
+    assert again == first
 
 
 def test_without_open3d_the_message_says_what_to_install(flats, monkeypatch):
