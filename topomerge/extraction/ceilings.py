@@ -10,7 +10,7 @@ import numpy as np
 
 from topomerge.extraction.components import connected_components
 from topomerge.extraction.convolution import Kernel, any_at, moore
-from topomerge.extraction.distance_field import horizontal_distance_field
+from topomerge.extraction.distance_field import on_all_sides
 from topomerge.kernels.columns import first_occupied, hollow_below, levels_below
 from topomerge.types import Array, VoxelGrid
 
@@ -39,7 +39,8 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
     hollow = hollow_below(*grid._bricks, cells, 1, slab, int(np.ceil(HOLLOW_HEIGHT / grid.edge)), far)
     component = connected_components(standing, moore(), group=np.where(bare, 0, -1))
     count = int(component.max()) + 1
-    boundary = np.flatnonzero(bare & (horizontal_distance_field(standing) == 0))
+    boundary = np.flatnonzero(bare)
+    boundary = boundary[~on_all_sides(standing, cells[boundary], 1)]
     walled = any_at(grid, cells[boundary], beside_and_above(grid.edge))
     on_boundary = np.bincount(component[boundary], minlength=count)
     with_wall = np.bincount(component[boundary], walled, minlength=count)

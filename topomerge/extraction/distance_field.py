@@ -5,6 +5,7 @@ from __future__ import annotations
 import edt
 import numpy as np
 
+from topomerge.extraction.convolution import circle, count_at
 from topomerge.types import Array, VoxelGrid
 
 
@@ -32,3 +33,11 @@ def horizontal_distance_field(grid: VoxelGrid) -> Array:
         squared = np.rint(edt.edtsq(plan.view(np.uint8), parallel=1)[at].astype(np.float64))
         distance[rows] = np.ceil(np.sqrt(squared)).astype(np.int32) - 1
     return distance
+
+
+def on_all_sides(grid: VoxelGrid, cells: Array, radius: int) -> Array:
+    """(m,) bool: does the grid hold all cells of the level that are at most so many cells away? As `horizontal_distance_field` at
+    or above the radius, of some cells and for a small radius."""
+    disc = circle(radius * grid.edge, grid.edge)
+    inside: Array = count_at(grid, cells, disc) == len(disc)
+    return inside

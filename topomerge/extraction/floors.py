@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from topomerge.extraction.components import connected_components
-from topomerge.extraction.distance_field import horizontal_distance_field
+from topomerge.extraction.distance_field import on_all_sides
 from topomerge.types import Array, VoxelGrid
 
 FLOOR_LEAST_AREA = 1.0  # m2
@@ -35,9 +35,8 @@ def floor_components(grid: VoxelGrid) -> VoxelGrid:
     component = connected_components(grid)
     count = int(component.max()) + 1
     area = _columns(grid, component, count) * grid.edge**2
-    widest = np.zeros(count, np.int64)
-    np.maximum.at(widest, component, horizontal_distance_field(grid))
-    floor = (area >= FLOOR_LEAST_AREA) & ((widest + 0.5) * grid.edge >= FLOOR_LEAST_HALF_WIDTH)
+    inner = on_all_sides(grid, grid.cells, int(np.ceil(FLOOR_LEAST_HALF_WIDTH / grid.edge - 0.5 - 1e-9)))
+    floor = (area >= FLOOR_LEAST_AREA) & (np.bincount(component, inner, count) > 0)
     suspects = np.flatnonzero(floor & (area <= FURNITURE_AREA))
     if len(suspects):
         large = grid.cells[(floor & (area > 2 * area[suspects].min()))[component]] * grid.edge

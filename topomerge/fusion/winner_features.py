@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from topomerge.fusion.judge import SAME_WALL, Judge
 from topomerge.kernels import align
+from topomerge.kernels.bend import shifted_sums
 from topomerge.matching.plan_fields import FREE_MARGIN, PlanFields
 from topomerge.matching.refinement import storeys_at
 from topomerge.types import Array, Sim3
@@ -81,19 +82,14 @@ def _moved(rows: Array, target: PlanFields, main: float) -> Array:
     steps = np.concatenate([[0.0], steps, -steps])
     axes = np.array([[np.cos(main), np.sin(main)], [-np.sin(main), np.cos(main)]])
     shifts = np.concatenate([steps[:, None] * axes[0], steps[1:, None] * axes[1]])
-    size = np.array(target.to_wall.shape)
+    fitting = np.exp(-((target.to_wall / WINDOW_SIGMA) ** 2) / 2)
     out = np.zeros(2)
     for offset in (0.0, 0.5):
         square = np.floor(rows[:, :2] @ axes.T / WINDOW_SIDE + offset).astype(np.int64)
         _, owner = np.unique(square[:, 0] << 32 | (square[:, 1] & 0xFFFFFFFF), return_inverse=True)
         area = np.bincount(owner, weights=rows[:, 5], minlength=1)
-        fit = np.zeros((len(shifts), len(area)))
-        for k, shift in enumerate(shifts):
-            cells = np.floor((rows[:, :2] + shift - target.plan.origin) / target.plan.edge).astype(np.int64)
-            inside = ((cells >= 0) & (cells < size)).all(axis=1)
-            i, j = np.where(inside[:, None], cells, 0).T
-            weight = np.where(inside, np.exp(-((target.to_wall[i, j] / WINDOW_SIGMA) ** 2) / 2), 0.0) * rows[:, 5]
-            fit[k] = np.bincount(owner, weights=weight, minlength=1)
+        plan = target.plan
+        fit = shifted_sums(rows[:, :2], rows[:, 5], owner, len(area), shifts, fitting, plan.origin, plan.edge)
         compared = area >= WINDOW_WALLS
         gain = np.maximum(fit[1:].max(axis=0) - fit[0], 0.0)
         out += gain[compared].sum(), area[compared].sum()

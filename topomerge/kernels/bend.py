@@ -43,6 +43,19 @@ def move_scores(points, sector, start, places, turns, yaws, shifts, gain, origin
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def shifted_sums(points, weights, owner, owners, shifts, values, origin, edge):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """(S, owners) sums of the values of a raster (nx, ny) at weighted points (n, 2) of each owner, moved by each shift (S, 2)."""
+    out = np.zeros((len(shifts), owners))
+    for k in range(len(shifts)):
+        for p in range(len(points)):
+            u = int(np.floor((points[p, 0] + shifts[k, 0] - origin[0]) / edge))
+            v = int(np.floor((points[p, 1] + shifts[k, 1] - origin[1]) / edge))
+            if u >= 0 and v >= 0 and u < values.shape[0] and v < values.shape[1]:
+                out[k, owner[p]] += values[u, v] * weights[p]
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def line_normals(row, points, columns, reach, least):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """(n, 2) unit normals of the lines through the points within `reach` columns of each one, and (n,) how straight these are
     (0 to 1); 0 where fewer than `least` points are near.

@@ -14,14 +14,14 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
+from topomerge.kernels.selected_inverse import inverse_on_factor
 from topomerge.types import Array
 
 UNKNOWNS = 4  # of a piece: shift x, y, turn, logarithm of the scale
 SETTLED_WEIGHTS = 0.005  # change of the weights, below which no further round is needed
 CONVEX_ROUNDS = 10  # of graduated non-convexity
 OUTLIER = 9.0  # square of the misfit, in standard deviations, from which a measurement is doubted
-SAMPLED_JOINTS = 120  # joints of which it is said how sure they are
-HELD = 1e9  # information of what may not move
+FIXED = 1e-9  # variance of what may not move
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,8 @@ class Settled:
         weights: (m,) 0..1 of each measurement.
         squares: (j, 4) squared misfit of each joint in each unknown, in variances.
         factor: of the normal equations.
-        jointed: rows of the joints.
+        jointed: rows of the joints, of the unknowns that may move.
+        free: (u,) those unknowns, of 4 n.
     """
 
     moves: Array
@@ -70,6 +71,7 @@ class Settled:
     squares: Array
     factor: SuperLU
     jointed: sparse.csr_matrix
+    free: Array
 
     @property
     def strain(self) -> Array:
@@ -79,13 +81,25 @@ class Settled:
 
     @property
     def expected_strain(self) -> Array:
-        """(j, 4) what the squares are expected to be, as far as the moves are uncertain; nan for joints beyond a sample."""
-        return self.squares + _joint_variance(self.factor, self.jointed)
+        """(j, 4) what the squares are expected to be, as far as the moves are uncertain."""
+        left = np.asarray(self.jointed.multiply(self.jointed @ self._inverse).sum(axis=1)).reshape(-1, UNKNOWNS)
+        return self.squares + left
 
     @cached_property
     def covariance(self) -> Array:
         """(n, 3, 3) of shift and turn of each piece."""
-        return _covariance(self.factor, len(self.moves))
+        count, inverse = len(self.moves), self._inverse.tocoo()
+        piece, unknown = np.divmod(self.free, UNKNOWNS)
+        out = np.tile(FIXED * np.eye(UNKNOWNS), (count, 1, 1))
+        own = piece[inverse.row] == piece[inverse.col]
+        i, j = inverse.row[own], inverse.col[own]
+        out[piece[i], unknown[i], unknown[j]] = inverse.data[own]
+        return out[:, :3, :3]
+
+    @cached_property
+    def _inverse(self) -> sparse.csr_matrix:
+        """(u, u) inverse of the normal equations where their factor has entries: at all joints, and at each piece."""
+        return _inverse_of(self.factor)
 
 
 def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array) -> Settled:
@@ -96,14 +110,14 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
         prior: (n, 4) standard deviations of the moves by themselves; 0: does not move.
     """
     n = len(anchors)
-    jointed = _joint_rows(anchors, joints)
-    stiff = sparse.diags(np.where(prior > 0, 1 / np.maximum(prior, 1e-9) ** 2, HELD).ravel())
-    held = jointed.T @ jointed + stiff
-    rows = _measured_rows(anchors, measured)
+    free = np.flatnonzero(prior.ravel() > 0)
+    jointed = _joint_rows(anchors, joints)[:, free]
+    held = jointed.T @ jointed + sparse.diags(1 / np.maximum(prior.ravel()[free], 1e-9) ** 2)
+    rows = _measured_rows(anchors, measured)[:, free]
     roots = _roots(measured.information)
     whitened = sparse.block_diag(list(roots), format="csr") @ rows if len(rows.indptr) > 1 else rows
     aims = np.einsum("mij,mj->mi", roots, measured.moves)
-    weights, moves = np.ones(len(aims)), np.zeros(n * UNKNOWNS)
+    weights, moves = np.ones(len(aims)), np.zeros(len(free))
     relaxed = 0.0
     for k in range(CONVEX_ROUNDS):
         scaled = whitened.multiply(np.repeat(weights, 3)[:, None]).tocsr()
@@ -115,9 +129,10 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
         before, weights = weights, (relaxed * OUTLIER / (chi + relaxed * OUTLIER)) ** 2
         if relaxed == 1.0 and np.abs(weights - before).max(initial=0.0) < SETTLED_WEIGHTS:
             break
-    moves = np.where(prior.ravel() > 0, moves, 0.0)
     squares = (jointed @ moves).reshape(-1, UNKNOWNS) ** 2
-    return Settled(moves.reshape(n, UNKNOWNS), weights, squares, factor, jointed)
+    every = np.zeros(n * UNKNOWNS)
+    every[free] = moves
+    return Settled(every.reshape(n, UNKNOWNS), weights, squares, factor, jointed, free)
 
 
 def _factor(normal: sparse.spmatrix) -> SuperLU:
@@ -125,33 +140,16 @@ def _factor(normal: sparse.spmatrix) -> SuperLU:
     return splu(normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def _joint_variance(factor: SuperLU, jointed: sparse.csr_matrix) -> Array:
-    """(j, 4) variance that is left to each joint, in its variances before all measurements; nan for those beyond a sample."""
-    many = jointed.shape[0] // UNKNOWNS
-    out = np.full((many, UNKNOWNS), np.nan)
-    if not many:
-        return out
-    chosen = np.arange(many)[:: max(many // SAMPLED_JOINTS, 1)]
-    rows = (UNKNOWNS * chosen[:, None] + np.arange(UNKNOWNS)).ravel()
-    sampled = jointed[rows].toarray()
-    left = np.einsum("ij,ji->i", sampled, factor.solve(np.ascontiguousarray(sampled.T)))
-    out[chosen] = left.reshape(-1, UNKNOWNS)
-    return out
-
-
-def _covariance(factor: SuperLU, n: int) -> Array:
-    """(n, 3, 3) of each piece by itself."""
-    out = np.zeros((n, 3, 3))
-    for k in range(3):
-        for start in range(0, n, 256):
-            many = min(256, n - start)
-            ones = np.zeros((n * UNKNOWNS, many))
-            at = UNKNOWNS * (start + np.arange(many))
-            ones[at + k, np.arange(many)] = 1.0
-            solved = factor.solve(ones)
-            for j in range(3):
-                out[start : start + many, j, k] = solved[at + j, np.arange(many)]
-    return out
+def _inverse_of(factor: SuperLU) -> sparse.csr_matrix:
+    """The inverse of what was factored, where the factor has entries; everywhere if rows and columns were ordered differently."""
+    lower, order = factor.L, factor.perm_c
+    lower.sort_indices()
+    if np.array_equal(order, factor.perm_r):
+        values = inverse_on_factor(lower.indptr, lower.indices, lower.data, factor.U.diagonal())
+        if not np.isnan(values[:1]).any():
+            half = sparse.csc_matrix((values, lower.indices, lower.indptr), lower.shape)
+            return (half + sparse.tril(half, -1).T).tocsr()[order][:, order]
+    return sparse.csr_matrix(factor.solve(np.eye(len(order))))
 
 
 def _roots(information: Array) -> Array:

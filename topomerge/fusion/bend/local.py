@@ -144,7 +144,8 @@ def _gaussian(scores: Array, shifts: Array, yaws: Array) -> tuple[Array, Array]:
     likely = np.exp(flat - flat.max(axis=1, keepdims=True))
     likely /= likely.sum(axis=1, keepdims=True)
     mean = likely @ moves
-    spread = np.einsum("km,mi,mj->kij", likely, moves, moves) - mean[:, :, None] * mean[:, None, :]
+    squares = (moves[:, :, None] * moves[:, None, :]).reshape(-1, 9)
+    spread = (likely @ squares).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
     window = np.linalg.inv(1.2 * np.diag(moves.var(axis=0)))
     information = np.linalg.inv(spread + np.diag(np.array([MOVE_FLOOR[0], MOVE_FLOOR[0], MOVE_FLOOR[1]]) ** 2)) - window
     values, vectors = np.linalg.eigh(information)

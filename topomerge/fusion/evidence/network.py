@@ -57,10 +57,16 @@ def planes(parts: Array, ceiling: Array, looked: Array) -> Array:
     out += [usual.sum(axis=1) / np.maximum(roof.sum(axis=1), 1)]
     sliced = np.broadcast_to(looked[:, :, 0].max(axis=1)[:, None, None], both.shape)
     out += [bit["wall"].any(axis=1), bit["clutter"].any(axis=1), sliced]
-    stacked = np.stack([layer.astype(np.float32) for layer in out], axis=-1)
-    k, side = len(parts), parts.shape[-1] // POOLED
-    pooled: Array = stacked.reshape(k, side, POOLED, side, POOLED, PLANES).mean(axis=(2, 4))
-    return pooled
+    return np.stack([_pooled(layer) for layer in out], axis=-1)
+
+
+def _pooled(layer: Array) -> Array:
+    """(k, SIDE / 4, SIDE / 4) float32 mean over 4 x 4 pixels."""
+    kind = np.uint8 if layer.dtype == bool else np.float32
+    rows = sum(layer[:, n::POOLED].astype(kind) for n in range(POOLED))
+    total = sum(rows[:, :, n::POOLED] for n in range(POOLED))
+    out: Array = total / np.float32(POOLED**2)
+    return out
 
 
 def _compared(there: Array, missing: Array, near: Array) -> list[Array]:
