@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, warn
+from topomerge.cli.console import check_inputs, check_outputs, warn
 from topomerge.cli.options import CLOUD_OPTIONS, CONTEXT_STEPS, DESCRIPTOR, json_option, map_from
 
 
@@ -18,12 +18,18 @@ def match_command(args: argparse.Namespace) -> int:
     from topomerge.matching.match import check, match
 
     check_inputs([args.a, args.b])
+    if args.report:
+        check_outputs([args.report], [args.a, args.b])
     a, b = map_from(args.a, args), map_from(args.b, args)
     check(a, b)
     alone = [path for path, topomap in ((args.a, a), (args.b, b)) if len(topomap.rooms) == 1]
     warn(f"{path}: has one room: only its shape and doors can be compared" for path in alone)
     matching = match(a, b, args.descriptor, args.method, k=args.k, scale_free=args.scale_of_b == "free")
     matching = believed_matches(matching, a, b, args.method)
+    if args.report:
+        from topomerge.viz.match_report import save_match_report
+
+        save_match_report(matching, a, b, args.report)
     sys.stdout.write(json_text(matching_to_json(matching, a, b)) if args.json else matching_to_text(matching, a, b) + "\n")
     return 0
 
@@ -38,6 +44,12 @@ MATCH = Command(
         option("b", metavar="B", help="the other one"),
         json_option(),
         option(
+            "--report",
+            metavar="M.html",
+            default=None,
+            help="also write plans and what is around each match as a web page",
+        ),
+        option(
             "--method",
             choices=("consistent", "attention", "growing", "assignment", "thesis"),
             default="consistent",
@@ -48,6 +60,6 @@ MATCH = Command(
         CONTEXT_STEPS,
         *CLOUD_OPTIONS,
     ),
-    paths=("a", "b"),
+    paths=("a", "b", "report"),
     description="Print which rooms of two maps are the same, with probabilities, and the transforms that would make them so.",
 )

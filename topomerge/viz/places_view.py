@@ -103,6 +103,11 @@ def crop_image(parts: Array) -> Array:
     image = np.full((*parts.shape, 3), UNKNOWN, np.uint8)
     for name, colour in PIXEL_COLOURS.items():
         image[(parts >> PARTS.index(name) & 1) > 0] = colour
+    return drawn_north_up(image)
+
+
+def drawn_north_up(image: Array) -> Array:
+    """Pixels (x, y, 3) as rows of a picture, the largest y first."""
     return np.ascontiguousarray(image.transpose(1, 0, 2)[::-1])
 
 

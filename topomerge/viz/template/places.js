@@ -1,6 +1,6 @@
 "use strict";
 
-// A click on a room of the plan of what each room says opens the pictures of its places.
+// A click on a room of a plan opens the pictures of its places: of room a3 those of room 3 of a.
 function startPlaces(section) {
   if (!section) {
     return;
@@ -10,9 +10,9 @@ function startPlaces(section) {
     if (!room) {
       return;
     }
-    const number = room.dataset.room.replace(/^a/, "");
+    const [map, number] = [room.dataset.room[0], room.dataset.room.slice(1)];
     for (const details of section.querySelectorAll("details[data-room-of-a]")) {
-      details.open = details.dataset.roomOfA === number;
+      details.open = (map === "b" ? details.dataset.roomOfB : details.dataset.roomOfA) === number;
       if (details.open) {
         details.scrollIntoView({ block: "nearest" });
       }
