@@ -41,7 +41,7 @@ def _add(args: argparse.Namespace) -> int:
     check_folder(args.folder)
     choices, workers = atlas_choices(args), _workers(args)
     check_inputs(args.items)
-    maps = [(Path(path).stem, replace(map_from(path, args), source=path)) for path in args.items]
+    maps = ((Path(path).stem, replace(map_from(path, args), source=path)) for path in args.items)  # one in memory at a time
     return _report(add(args.folder, maps, atlas_html, workers, **choices), args)
 
 

@@ -27,8 +27,10 @@ def atlas_html(
     title: str = "Atlas",
     more: Sequence[Markup] = (),
     stamp: str = "",
+    pages: Mapping[int, str] | None = None,
+    component: int | None = None,
 ) -> str:
-    """The report as HTML.
+    """The report as HTML, or the page of one component.
 
     Args:
         result: where the maps lie, and what contradicts.
@@ -36,20 +38,56 @@ def atlas_html(
         title: what it is called.
         more: sections that stand behind the list of the maps.
         stamp: as of `report.page`.
+        pages: component -> the file beside this one that shows its joined map: this one shows none then.
+        component: the page of this one alone, which says nothing of the others, nor how long it took.
     """
+    if component is not None:
+        return _component_html(result, component, joined[component], title)
     sections = [_verdict(result), warnings(result.warnings)]
     data: dict[str, Any] = {}
+    if pages:
+        sections.append(_index(result, pages))
     for n, members in enumerate(result.components):
-        if len(members) > 1 and n in joined:
-            sheet, plans = lay_out(joined[n], f"m{n}-" if n else "")
-            table = scroller(rooms_table(joined[n], f"m{n}-" if n else ""))
-            view = element("div", plan_view(joined[n], sheet, plans), table, class_="beside")
-            sections.append(section(f"{_names(result, members)}: rooms found anew", view, f"joined-{n}"))
-            if not data:
-                data["scene-data"] = _scene(joined[n], sheet.turn)
-                sections.append(_space(joined[n]))
-    sections += [_maps(result), *more, _links(result)]
+        if len(members) > 1 and n in joined and not pages:
+            shown, scene = _joined(result, n, joined[n], not data)
+            sections += shown
+            data |= scene
+    sections += [_maps(result, pages=pages), *more, _links(result)]
     return page(title, f"Atlas of {len(result.names)} maps", sections, data, stamp)
+
+
+def _component_html(result: AtlasResult, n: int, map: TopometricMap, title: str) -> str:
+    """The page of one component."""
+    sections, data = _joined(result, n, map, True)
+    back = element("p", element("a", f"All of {title}", href="report.html"), class_="note")
+    sections = [back, *sections, _maps(result, [n]), _links(result, result.components[n])]
+    return page(f"{title}, joined map {n}", f"{len(result.components[n])} maps of an atlas", sections, data)
+
+
+def _joined(result: AtlasResult, n: int, map: TopometricMap, in_space: bool) -> tuple[list[Markup], dict[str, Any]]:
+    """The joined map of a component: its sections, and what their scripts read."""
+    prefix = f"m{n}-" if n else ""
+    sheet, plans = lay_out(map, prefix)
+    view = element("div", plan_view(map, sheet, plans), scroller(rooms_table(map, prefix)), class_="beside")
+    sections = [section(f"{_names(result, result.components[n])}: rooms found anew", view, f"joined-{n}")]
+    if not in_space:
+        return sections, {}
+    return [*sections, _space(map)], {"scene-data": _scene(map, sheet.turn)}
+
+
+def _index(result: AtlasResult, pages: Mapping[int, str]) -> Markup:
+    """The joined maps, which have pages of their own."""
+    rows = [
+        (_linked(f"joined map {n}", file), str(len(result.components[n])), chance(result.probability(n)), _names(result, members))
+        for n, file in pages.items()
+        for members in (result.components[n],)
+    ]
+    return section("The joined maps", _texts(("page", "maps", "weakest link", "names"), rows), "joined")
+
+
+def _linked(words: str, file: str | None) -> str:
+    """Words that lead to a file beside this one, if there is one."""
+    return words if file is None else element("a", words, href=file)
 
 
 def _verdict(result: AtlasResult) -> Markup:
@@ -63,34 +101,40 @@ def _names(result: AtlasResult, members: Iterable[int]) -> str:
     return " + ".join(Path(result.names[k]).name for k in members)
 
 
-def _maps(result: AtlasResult) -> Markup:
+def _maps(result: AtlasResult, components: Sequence[int] | None = None, pages: Mapping[int, str] | None = None) -> Markup:
+    """Where the maps lie, those of some components or all."""
     rows = []
-    for n, members in enumerate(result.components):
+    for n in range(len(result.components)) if components is None else components:
+        members = result.components[n]
         for k in members:
             pose, off = result.transforms[k], result.residuals.get(k, float("nan"))
             moved = f"{np.degrees(pose.yaw):.1f}° · " + ", ".join(f"{v:.2f}" for v in pose.translation)
             scale = f" · scale {pose.scale:.3f}" if pose.scale != 1.0 else ""
-            where = "apart" if len(members) == 1 else f"joined map {n}"
+            where = "apart" if len(members) == 1 else _linked(f"joined map {n}", (pages or {}).get(n))
             missed = f"{100 * off:.0f} cm" if np.isfinite(off) else "–"
             rows.append((str(k), result.names[k], where, "–" if pose == Sim3() else moved + scale, missed))
     heads = ("map", "name", "where", "turn, x, y, z in m", "measurements miss it by")
     return section("The maps", _texts(heads, rows), "maps")
 
 
-def _links(result: AtlasResult) -> Markup:
+def _links(result: AtlasResult, within: Sequence[int] | None = None) -> Markup:
+    """What holds the maps together and what was thrown out; of some of them, or of all and how long it took."""
     parts: list[Markup] = []
-    if result.links:
-        rows = [(*_pair(result, x.maps), chance(x.hypothesis.probability), chance(x.probability)) for x in result.links]
+    links, rejected = ([x for x in of if within is None or {*x.maps} & {*within}] for of in (result.links, result.rejected))
+    if links:
+        rows = [(*_pair(result, x.maps), chance(x.hypothesis.probability), chance(x.probability)) for x in links]
         words = "Every other two maps that a link brings over each other say what they think of it."
         parts += [element("p", words, class_="note"), _texts(("map", "map", "by itself", "with all that is said"), rows)]
-    if result.rejected:
+    if rejected:
         out = [
             (*_pair(result, x.maps), chance(x.hypothesis.probability), _names(result, x.against) if x.against else "other maps")
-            for x in result.rejected
+            for x in rejected
         ]
         parts += [element("h3", "Thrown out"), _texts(("map", "map", "by itself", "contradicted by"), out)]
     tried = f"{result.registered[0]} of {result.registered[1]} pairs were searched in each other, in {result.seconds:.1f} s."
-    return section("Links between the maps", join([*parts, element("p", tried, class_="note")]), "links")
+    if within is None:
+        parts.append(element("p", tried, class_="note"))
+    return section("Links between the maps", join(parts), "links")
 
 
 def _pair(result: AtlasResult, maps: tuple[int, int]) -> tuple[str, str]:

@@ -113,7 +113,8 @@ def test_fine_poses_are_made_once_and_never_of_slices(monkeypatch):
     sides = [
         SimpleNamespace(storeys=[plan_fields(np.ones((2, 2), bool), sliced=s)], middle=np.zeros(3)) for s in (False, False, True)
     ]
-    maps = SimpleNamespace(prepared=sides.__getitem__, answer=lambda question, pair, make: make())
+    facts = {"sliced": [False, False, True].__getitem__, "middle": lambda k: np.zeros(3)}
+    maps = SimpleNamespace(prepared=sides.__getitem__, answer=lambda question, pair, make: make(), **facts)
     checks = Checks(maps, scaled=True)  # type: ignore[arg-type]
     near = Sim3(0.0, (0.05, 0.0, 0.0))
     assert checks.fine(0, 1, Sim3()) == checks.fine(0, 1, near) == Sim3(0.0, (1.0, 0.0, 0.0))

@@ -2,7 +2,8 @@
 
 Links are taken in the order of their probability, as in a maximum spanning tree, but each is heard before: every two maps that it
 would bring over each other say what they think of that, its own two if they contradict it. What contradicts better evidence is
-rejected, and named.
+rejected, and named. Maps that no hypothesis joins, by others or directly, say nothing to each other: each set of maps that may
+come together is assembled by itself, and only anew when more of its pairs were registered.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from topomerge.fusion.atlas.map_sets import sets_of_maps
 from topomerge.fusion.atlas.pairs import Check, Checks, alike
 from topomerge.fusion.atlas.pose_graph import Measured, optimise
 from topomerge.matching.poses import PoseHypothesis
@@ -73,11 +75,32 @@ class Assembler:
     """
 
     def __init__(self, count: int, hypotheses: Hypotheses, checks: Checks, limit: float, scaled: bool = False) -> None:
-        self.count, self.hypotheses, self.checks, self.limit, self.scaled = count, hypotheses, checks, limit, scaled
+        self.maps: Sequence[int] = range(count)
+        self.hypotheses, self.checks, self.limit, self.scaled = hypotheses, checks, limit, scaled
         self._settled: dict[tuple[Hashable, ...], tuple[dict[int, Sim3], list[Measured]]] = {}
+        self._built: dict[tuple[int, ...], tuple[set[tuple[int, int]], Assembly]] = {}  # of sets of maps, with their pairs
 
     def build(self) -> Assembly:
         """The most probable assembly without contradictions."""
+        built = {}
+        candidates = {pair for pair, _ in self._candidates(set())}
+        for maps, within in sets_of_maps(len(self.maps), candidates, self.hypotheses):
+            pairs, assembly = self._built.get(maps, (set(), None))
+            if assembly is None or pairs != set(within):
+                part = Assembler(0, within, self.checks, self.limit, self.scaled)
+                part.maps, part._settled = maps, self._settled
+                assembly = part._assembled()
+            built[maps] = set(within), assembly
+        self._built = built
+        whole = Assembly([])
+        for _, assembly in built.values():
+            whole.components += assembly.components
+            whole.links += assembly.links
+            whole.rejected += assembly.rejected
+        return whole
+
+    def _assembled(self) -> Assembly:
+        """`build`, of all maps at once."""
         banned: set[tuple[int, int]] = set()
         while True:  # ends: each time one more pair is banned
             assembly = self._grown(banned)
@@ -103,20 +126,22 @@ class Assembler:
         return max(PoseHypothesis(h.transform, probability=any_of_them).log_odds - h.log_odds, 0.0) + BACKING
 
     def _grown(self, banned: set[tuple[int, int]]) -> Assembly:
-        assembly = Assembly([{k: Sim3()} for k in range(self.count)])
+        assembly = Assembly([{k: Sim3()} for k in self.maps])
         candidates = self._candidates(banned)
+        refused: dict[int, tuple[Poses, Poses]] = {}  # by the components that stood there then, and mostly still do
         again = True
         while again:
             again = False
-            for pair, h in candidates:
+            for n, (pair, h) in enumerate(candidates):
                 a, b = assembly.of(pair[0]), assembly.of(pair[1])
-                if a is b:
+                if a is b or (n in refused and refused[n][0] is a and refused[n][1] is b):
                     continue
                 link = self.heard(a, b, pair, h)
                 if link.log_odds >= self.limit:
                     self._join(assembly, a, b, link)
                     again = True
                     break
+                refused[n] = a, b
         return assembly
 
     def _join(self, assembly: Assembly, a: dict[int, Sim3], b: dict[int, Sim3], link: Link) -> None:
@@ -202,7 +227,7 @@ class Assembler:
 
     def _exchange(self, assembly: Assembly) -> None:
         """Put contradicted hypotheses in the place of links, where everything agrees better then."""
-        for _ in range(2 * self.count):
+        for _ in range(2 * len(self.maps)):
             change = next(self._better(assembly), None)
             if change is None:
                 return

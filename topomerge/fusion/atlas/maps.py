@@ -1,8 +1,8 @@
-"""The maps of an atlas: plans of all stay in memory, the cells of those that are files only while they are needed."""
+"""The maps of an atlas: what is made of them stays in memory while it is needed, so that many maps take no more than some."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,9 @@ from topomerge.fusion.bend.bend import bend_together
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.prepared import Prepared, prepare
 from topomerge.fusion.refine import surface
+from topomerge.io.maps import load_map
 from topomerge.matching.match import checked
-from topomerge.types import Sim3, TopometricMap
+from topomerge.types import Array, Sim3, TopometricMap
 
 Made = TypeVar("Made")
 
@@ -64,7 +65,7 @@ class Maps:
             make_surface = partial(memory.surface, key, lambda: surface(memory.map(key).grid))
             return replace(prepare(memory.map(key)), load=lambda: memory.map(key), make_surface=make_surface)
 
-        return memory.answer(("prepared", key), make)
+        return memory.prepared(key, make)
 
     def answer(self, question: tuple[Hashable, ...], maps: Iterable[int], make: Callable[[], Made]) -> Made:
         """`Memory.answer` to a question about some of the maps."""
@@ -75,9 +76,33 @@ class Maps:
         storeys = self.prepared(k).storeys
         return self.answer(("area",), (k,), lambda: float(sum(v.plan.explored.sum() * v.plan.edge**2 for v in storeys)))
 
+    def middle(self, k: int) -> Array:
+        """(3,) of its cells, m."""
+        return self.answer(("middle",), (k,), lambda: self.prepared(k).middle)
+
+    def sliced(self, k: int) -> bool:
+        """Is a storey a slice, which has no planes?"""
+        return self.answer(("sliced",), (k,), lambda: any(v.plan.sliced for v in self.prepared(k).storeys))
+
     def rows(self, k: int) -> Rows:
         """Descriptors of the rooms."""
         return self.memory.answer(("rows", self.embedder, self.keys[k]), lambda: checked(self._describe, self[k]))
+
+
+class MapFiles(Mapping[int, TopometricMap]):
+    """Maps by their numbers, read from their files whenever they are asked for."""
+
+    def __init__(self, files: Mapping[int, Path]) -> None:
+        self._files = dict(files)
+
+    def __getitem__(self, n: int) -> TopometricMap:
+        return load_map(self._files[n])
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
 
 
 def bent_together(

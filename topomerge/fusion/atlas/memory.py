@@ -19,6 +19,7 @@ from topomerge.io.maps import load_map
 from topomerge.types import TopometricMap
 
 LOADED_AT_ONCE = 3  # maps in memory, of those that are files
+PREPARED_AT_ONCE = 64  # maps whose plans are in memory
 SURFACES_AT_ONCE = 8  # surfaces in memory, for the fine registration
 Made = TypeVar("Made")
 
@@ -44,6 +45,7 @@ class Memory:
         self._facts: dict[Path, tuple[tuple[int, int, int], Facts]] = {}  # of files, with what tells whether they changed
         self._sources: dict[str, TopometricMap | str | Path] = {}
         self._loaded: OrderedDict[str, TopometricMap] = OrderedDict()
+        self._prepared: OrderedDict[str, Any] = OrderedDict()
         self._surfaces: OrderedDict[str, Any] = OrderedDict()
         self._answers: dict[tuple[Hashable, ...], Any] = {}  # that were asked for since the maps were named
         self._before: dict[tuple[Hashable, ...], Any] = {}  # … between that and the time before
@@ -56,6 +58,7 @@ class Memory:
         """
         self._sources = dict(sources)
         self._loaded = OrderedDict((k, m) for k, m in self._loaded.items() if k in sources)
+        self._prepared = OrderedDict((k, p) for k, p in self._prepared.items() if k in sources)
         self._surfaces = OrderedDict((k, s) for k, s in self._surfaces.items() if k in sources)
         self._before, self._answers = self._answers, {}
 
@@ -88,6 +91,11 @@ class Memory:
         """Where a map is loaded from; None of one that is given as it is."""
         source = self._sources[key]
         return None if isinstance(source, TopometricMap) else Path(source)
+
+    def prepared(self, key: str, make: Callable[[], Made]) -> Made:
+        """The plans of a map, one of the last that were asked for or made now."""
+        out: Made = _recent(self._prepared, key, PREPARED_AT_ONCE, make)
+        return out
 
     def surface(self, key: str, make: Callable[[], Made]) -> Made:
         """The surface of a map, one of the last that were asked for or made now."""

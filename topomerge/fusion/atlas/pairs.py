@@ -103,23 +103,27 @@ class Checks:
 
     def place(self, i: int, j: int, pose: Sim3) -> Array:
         """`place` of maps i and j (i < j) under T_ij."""
-        a, b = self.maps.prepared(i), self.maps.prepared(j)
+
+        def made() -> Array:
+            return place(self.maps.prepared(i).storeys, self.maps.prepared(j).storeys, pose)
 
         def make() -> Array:
-            return self.maps.answer(("place", pose), (i, j), lambda: place(a.storeys, b.storeys, pose))
+            return self.maps.answer(("place", pose), (i, j), made)
 
-        return _once(self._places, (i, j), pose, b.middle, make)
+        return _once(self._places, (i, j), pose, self.maps.middle(j), make)
 
     def fine(self, i: int, j: int, pose: Sim3) -> Sim3:
         """T_ij after the fine registration (i < j); as it was where a map is a slice, which has no planes."""
-        a, b = self.maps.prepared(i), self.maps.prepared(j)
-        if any(v.plan.sliced for v in (*a.storeys, *b.storeys)):
+        if self.maps.sliced(i) or self.maps.sliced(j):
             return pose
 
-        def make() -> Sim3:
-            return self.maps.answer(("fine", pose, self.scaled), (i, j), lambda: fine(a, b, pose, self.scaled)[0])
+        def made() -> Sim3:
+            return fine(self.maps.prepared(i), self.maps.prepared(j), pose, self.scaled)[0]
 
-        return _once(self._fine, (i, j), pose, b.middle, make)
+        def make() -> Sim3:
+            return self.maps.answer(("fine", pose, self.scaled), (i, j), made)
+
+        return _once(self._fine, (i, j), pose, self.maps.middle(j), make)
 
     def __call__(self, i: int, j: int, pose: Sim3) -> Check:
         """What maps i and j say to T_ij."""
@@ -130,7 +134,7 @@ class Checks:
         def make() -> Check:
             return self.maps.answer(("check", pose, self.scaled), (i, j), lambda: self._judged(i, j, pose))
 
-        return _once(self._checks, (i, j), pose, self.maps.prepared(j).middle, make)
+        return _once(self._checks, (i, j), pose, self.maps.middle(j), make)
 
     def _judged(self, i: int, j: int, pose: Sim3) -> Check:
         a, b = self.maps.prepared(i).storeys, self.maps.prepared(j).storeys

@@ -212,13 +212,13 @@ class _Explorer:
             counts: pairs that were tried, of each map.
             late: only pairs that are registered already.
         """
+        lies_in = {k: n for n, component in enumerate(assembly.components) for k in component}
+        sure = {k for link in assembly.links if link.log_odds >= SURE_LINK for k in link.maps}
         for k in range(len(self.maps)):
-            component = assembly.of(k)
-            sure = any(link.log_odds >= SURE_LINK for link in assembly.links if k in link.maps)
-            pairs = [((min(k, m), max(k, m)), m in component) for m in self.partners[k]]
+            pairs = [((min(k, m), max(k, m)), lies_in[k] == lies_in[m]) for m in self.partners[k]]
             pairs = [p for p in pairs if p[0] not in self.tried and not (late and not self._is_registered(*p[0]))]
             outside = [pair for pair, within in pairs if not within]
-            inside = [pair for pair, within in pairs if within and not sure and counts[k] < ENOUGH_REGISTRATIONS]
+            inside = [pair for pair, within in pairs if within and k not in sure and counts[k] < ENOUGH_REGISTRATIONS]
             yield from (*outside[:1], *inside[:1])
 
     def _is_registered(self, i: int, j: int) -> bool:

@@ -6,7 +6,8 @@
 | maps/NAME.tmap | copies of the maps |
 | pairs.json | registrations made so far, by the hashes of the maps; it may be deleted |
 | map_N.tmap, merged_N.ply | the joined map of component N |
-| report.html | everything to look at |
+| report.html | everything to look at; of more than four joined maps it names their pages |
+| map_N.html | the page of component N, then |
 | report_stamp.css | which report that is: an open page that has another one loads itself anew |
 | watch.json | which files gave which maps (`sources`) |
 
@@ -18,29 +19,30 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from topomerge import __version__
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.assembly import Link
+from topomerge.fusion.atlas.atlas_json import atlas_to_json, component_to_json, shown_of
 from topomerge.fusion.atlas.folder import changing, link_or_copy
-from topomerge.fusion.atlas.maps import Maps
+from topomerge.fusion.atlas.maps import MapFiles, Maps
 from topomerge.fusion.atlas.memory import Memory, map_key
 from topomerge.fusion.atlas.registration_cache import PAIRS_FILE, Journal, registrations_to_json
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import AtlasSettings, Pace, Proposed, solve
-from topomerge.fusion.atlas.stored import ATLAS_FORMAT, Entry, Stored, check_folder, held_by, read_atlas
+from topomerge.fusion.atlas.stored import Entry, Stored, check_folder, held_by, read_atlas
 from topomerge.fusion.atlas.workers import Workers
-from topomerge.fusion.result import transform_to_json
-from topomerge.io.listing import json_text, plain
-from topomerge.io.maps import load_map, save_map
+from topomerge.io.listing import json_text
+from topomerge.io.maps import save_map
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.types import Sim3, TopometricMap
 
-Report = Callable[..., str]  # (atlas, joined map of each component, title, stamp=…) -> HTML
+Report = Callable[..., str]  # (atlas, joined maps, title, stamp=…, pages=…), of one of them (…, component=…) -> HTML
+JOINED_ON_ONE_PAGE = 4  # joined maps; of more each has a page of its own
 STAMP_FILE = "report_stamp.css"
 
 
@@ -50,14 +52,14 @@ class Change:
 
     Args:
         stored: its maps and settings.
-        new: those that it does not hold yet, by their names.
+        new: those that it does not hold yet, or their files, by their names.
         proposed: as of `solve`, beside those of the links that there are.
         files: others that are written with it, name -> text.
         seconds: after which no more pairs are registered: what is left is for the next change.
     """
 
     stored: Stored
-    new: Mapping[str, TopometricMap] = field(default_factory=dict)
+    new: Mapping[str, TopometricMap | Path] = field(default_factory=dict)
     proposed: Proposed = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
     seconds: float = float("inf")
@@ -65,7 +67,7 @@ class Change:
 
 def add(
     folder: str | Path,
-    maps: Sequence[tuple[str, TopometricMap]],
+    maps: Iterable[tuple[str, TopometricMap]],
     report: Report,
     workers: Workers | None = None,
     **settings: Any,
@@ -74,7 +76,8 @@ def add(
 
     Args:
         folder: of the atlas.
-        maps: name, map; where a name is taken already, a number is put behind it.
+        maps: name, map; where a name is taken already, a number is put behind it. Only one is in memory at once, if they are made
+            one after the other.
         report: makes report.html (`topomerge.atlas_html`).
         workers: register pairs in place of this process (`workers.processes`, `workers.cluster`).
         settings: ``scale``, ``threshold``, ``embedder`` of `atlas`; they stay those of the atlas.
@@ -83,20 +86,25 @@ def add(
         InputError: the folder is no atlas, a map is in it already, or what `atlas` says of the maps.
     """
     check_folder(folder)
+    with tempfile.TemporaryDirectory(prefix="topomerge-") as spool:
+        entries = []
+        for k, (name, m) in enumerate(maps):
+            entries.append(entry_of(name, m, Stored(Path(folder))))
+            save_map(m, Path(spool) / f"{k}.tmap")
 
-    def with_maps(stored: Stored) -> Change:
-        stored = replace(stored, settings={**stored.settings, **settings})
-        new = {}
-        for name, m in maps:
-            entry = entry_of(name, m, stored)
-            same = stored.named(entry.key)
-            if same is not None:
-                raise InputError(f"{m.source or name}: is in the atlas already, as {same}; leave it out")
-            stored = replace(stored, entries=(*stored.entries, entry))
-            new[entry.name] = m
-        return Change(stored, new)
+        def with_maps(stored: Stored) -> Change:
+            stored = replace(stored, settings={**stored.settings, **settings})
+            new = {}
+            for k, entry in enumerate(entries):
+                same = stored.named(entry.key)
+                if same is not None:
+                    raise InputError(f"{entry.source}: is in the atlas already, as {same}; leave it out")
+                entry = replace(entry, name=_free_name(entry.name, stored.entries))
+                stored = replace(stored, entries=(*stored.entries, entry))
+                new[entry.name] = Path(spool) / f"{k}.tmap"
+            return Change(stored, new)
 
-    return change(folder, with_maps, report, workers=workers)
+        return change(folder, with_maps, report, workers=workers)
 
 
 def remove(folder: str | Path, names: Sequence[str], report: Report) -> AtlasResult:
@@ -159,25 +167,25 @@ def change(
         stored = wanted.stored
         (place / "maps").mkdir()
         for entry in stored.entries:
-            if entry.name in wanted.new:
-                save_map(wanted.new[entry.name], place / entry.file)
+            new = wanted.new.get(entry.name)
+            if isinstance(new, Path):
+                link_or_copy(new, place / entry.file)
+            elif new is not None:
+                save_map(new, place / entry.file)
         files = [place / e.file if e.name in wanted.new else folder / e.file for e in stored.entries]
         names, keys = [e.name for e in stored.entries], [e.key for e in stored.entries]
         registrations = Journal(folder, stored.settings)
         choices, proposed = AtlasSettings(**stored.settings), {**before.lying(), **wanted.proposed}
         atlas = solve(files, choices, registrations, names, keys, proposed, memory, Pace(wanted.seconds, answered, workers))
         atlas = atlas.in_frames({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
-        joined, components = {}, []
-        for n, members in enumerate(atlas.components):
-            component = _component(atlas, stored, n)
-            if len(members) > 1:
-                component |= {"map": f"map_{n}.tmap", "ply": f"merged_{n}.ply"}
-                joined[n] = _joined(atlas, n, component, before, place)
-            components.append(component)
-        listing = _listing(atlas, stored, components)
+        components = [component_to_json(atlas, stored, n) for n in range(len(atlas.components))]
+        joined = _joined(atlas, components, before, place)
+        title = folder.resolve().name
+        pages = _pages(atlas, components, before, place, title, partial(report, atlas, joined, title))
+        listing = atlas_to_json(atlas, stored, components)
         pairs = json.dumps(registrations_to_json(registrations, keys, stored.settings))
         stamp = hashlib.sha256(json_text(listing | {"seconds": 0}).encode()).hexdigest()[:16]
-        page = report(atlas, joined, folder.resolve().name, stamp=stamp)
+        page = report(atlas, joined, title, stamp=stamp, pages=pages)
         css = f':root {{ --stamp: "{stamp}"; }}\n'
         texts = {PAIRS_FILE: pairs, "report.html": page, STAMP_FILE: css, "atlas.json": json_text(listing)}
         for name, text in (texts | dict(wanted.files)).items():
@@ -191,59 +199,41 @@ def _write(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8", errors="replace", newline="\n")
 
 
-def _joined(atlas: AtlasResult, n: int, component: dict[str, Any], before: Stored, place: Path) -> TopometricMap:
-    """The joined map of a component, written; copied where the atlas had the same before."""
+def _joined(atlas: AtlasResult, components: Sequence[dict[str, Any]], before: Stored, place: Path) -> Mapping[int, TopometricMap]:
+    """The joined maps, written one after the other, copied where the atlas had the same before; read when they are asked for."""
+    files = {}
+    for n, component in enumerate(components):
+        if len(component["maps"]) < 2:
+            continue
+        component |= {"map": f"map_{n}.tmap", "ply": f"merged_{n}.ply"}
+        files[n] = place / component["map"]
+        if not _copied(before, component, "made_of", ("map", "ply"), place):
+            joined = atlas.joined(n)
+            save_map(joined, files[n])
+            save_rooms_ply(joined, place / component["ply"])
+    return MapFiles(files)
+
+
+def _pages(
+    atlas: AtlasResult, components: Sequence[dict[str, Any]], before: Stored, place: Path, title: str, page: Report
+) -> dict[int, str]:
+    """Of more joined maps than one page shows, the page of each, written like the maps."""
+    joined = [n for n, component in enumerate(components) if "map" in component]
+    if len(joined) <= JOINED_ON_ONE_PAGE:
+        return {}
+    for n in joined:
+        components[n] |= {"page": f"map_{n}.html", "shown": shown_of(atlas, n, components[n], title)}
+        if not _copied(before, components[n], "shown", ("page",), place):
+            _write(place / components[n]["page"], page(component=n))
+    return {n: components[n]["page"] for n in joined}
+
+
+def _copied(before: Stored, component: Mapping[str, Any], digest: str, kinds: Sequence[str], place: Path) -> bool:
+    """Take files over from the atlas before, where it has a component with the same digest."""
     for old in (before.listing or {}).get("components", []):
-        there = all((before.folder / old.get(kind, "?")).is_file() for kind in ("map", "ply"))
-        if there and old.get("made_of") == component["made_of"]:
-            for kind in ("map", "ply"):
+        there = all((before.folder / old.get(kind, "?")).is_file() for kind in kinds)
+        if there and old.get(digest) == component[digest]:
+            for kind in kinds:
                 link_or_copy(before.folder / old[kind], place / component[kind])
-            return load_map(place / component["map"])
-    joined = atlas.joined(n)
-    save_map(joined, place / component["map"])
-    save_rooms_ply(joined, place / component["ply"])
-    return joined
-
-
-def _component(atlas: AtlasResult, stored: Stored, n: int) -> dict[str, Any]:
-    members = atlas.components[n]
-    digest = hashlib.sha256(__version__.encode())
-    for k in members:
-        digest.update(stored.entries[k].key.encode() + atlas.transforms[k].matrix.tobytes())
-    return {
-        "maps": list(members),
-        "names": [stored.entries[k].name for k in members],
-        "probability": round(atlas.probability(n), 4),
-        "made_of": digest.hexdigest()[:16],
-    }
-
-
-def _listing(atlas: AtlasResult, stored: Stored, components: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """atlas.json, see docs/outputs.md."""
-    into = {k: members[0] for members in atlas.components for k in members}
-    moved = sorted(k for k, first in into.items() if k != first or atlas.transforms[k] != Sim3())
-    poses = {str(k): transform_to_json(atlas.transforms[k], atlas.residuals[k], into[k]) for k in moved}
-    maps = [
-        {"name": e.name, "file": e.file, "key": e.key, "source": e.source, "rooms": e.rooms, "storeys": e.storeys}
-        | ({} if e.frame == Sim3() else {"frame": e.frame.matrix.tolist()})
-        for e in stored.entries
-    ]
-    listing = {
-        "format": ATLAS_FORMAT,
-        "status": atlas.status,
-        "reason": atlas.words(),
-        "settings": dict(stored.settings),
-        "maps": maps,
-        "components": components,
-        "transforms": poses,
-        "links": [_link(link) | {"probability": round(link.probability, 4)} for link in atlas.links],
-        "thrown_out": [_link(link) | {"against": link.against} for link in atlas.rejected],
-        "registered": {"pairs": atlas.registered[0], "of": atlas.registered[1], "complete": atlas.complete},
-        "seconds": round(atlas.seconds, 3),
-    }
-    plain_listing: dict[str, Any] = plain(listing)
-    return plain_listing
-
-
-def _link(link: Link) -> dict[str, Any]:
-    return {"maps": link.maps, "by_itself": round(link.hypothesis.probability, 4)}
+            return True
+    return False

@@ -57,7 +57,7 @@ class Stored:
 
     def files(self) -> list[str]:
         """All that belongs to the atlas but atlas.json."""
-        joined = [c[kind] for c in (self.listing or {}).get("components", []) for kind in ("map", "ply") if kind in c]
+        joined = [c[kind] for c in (self.listing or {}).get("components", []) for kind in ("map", "ply", "page") if kind in c]
         return [e.file for e in self.entries] + joined
 
     def named(self, key: str) -> str | None:

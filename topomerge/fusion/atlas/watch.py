@@ -220,7 +220,8 @@ class _Plan:
         first = next(iter(stored.entries), None)
         if first is not None and stored.settings["scale"] == "fixed":
             try:
-                check_units(wanted.new.get(first.name) or self.watch.memory.facts(stored.folder / first.file).extent, map)
+                there = wanted.new.get(first.name) or stored.folder / first.file
+                check_units(self.watch.memory.facts(there).extent, map)
             except InputError as error:
                 self.lines.append((f"{name}: {error}", True))
                 self.counts["unreadable"] += 1
