@@ -43,7 +43,7 @@ from topomerge.viz.atlas_report import atlas_html
 
 RESULTS = SCALE_CACHE / "results.jsonl"
 DRAWN_FROM = 100  # maps of the atlas whose registrations the drawn ones are like
-COLUMNS = (
+SCALE_COLUMNS = (
     *("maps", "buildings", "registrations", "pairs a map", "right links", "wrong links", "placed right", "of", "wrong", "alone"),
     *(
         "s registering",
@@ -213,10 +213,10 @@ def main(count: int, drawn: bool, at_once: bool) -> None:
     done = subprocess.run([sys.executable, "-m", "benchmarks.merging.scale", *words], stdout=subprocess.PIPE, check=True, env=one)
     with RESULTS.open("a") as out:
         out.write(done.stdout.decode().splitlines()[-1] + "\n")
-    print("| " + " | ".join(("registrations", *COLUMNS)) + " |\n" + "|---" * (len(COLUMNS) + 1) + "|")
+    print("| " + " | ".join(("registrations", *SCALE_COLUMNS)) + " |\n" + "|---" * (len(SCALE_COLUMNS) + 1) + "|")
     for row in map(json.loads, RESULTS.read_text().splitlines()):
         how = ("drawn" if row["drawn"] else "made") + (", assembled at once" if row["at once"] else "")
-        print("| " + " | ".join(str(v) for v in (how, *(row[c] for c in COLUMNS))) + " |")
+        print("| " + " | ".join(str(v) for v in (how, *(row[c] for c in SCALE_COLUMNS))) + " |")
 
 
 if __name__ == "__main__":

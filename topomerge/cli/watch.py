@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_outputs, failure_line, say, signal_behind, warn
@@ -47,10 +47,10 @@ def watch_command(args: argparse.Namespace) -> int:
 
     log = _rerun_log(args)
 
-    def report(result: AtlasResult, joined: Mapping[int, TopometricMap], title: str, stamp: str) -> str:
-        if log is not None:
+    def report(result: AtlasResult, joined: Mapping[int, TopometricMap], title: str, **words: Any) -> str:
+        if log is not None and "component" not in words:  # once, with the page of all
             log.log(result, joined)
-        return atlas_html(result, joined, title, stamp=stamp)
+        return atlas_html(result, joined, title, **words)
 
     watch = Watch(
         Path(args.folder),

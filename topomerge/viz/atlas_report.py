@@ -43,7 +43,7 @@ def atlas_html(
     """
     if component is not None:
         return _component_html(result, component, joined[component], title)
-    sections = [_verdict(result), warnings(result.warnings)]
+    sections = [_verdict(result, _counts(result) if pages else result.words().split("; ")), warnings(result.warnings)]
     data: dict[str, Any] = {}
     if pages:
         sections.append(_index(result, pages))
@@ -90,11 +90,18 @@ def _linked(words: str, file: str | None) -> str:
     return words if file is None else element("a", words, href=file)
 
 
-def _verdict(result: AtlasResult) -> Markup:
+def _verdict(result: AtlasResult, parts: Iterable[str]) -> Markup:
     head = {"merged": "All maps belong together", "parted": "Some maps belong together", "abstained": "Nothing is believed"}
-    parts = result.words().split("; ")
     words = [element("b", head[result.status]), element("ul", *(element("li", part) for part in parts))]
     return element("div", *words, class_="verdict" if result.status != "abstained" else "verdict refused")
+
+
+def _counts(result: AtlasResult) -> list[str]:
+    """What came out, where the names of all maps would fill a page."""
+    joined = [members for members in result.components if len(members) > 1]
+    counts = [f"{sum(map(len, joined))} of {len(result.names)} maps, in {len(joined)} joined maps"]
+    counts += [f"stand apart: {len(result.alone)}"] if result.alone else []
+    return counts + ([f"matches that were thrown out: {len(result.rejected)}"] if result.rejected else [])
 
 
 def _names(result: AtlasResult, members: Iterable[int]) -> str:

@@ -82,6 +82,7 @@ def test_each_joined_map_has_its_page_and_the_report_names_them(tmp_path: Path) 
     assert [c.get("page") for c in listing["components"]] == ["map_0.html", "map_1.html", None]
     index, page = ((folder / name).read_text(encoding="utf-8") for name in ("report.html", "map_1.html"))
     assert 'href="map_0.html"' in index and 'href="map_1.html"' in index and 'id="joined-' not in index
+    assert "4 of 5 maps, in 2 joined maps" in index and "stand apart: 1" in index
     assert 'id="joined-1"' in page and 'id="scene-data"' in page and 'href="report.html"' in page
     assert "room-2" in page and "room-3" in page and "room-0" not in page and "room-4" not in page
 
