@@ -62,10 +62,10 @@ def planes(parts: Array, ceiling: Array, looked: Array) -> Array:
 
 def _pooled(layer: Array) -> Array:
     """(k, SIDE / 4, SIDE / 4) float32 mean over 4 x 4 pixels."""
-    total = layer[:, ::POOLED].astype(np.uint8 if layer.dtype == bool else np.float32)
+    total: Array = layer[:, ::POOLED].astype(np.uint8 if layer.dtype == bool else np.float32)
     for n in range(1, POOLED):
         total += layer[:, n::POOLED]
-    across = total[:, :, ::POOLED].copy()
+    across: Array = total[:, :, ::POOLED].copy()
     for n in range(1, POOLED):
         across += total[:, :, n::POOLED]
     out: Array = across / np.float32(POOLED**2)
