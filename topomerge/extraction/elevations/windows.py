@@ -23,7 +23,7 @@ WINDOW = WALL_CLASSES.index("window")
 SAME_WINDOW = 0.5  # share of the narrower of two that lies in the other one, from which they are one
 SAME_WALL, SAME_FLOOR = 0.6, 0.75  # m across and in height, to be in one wall
 TURNED_AWAY = 0.26  # sine of the angle between two walls that are not one
-SIDES = (0.1, 0.9)  # m from a window: where the floors of its rooms begin
+SIDES = (0.3, 1.0)  # m from a window: where its rooms have their floors, which reach a little into walls
 FACE_DEPTHS = slice(round((BEFORE - 0.05) / ACROSS), round((BEFORE + 0.05) / ACROSS))  # elements in which a face lies
 BESIDE = 5  # places beside a window that show how full its wall is
 LEAST_FILL = 0.15  # of the elements of a wall: in emptier ones no sill shows
@@ -56,8 +56,9 @@ def windows_on_walls(walls: Elevations, chance: Array) -> Array:
 
 
 def in_map(map: TopometricMap, rows: Array) -> Array:
-    """(W,) WINDOW_DTYPE of the windows that lie beside a floor of the map, with the rooms on their two sides, in the order of
-    these; without those that lead from a room into itself, and those where a door is.
+    """(W,) WINDOW_DTYPE of the windows with the rooms on their two sides, in the order of these; without those where a door is.
+
+    A floor that goes on behind a window, seen through it, is often taken for one with the room: then there is no second room.
 
     Args:
         rows: WINDOW_DTYPE in the map's frame; their rooms stay where no floor is near.
@@ -68,10 +69,10 @@ def in_map(map: TopometricMap, rows: Array) -> Array:
     sides = _rooms_beside(map, rows)
     unseen = (sides < 0).all(axis=1)
     sides[unseen] = rows["rooms"][unseen]
+    sides[sides[:, 0] == sides[:, 1], 1] = -1
     both = (sides >= 0).all(axis=1)
     rows["rooms"] = np.where(both[:, None], np.sort(sides, axis=1), -np.sort(-sides, axis=1))
-    fits = (sides[:, 0] != sides[:, 1]) & ~_at_doors(map, rows)
-    rows = rows[fits]
+    rows = rows[~_at_doors(map, rows)]
     return rows[np.lexsort((*rows["centre"].T[::-1], *rows["rooms"].T[::-1]))]
 
 
