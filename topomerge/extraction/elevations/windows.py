@@ -61,7 +61,7 @@ def in_map(map: TopometricMap, rows: Array) -> Array:
     A floor that goes on behind a window, seen through it, is often taken for one with the room: then there is no second room.
 
     Args:
-        rows: WINDOW_DTYPE in the map's frame; their rooms stay where no floor is near.
+        rows: WINDOW_DTYPE in the map's frame; their rooms stay where no floor is near, and those without any are left out.
     """
     if not len(rows) or not len(map.rooms):
         return np.zeros(0, WINDOW_DTYPE)
@@ -72,7 +72,7 @@ def in_map(map: TopometricMap, rows: Array) -> Array:
     sides[sides[:, 0] == sides[:, 1], 1] = -1
     both = (sides >= 0).all(axis=1)
     rows["rooms"] = np.where(both[:, None], np.sort(sides, axis=1), -np.sort(-sides, axis=1))
-    rows = rows[~_at_doors(map, rows)]
+    rows = rows[(rows["rooms"][:, 0] >= 0) & ~_at_doors(map, rows)]
     return rows[np.lexsort((*rows["centre"].T[::-1], *rows["rooms"].T[::-1]))]
 
 
