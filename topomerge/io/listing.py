@@ -16,8 +16,8 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
 
 `completeness` is the share of a floor's outline at which a wall was seen; `confidence` the probability that it is a room, `whole`
 that most of it was seen, `entered` that the sensor was in it, `outside` that it is out of doors; `glimpsed` rooms were probably
-only looked into. `kind` is door, opening or stairs; `direction` is that of the wall's normal seen from above, from x towards y. The
-second room of a window is null where it leads out of doors; `sill` and `head` are m above the floor.
+only looked into. `kind` is door, opening or stairs; `direction` is that of the wall's normal seen from above, from x towards y.
+The second room of a window is null where it leads out of doors; `sill` and `head` are m above the floor.
 """
 
 from __future__ import annotations

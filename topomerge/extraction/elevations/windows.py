@@ -24,7 +24,8 @@ SAME_WINDOW = 0.5  # share of the narrower of two that lies in the other one, fr
 SAME_WALL, SAME_FLOOR = 0.6, 0.75  # m across and in height, to be in one wall
 TURNED_AWAY = 0.26  # sine of the angle between two walls that are not one
 SIDES = (0.3, 1.0)  # m from a window: where its rooms have their floors, which reach a little into walls
-FACE_DEPTHS = slice(round((BEFORE - 0.05) / ACROSS), round((BEFORE + 0.05) / ACROSS))  # elements in which a face lies
+FACE_OFF = 0.1  # m between a face and its line, as walls are bent by drift
+BELOW_WINDOWS = slice(1, 4)  # bands in which a face shows below most windows
 BESIDE = 5  # places beside a window that show how full its wall is
 LEAST_FILL = 0.15  # of the elements of a wall: in emptier ones no sill shows
 
@@ -107,12 +108,15 @@ def _window(face: Array, chance: Array, strip: Array, start: int, stop: int) -> 
 def _heights(strip: Array, start: int, stop: int) -> tuple[float, float]:
     """m above the floor of sill and head of a stretch, nan where they do not show: the bands of the face that are mostly empty,
     and as much of those below and above them as is."""
+    inner = slice((start + 1) * PLACES, (stop - 1) * PLACES)
     reach = slice(max(start - BESIDE, 0) * PLACES, (stop + BESIDE) * PLACES)
-    face = np.minimum(strip[:, FACE_DEPTHS, :BANDS].sum(axis=1), 1.0)
+    nearest, farthest = round((BEFORE - FACE_OFF) / ACROSS), round((BEFORE + FACE_OFF) / ACROSS)
+    depth = nearest + int(strip[inner, nearest:farthest, BELOW_WINDOWS].mean(axis=0).sum(axis=1).argmax())
+    face = strip[:, depth - 1 : depth + 1, :BANDS].max(axis=1)
     full = float(np.quantile(face[reach].mean(axis=0), 0.75))
     if full < LEAST_FILL:
         return np.nan, np.nan
-    empty = 1 - np.minimum(face[(start + 1) * PLACES : (stop - 1) * PLACES].mean(axis=0) / full, 1.0)
+    empty = 1 - np.minimum(face[inner].mean(axis=0) / full, 1.0)
     runs = np.flatnonzero(np.diff(np.concatenate([[0], empty > 0.5, [0]]))).reshape(-1, 2)
     if not len(runs):
         return np.nan, np.nan
