@@ -1,7 +1,7 @@
 """Windows of maps against the true ones: which are there, of which nothing is, and how far off they are.
 
 ``python -m benchmarks.extraction.windows --write docs/results/rooms.md`` scans buildings of the validation list with five sensors
-and makes a map of each: those of the benchmark of doors by a laser scanner and a depth camera, others by a walked laser scanner, a
+and makes a map of each: those of the benchmark of doors by a laser scanner and a depth camera, others by a walked laser, a
 tablet and a camera. It also judges the class `window` by places, on the cached walls of scans that trained nothing, where
 ``cache/walls`` has them (`python train.py task=wall_segmentation` makes them). Scans are kept under ``cache/scans/``.
 
@@ -38,7 +38,17 @@ OTHER_SENSORS = ("lidar", "tablet", "mono")
 WINDOW_SEEDS, WINDOW_TRAINING = 800_740, 5_740  # first seeds
 OF_ROOM = 0.6  # m between a window and its room
 LEAST_IOU, ACROSS_WALL, ONE_LEVEL = 0.5, 0.6, 0.75  # of two windows that are one: along, across (m) and in height (m)
-WINDOW_COLUMNS = ("sensor", "scans", "true windows", "precision", "recall", "off, m", "width off, m", "sill off, m", "head off, m")
+WINDOW_COLUMNS = (
+    "sensor",
+    "scans",
+    "true windows",
+    "precision",
+    "recall",
+    "off, m",
+    "width off, m",
+    "sill off, m",
+    "head off, m",
+)
 Row = dict[str, Any]
 
 
@@ -131,7 +141,9 @@ def places(listing: Path, folder: Path) -> str:
 
 def main(words: list[str] | None = None) -> int:
     """See the text at the top."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.extraction.windows", description=(__doc__ or "").partition("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.extraction.windows", description=(__doc__ or "").partition("\n")[0]
+    )
     parser.add_argument("--write", type=Path, help="a document whose section between the marks `windows` is written anew")
     parser.add_argument("--dev", action="store_true", help="buildings of the training list")
     parser.add_argument("--scans", type=Path, default=Path("cache/scans"), help="where scans are kept")

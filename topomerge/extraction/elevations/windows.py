@@ -17,15 +17,14 @@ from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, BEFO
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.types import WINDOW_DTYPE, Array, TopometricMap
 
-WINDOW_CHANCE, LIKELY_WINDOW = 0.5, 0.8  # probability of a window of every place of it, and on average
+WINDOW_CHANCE, LIKELY_WINDOW = 0.5, 0.85  # probability of a window of every place of it, and on average
 LEAST_WINDOW = 0.4  # m, width
 WINDOW = WALL_CLASSES.index("window")
 SAME_WINDOW = 0.5  # share of the narrower of two that lies in the other one, from which they are one
 SAME_WALL, SAME_FLOOR = 0.6, 0.75  # m across and in height, to be in one wall
 TURNED_AWAY = 0.26  # sine of the angle between two walls that are not one
 SIDES = (0.3, 1.0)  # m from a window: where its rooms have their floors, which reach a little into walls
-FACE_OFF = 0.1  # m between a face and its line, as walls are bent by drift
-BELOW_WINDOWS = slice(1, 4)  # bands in which a face shows below most windows
+BESIDE_WINDOWS, ABOVE_WINDOWS = slice(5, 12), slice(11, 13)  # bands in which walls show beside windows, and above most
 BESIDE = 5  # places beside a window that show how full its wall is
 LEAST_FILL = 0.15  # of the elements of a wall: in emptier ones no sill shows
 
@@ -98,21 +97,34 @@ def _runs(chance: Array) -> Iterator[tuple[int, int]]:
 def _window(face: Array, chance: Array, strip: Array, start: int, stop: int) -> tuple[object, ...]:
     """Row of WINDOW_DTYPE of one stretch of a face."""
     step = PLACES * ALONG
-    middle = face["start"] + (start + stop) / 2 * step * face["along"] + HALF_WALL * face["out"]
+    depth = _wall_depth(strip, start, stop)
+    off = (depth + 0.5) * ACROSS - BEFORE + HALF_WALL
+    middle = face["start"] + (start + stop) / 2 * step * face["along"] + off * face["out"]
     direction = float(np.arctan2(face["out"][1], face["out"][0]) % np.pi)
     centre = (*middle.tolist(), float(face["floor"]))
     likely = float(chance[start:stop].mean())
-    return (int(face["room"]), -1), centre, (stop - start) * step, *_heights(strip, start, stop), direction, likely
+    return (int(face["room"]), -1), centre, (stop - start) * step, *_heights(strip, start, stop, depth), direction, likely
 
 
-def _heights(strip: Array, start: int, stop: int) -> tuple[float, float]:
+def _wall_depth(strip: Array, start: int, stop: int) -> int:
+    """Element across the strip in which the wall of a window lies, by what is beside and above it: a cupboard before a window has
+    a face, too, and its strip shows the window behind it."""
+    left, right = (strip[slice(*ends)] for ends in _beside(start, stop))
+    beside = np.concatenate([left, right])[:, :, BESIDE_WINDOWS].sum(axis=(0, 2))
+    return int((beside + strip[start * PLACES : stop * PLACES, :, ABOVE_WINDOWS].sum(axis=(0, 2))).argmax())
+
+
+def _beside(start: int, stop: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """First element and that after the last one of both sides of a stretch."""
+    return (max(start - BESIDE, 0) * PLACES, start * PLACES), (stop * PLACES, (stop + BESIDE) * PLACES)
+
+
+def _heights(strip: Array, start: int, stop: int, depth: int) -> tuple[float, float]:
     """m above the floor of sill and head of a stretch, nan where they do not show: the bands of the face that are mostly empty,
     and as much of those below and above them as is."""
     inner = slice((start + 1) * PLACES, (stop - 1) * PLACES)
     reach = slice(max(start - BESIDE, 0) * PLACES, (stop + BESIDE) * PLACES)
-    nearest, farthest = round((BEFORE - FACE_OFF) / ACROSS), round((BEFORE + FACE_OFF) / ACROSS)
-    depth = nearest + int(strip[inner, nearest:farthest, BELOW_WINDOWS].mean(axis=0).sum(axis=1).argmax())
-    face = strip[:, depth - 1 : depth + 1, :BANDS].max(axis=1)
+    face = strip[:, max(depth - 1, 0) : depth + 1, :BANDS].max(axis=1)
     full = float(np.quantile(face[reach].mean(axis=0), 0.75))
     if full < LEAST_FILL:
         return np.nan, np.nan
