@@ -21,7 +21,7 @@ WINDOW_CHANCE, LIKELY_WINDOW = 0.5, 0.85  # probability of a window of every pla
 LEAST_WINDOW = 0.4  # m, width
 WINDOW = WALL_CLASSES.index("window")
 SAME_WINDOW = 0.5  # share of the narrower of two that lies in the other one, from which they are one
-SAME_WALL, SAME_FLOOR = 0.6, 0.75  # m across and in height, to be in one wall
+SAME_WALL, WINDOW_LEVEL = 0.6, 0.75  # m across and in height, to be in one wall
 TURNED_AWAY = 0.26  # sine of the angle between two walls that are not one
 SIDES = (0.3, 1.0)  # m from a window: where its rooms have their floors, which reach a little into walls
 BESIDE_WINDOWS, ABOVE_WINDOWS = slice(5, 12), slice(11, 13)  # bands in which walls show beside windows, and above most
@@ -170,7 +170,7 @@ def _in_place(window: Array, centres: Array, widths: Array) -> Array:
     apart, along = centres - window["centre"], _along(window)
     place, across = apart[:, :2] @ along, np.abs(apart[:, 0] * along[1] - apart[:, 1] * along[0])
     shared = (widths + window["width"]) / 2 - np.abs(place)
-    level = np.abs(apart[:, 2]) < SAME_FLOOR
+    level = np.abs(apart[:, 2]) < WINDOW_LEVEL
     fits: Array = level & (across < SAME_WALL) & (shared > SAME_WINDOW * np.minimum(widths, window["width"]))
     return fits
 
@@ -184,7 +184,7 @@ def _at_doors(map: TopometricMap, rows: Array) -> Array:
 def _rooms_beside(map: TopometricMap, rows: Array) -> Array:
     """(W, 2) the rooms whose floors are the nearest on either side, -1 none."""
     inside = map.navigable_room >= 0
-    flat = np.array([1, 1, STOOD / SAME_FLOOR])
+    flat = np.array([1, 1, STOOD / WINDOW_LEVEL])
     floor, room = map.navigable.centroids(map.navigable.cells[inside]) * flat, map.navigable_room[inside]
     steps = np.arange(SIDES[0], SIDES[1] + 0.05, 0.1)[:, None] * np.array([-1.0, 1.0])
     shift = rows["width"][:, None] / 4 * np.array([0.0, -1.0, 1.0])
