@@ -98,7 +98,7 @@ def table(rows: list[Row]) -> str:
                 continue
             total = {name: sum(r[name] for r in some) for name in (*STATES, "right", "said")}
             count = sum(int(total[name][1]) for name in STATES)
-            shares = [_share(total[name]) for name in (*STATES, "right", "said")]
+            shares = [share(total[name]) for name in (*STATES, "right", "said")]
             edges = np.nanmean([r["edges"] for r in some], axis=0)
             rest = [*edges, np.mean([r["iou"] for r in some]), np.mean([r["seconds"] for r in some])]
             how = "plan and walls" if walls else "plan"
@@ -106,7 +106,8 @@ def table(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
-def _share(counts: Iterable[int]) -> str:
+def share(counts: Iterable[int]) -> str:
+    """Right ones of all, in words."""
     right, every = counts
     return f"{right / every:.2f} ({right} of {every})" if every else "none"
 

@@ -216,6 +216,11 @@ def _doors(building: Building, shut: bool) -> Sequence[tuple[float, ...]]:
 
 def panes(building: Building) -> list[tuple[float, ...]]:
     """Windows: their middle at the height of the floor, direction of the normal (rad), width and depth of the reveal (m)."""
+    return [(*place, 0.3) for *place, _, _ in glazed(building)]
+
+
+def glazed(building: Building) -> list[tuple[float, ...]]:
+    """Windows: their middle at the height of the floor, direction of the normal (rad), width, and sill and head above the floor (m)."""
     glass = building.triangles[building.labels == SURFACES.index("glass")]
     windows = []
     for triangle in glass[::2]:  # two make a pane
@@ -227,5 +232,5 @@ def panes(building: Building) -> list[tuple[float, ...]]:
         wide = ends[1] - ends[0]
         if low > floor + LOW_SILL and high > low and np.hypot(*wide) > 0.2:
             direction = float(np.arctan2(wide[1], wide[0]) + np.pi / 2)
-            windows.append((*ends.mean(axis=0).tolist(), floor, direction, float(np.hypot(*wide)), 0.3))
+            windows.append((*ends.mean(axis=0).tolist(), floor, direction, float(np.hypot(*wide)), low - floor, high - floor))
     return windows

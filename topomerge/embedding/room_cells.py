@@ -68,6 +68,7 @@ def joined(map: TopometricMap, members: Array) -> TopometricMap:
         areas=map.areas[:0],
         navigable_area=None,
         narrows=np.zeros(0, EDGE_DTYPE),
+        windows=map.windows[:0],
         free=None,
         provenance=None,
     )

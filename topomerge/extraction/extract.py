@@ -6,7 +6,10 @@ from collections.abc import Iterable
 from dataclasses import asdict, replace
 from typing import Any
 
+from topomerge.extraction.elevations.doorways import place_classes
+from topomerge.extraction.elevations.elevation import wall_elevations
 from topomerge.extraction.elevations.wall_doors import with_wall_doors
+from topomerge.extraction.elevations.windows import with_windows
 from topomerge.extraction.free_space import free_space
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
@@ -66,7 +69,7 @@ def extract(
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
 
     watch.begin("odds of rooms, doors on walls", 0.87)
-    map, doubts = _with_odds_and_doors(map, scan, p)
+    map, doubts = _with_odds_and_openings(map, scan, p)
 
     watch.begin("free space", 0.9)
     free = free_space(scan, navigable, p.range) if p.carve else scan.free
@@ -82,15 +85,19 @@ def extract(
     )
 
 
-def _with_odds_and_doors(map: TopometricMap, scan: Scan, p: Parameters) -> tuple[TopometricMap, list[str]]:
-    """The map with how likely each room is one, with the doors that its walls show, and with those that the sensor was carried
-    through; and what is odd about its way."""
+def _with_odds_and_openings(map: TopometricMap, scan: Scan, p: Parameters) -> tuple[TopometricMap, list[str]]:
+    """The map with how likely each room is one, with the doors and windows that its walls show, and with the doors that the
+    sensor was carried through; and what is odd about its way."""
     if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
         return replace(map, rooms=with_outline_odds(map.rooms)), []
     map = with_room_odds(map, scan.rays)
-    if p.walls and scan.fine is not None:
-        map = with_wall_doors(map, scan.fine)
+    walls = wall_elevations(map, scan.fine) if p.walls and scan.fine is not None and len(map.rooms) else None
+    if walls is not None:
+        classes = place_classes(walls)
+        map = with_wall_doors(map, walls, classes)
     map, doubt = with_walked_doors(map, scan.places)
+    if walls is not None:
+        map = with_windows(map, walls, classes)
     return map, [doubt] if doubt else []
 
 

@@ -23,6 +23,7 @@ from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.joined_doors import joined_rooms, laid_floor, with_doors
+from topomerge.fusion.joined_windows import laid_windows, with_joined_windows
 from topomerge.fusion.resampling import Laying, decoded, encoded, resampled
 from topomerge.fusion.single_walls import copies
 from topomerge.fusion.storey_levels import extruded
@@ -65,11 +66,15 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     cells = _JoinedCells(maps[poses[0][0]].grid.origin, _edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     layings = [Laying.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
+    windows = []
     for n in order:
-        cells.add_map(maps[poses[n][0]], layings[n], int(first_bits[n]), parts[n].assumed and n != order[0])
+        map = maps[poses[n][0]]
+        cells.add_map(map, layings[n], int(first_bits[n]), parts[n].assumed and n != order[0])
+        windows.append(laid_windows(map, layings[n]))
     name = " + ".join(maps[k].source or "map" for k, _ in poses)
     joined = _extracted(cells, min(part.neighbours for part in parts), name)
-    return with_doors(joined, ((maps[k], laying) for (k, _), laying in zip(poses, layings, strict=True)))
+    joined = with_doors(joined, ((maps[k], laying) for (k, _), laying in zip(poses, layings, strict=True)))
+    return with_joined_windows(joined, windows)
 
 
 @dataclass(frozen=True)

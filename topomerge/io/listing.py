@@ -9,6 +9,7 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
                 "completeness", "glimpsed", "confidence", "whole", "entered", "outside"}, …],
      "edges": [{"rooms": [id, id], "door": {"centre": [x, y, z], "width", "height", "direction"}, "kind",
                 "open", "confidence", "lower": [x, y, z], "upper": [x, y, z]}, …],
+     "windows": [{"rooms": [id, id], "centre": [x, y, z], "width", "sill", "head", "direction", "confidence"}, …],
      "areas": [{"id", "room", "centroid": [x, y, z], "area"}, …], "narrows": [like edges, "areas" for "rooms"],
      "storeys": [{"id", "floor", "ceiling", "area"}, …],
      "seconds": {step: s}, "parameters": {…}, "warnings": […]}
@@ -16,6 +17,7 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
 `completeness` is the share of a floor's outline at which a wall was seen; `confidence` the probability that it is a room, `whole`
 that most of it was seen, `entered` that the sensor was in it, `outside` that it is out of doors; `glimpsed` rooms were probably
 only looked into. `kind` is door, opening or stairs; `direction` is that of the wall's normal seen from above, from x towards y.
+The second room of a window is null where it leads out of doors; `sill` and `head` are m above the floor.
 """
 
 from __future__ import annotations
@@ -84,6 +86,7 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
         "voxel_size": float(map.grid.edge),
         "rooms": rooms,
         "edges": [_edge(e, "rooms") for e in map.edges],
+        "windows": [_window(w) for w in map.windows],
         "areas": areas,
         "narrows": [_edge(e, "areas") for e in map.narrows],
         "storeys": storeys,
@@ -98,6 +101,11 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
 def _edge(edge: Any, ends: str) -> dict[str, Any]:
     door = {name: edge[name] for name in ("centre", "width", "height", "direction")}
     return {ends: edge["rooms"], "door": door, **{name: edge[name] for name in ("kind", "open", "confidence", "lower", "upper")}}
+
+
+def _window(window: Any) -> dict[str, Any]:
+    rooms = [room if room >= 0 else None for room in window["rooms"].tolist()]
+    return {"rooms": rooms, **{name: window[name] for name in window.dtype.names if name != "rooms"}}
 
 
 def json_text(listing: Mapping[str, Any]) -> str:
@@ -176,6 +184,7 @@ def map_to_text(map: TopometricMap) -> str:
     kinds = Counter(map.edges["kind"].tolist())
     counts = [_plural(len(map.rooms), "room"), _plural(len(map.storeys), "storey")]
     counts += [_plural(kinds[kind], kind) for kind in ("door", "opening", "stairs")]
+    counts += [_plural(len(map.windows), "window")] if len(map.windows) else []
     steps = [(f"{s:.2f}", step) for step, s in map.seconds.items()]
     steps.append((f"{sum(map.seconds.values()):.2f}", "all"))
     return "\n".join(

@@ -12,10 +12,10 @@ A `.tmap` is one compressed NumPy archive without pickled objects. Format 2 hold
 | grid_property.NAME, … | one row a cell |
 | room, navigable_room | int32 room of each cell, -1 none |
 | navigable_area | int32 area of each navigable cell, -1 none |
-| rooms, edges, storeys, areas, narrows | tables, see `topomerge.types` |
+| rooms, edges, storeys, areas, narrows, windows | tables, see `topomerge.types` |
 | provenance | uint32 bit set of the maps that saw each cell |
 
-`free_…` and `provenance` are absent where the map has none.
+`free_…`, `windows` and `provenance` are absent where the map has none.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from topomerge.types import (
     ROOM_DTYPE,
     ROOM_ODDS,
     STOREY_DTYPE,
+    WINDOW_DTYPE,
     Array,
     TopometricMap,
     VoxelGrid,
@@ -50,12 +51,13 @@ KIND = "map of topomerge (.tmap)"
 # What a file may declare. The largest buildings have about 1,000 rooms, the tallest 163 storeys.
 ROOM_LIMIT, STOREY_LIMIT = 5_000, 200
 ROOM_COLUMNS, TOTAL_COLUMNS = 50_000_000, 100_000_000  # of the grid, in the rectangle around a room's floor, and around each
-CONNECTION_LIMIT = 30_000  # of edges, areas and narrows each, however many rooms there are
-EDGES_PER_ROOM, AREAS_PER_ROOM = 20, 20  # on average
+CONNECTION_LIMIT = 30_000  # of edges, areas, narrows and windows each, however many rooms there are
+EDGES_PER_ROOM, AREAS_PER_ROOM, WINDOWS_PER_ROOM = 20, 20, 100  # on average
 COORDINATE_LIMIT = 1e9  # m, either way: beyond, float64 is coarser than 0.1 micrometres
 AREA_LIMIT = 1e12  # m2, and m3 for volumes
 SHORTEST_CELL_EDGE, LONGEST_CELL_EDGE = 0.001, 10.0  # m
 OLDER_ROOMS = np.dtype([(n, ROOM_DTYPE[n]) for n in ROOM_DTYPE.names or () if n not in ROOM_ODDS])  # before there were odds
+UNSEEN = (("storeys", "ceiling"), ("windows", "sill"), ("windows", "head"))  # columns that are nan where nothing was seen
 WARNING_LIMIT, LONGEST_WARNING = 20, 500  # warnings of a map, characters of one
 
 
@@ -79,6 +81,7 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
     arrays["navigable_area"] = np.asarray(map.navigable_area, "<i4")
     if map.free is not None:
         arrays |= _pack("free", map.free)
+    arrays |= {"windows": map.windows} if len(map.windows) else {}
     if map.provenance is not None:
         arrays["provenance"] = map.provenance.astype("<u4")
     about = {
@@ -174,8 +177,8 @@ def _table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
         raise ValueError(f"{name} has other columns")
     for column in (c for c in dtype.names or () if dtype[c].base.kind == "f"):
         values = table[column]
-        if (name, column) == ("storeys", "ceiling"):
-            values = values[~np.isnan(values)]  # nan: not seen
+        if (name, column) in UNSEEN:
+            values = values[~np.isnan(values)]
         limit = AREA_LIMIT if column in ("area", "volume") else COORDINATE_LIMIT
         if not (np.abs(values) <= limit).all():  # nan is not, either
             raise ValueError(f"{name} has a {column} that is no number or beyond {limit:.0e}")
@@ -201,11 +204,19 @@ def _rooms(arrays: dict[str, Array]) -> Array:
     return rooms
 
 
+def _windows(arrays: dict[str, Array]) -> Array:
+    """The table of windows. Files of earlier versions have none."""
+    windows = _table(arrays, "windows", WINDOW_DTYPE) if "windows" in arrays else np.zeros(0, WINDOW_DTYPE)
+    if (windows["width"] <= 0).any() or (windows["head"] <= windows["sill"]).any():
+        raise ValueError("windows has one that is not wide or not high")
+    return windows
+
+
 def _require_sane_counts(arrays: dict[str, Array]) -> None:
     """Refuses tables longer than the cells of the map can fill, before anything is done for each of their rows.
 
     Raises:
-        ValueError: more rooms, edges, storeys, areas or narrows than a building has.
+        ValueError: more rooms, edges, storeys, areas, narrows or windows than a building has.
     """
     rooms, areas = arrays["rooms"].size, arrays["areas"].size
     cells = arrays["room"].size + arrays["navigable_room"].size
@@ -215,10 +226,11 @@ def _require_sane_counts(arrays: dict[str, Array]) -> None:
         "edges": (min(EDGES_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} a room)"),
         "areas": (min(AREAS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({AREAS_PER_ROOM} a room)"),
         "narrows": (min(EDGES_PER_ROOM * areas, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} an area)"),
+        "windows": (min(WINDOWS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({WINDOWS_PER_ROOM} a room)"),
     }
     for name, (limit, share) in limits.items():
         words = share if limit < CONNECTION_LIMIT else ""
-        if arrays[name].size > limit:
+        if name in arrays and arrays[name].size > limit:
             raise ValueError(f"declares {arrays[name].size:,} {name}, more than {limit:,}{words}")
     if rooms > cells:
         raise ValueError(f"declares {rooms:,} rooms and has only {cells:,} cells")
@@ -277,6 +289,7 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
         areas=_table(arrays, "areas", AREA_DTYPE),
         navigable_area=_typed(arrays, "navigable_area", "i", 1).astype(np.int32),
         narrows=narrows,
+        windows=_windows(arrays),
         free=_unpack(arrays, "free") if "free_cells" in arrays else None,
         provenance=provenance,
         source=str(about["source"]),

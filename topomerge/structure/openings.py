@@ -1,4 +1,4 @@
-"""Doors and openings of a map, set into the walls that carry them."""
+"""Doors, openings and windows of a map, set into the walls that carry them."""
 
 from __future__ import annotations
 
@@ -20,6 +20,18 @@ OPENING_DTYPE = np.dtype(
         ("kind", "U8"),  # door | opening
     ]
 )
+SET_WINDOW_DTYPE = np.dtype(
+    [
+        ("window", "i4"),  # row of the map's windows
+        ("wall", "i4"),  # row of the walls; -1: none was seen around it
+        ("centre", "f8", 3),  # on the floor, in the middle of the wall, in the input's frame
+        ("width", "f8"),  # m
+        ("sill", "f8"),  # m above the floor; a usual height where it was not seen
+        ("head", "f8"),
+        ("direction", "f8"),  # rad, of the wall's normal, in [0, pi)
+    ]
+)
+USUAL_SILL, USUAL_HEAD, LEAST_PANE = 0.9, 2.1, 0.3  # m above the floor, where they were not seen, and between them at least
 CARRIER_REACH = 0.8  # m between the middle of a door and the middle line of its wall
 STRANGE = 0.4  # m: a wall of other rooms has to be so much nearer
 LEAST_SHARE = 0.5  # of an opening's width that is in its wall
@@ -45,8 +57,32 @@ def openings_in_walls(map: TopometricMap, walls: Array) -> Array:
     return out
 
 
+def windows_in_walls(map: TopometricMap, walls: Array) -> Array:
+    """(W,) SET_WINDOW_DTYPE, in the order of the map's windows; they lie in their walls as openings do.
+
+    Args:
+        walls: WALL_DTYPE of the whole map.
+    """
+    out = np.zeros(len(map.windows), SET_WINDOW_DTYPE)
+    for k, (pane, window) in enumerate(zip(out, map.windows, strict=True)):
+        for name in ("centre", "width", "direction"):
+            pane[name] = window[name]
+        rooms = window["rooms"][window["rooms"] >= 0]
+        pane["window"], pane["wall"] = k, _carrier(window, walls, map.rooms["storey"][rooms])
+        if pane["wall"] >= 0:
+            _set_into(pane, walls[pane["wall"]])
+        pane["sill"], pane["head"] = _pane(float(window["sill"]), float(window["head"]))
+    return out
+
+
+def _pane(sill: float, head: float) -> tuple[float, float]:
+    """Sill and head, usual ones where they were not seen."""
+    low = sill if np.isfinite(sill) else min(USUAL_SILL, head - LEAST_PANE) if np.isfinite(head) else USUAL_SILL
+    return max(low, 0.0), head if np.isfinite(head) else max(USUAL_HEAD, low + LEAST_PANE)
+
+
 def _carrier(edge: Array, walls: Array, storeys: Array) -> int:
-    """Row of the wall nearest to a door among those that part its rooms, -1 none."""
+    """Row of the wall nearest to a door or a window among those that part its rooms, -1 none."""
     line = walls["end"] - walls["start"]
     length = np.maximum(np.hypot(*line.T), 1e-9)
     along = line / length[:, None]
@@ -54,7 +90,7 @@ def _carrier(edge: Array, walls: Array, storeys: Array) -> int:
     place = (apart * along).sum(axis=1)
     off = np.abs(apart[:, 0] * along[:, 1] - apart[:, 1] * along[:, 0])
     past = np.maximum(np.maximum(-place, place - length), 0.0)
-    beside = np.isin(walls["rooms"], edge["rooms"]).sum(axis=1)
+    beside = np.isin(walls["rooms"], edge["rooms"][edge["rooms"] >= 0]).sum(axis=1)
     two = (np.sort(walls["rooms"], axis=1) == np.sort(edge["rooms"])).all(axis=1)
     cost = np.hypot(off, past) + np.where(two, 0.0, STRANGE)
     fits = np.isin(walls["storey"], storeys) & (beside > 0) & (off <= CARRIER_REACH)

@@ -17,6 +17,7 @@ from sklearn.linear_model import LogisticRegression
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import build_walls, load_walls
 from topomerge.errors import InputError
+from topomerge.extraction.elevations.doorways import place_classes
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
 from topomerge.metrics import match_places
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
@@ -54,7 +55,7 @@ def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Can
     scans = []
     for path in paths:
         example = load_walls(path)
-        candidates = door_candidates(example.map, example.elevations)
+        candidates = door_candidates(example.map, walls := example.elevations, place_classes(walls))
         right = np.zeros(len(candidates.edges), bool)
         right[match_places(example.doors, candidates.edges["centre"])[:, 1]] = True
         scans.append((candidates, right))

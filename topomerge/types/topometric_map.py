@@ -52,6 +52,17 @@ AREA_DTYPE = np.dtype(
         ("area", "f8"),  # m2 of navigable floor, seen from above
     ]
 )
+WINDOW_DTYPE = np.dtype(
+    [
+        ("rooms", "i4", 2),  # whose wall it is in; the second -1: it leads out of doors, or where nothing was seen
+        ("centre", "f8", 3),  # on the floor, in its wall, in the input's frame
+        ("width", "f8"),  # m
+        ("sill", "f8"),  # m above the floor, where it begins and where it ends; nan: not seen
+        ("head", "f8"),
+        ("direction", "f8"),  # rad, of the wall's normal in the horizontal plane, in [0, pi)
+        ("confidence", "f8"),  # that it is one: 0..1
+    ]
+)
 STOREY_DTYPE = np.dtype([("floor", "f8"), ("ceiling", "f8"), ("area", "f8")])  # m, m (nan: not seen), m2
 
 
@@ -94,6 +105,7 @@ class TopometricMap:
         areas: (A,) AREA_DTYPE, the parts of rooms that a narrowing or a wide opening suggests; a room without such has one.
         navigable_area: (m,) int32, area of each navigable cell, -1 none.
         narrows: (N,) EDGE_DTYPE whose `rooms` are two areas of one room.
+        windows: (W,) WINDOW_DTYPE, those that the walls show.
         free: cells known to be empty (rays crossed them), of the same origin but perhaps another edge length; or None.
         provenance: (n,) uint32 bit set of the maps that saw each cell, or None for a map of one source.
         source: the file it was made from.
@@ -112,6 +124,7 @@ class TopometricMap:
     areas: Array = field(default_factory=lambda: np.zeros(0, AREA_DTYPE))
     navigable_area: Array | None = None
     narrows: Array = field(default_factory=lambda: np.zeros(0, EDGE_DTYPE))
+    windows: Array = field(default_factory=lambda: np.zeros(0, WINDOW_DTYPE))
     free: VoxelGrid | None = None
     provenance: Array | None = None
     source: str = ""
@@ -127,6 +140,7 @@ class TopometricMap:
         require(self.storeys.dtype == STOREY_DTYPE, "storeys must have STOREY_DTYPE")
         require(self.areas.dtype == AREA_DTYPE, "areas must have AREA_DTYPE")
         require(self.narrows.dtype == EDGE_DTYPE, "narrows must have EDGE_DTYPE")
+        require(self.windows.dtype == WINDOW_DTYPE, "windows must have WINDOW_DTYPE")
         if self.navigable_area is None:
             object.__setattr__(self, "navigable_area", np.full(len(self.navigable), -1, np.int32))
         assert self.navigable_area is not None
@@ -141,6 +155,10 @@ class TopometricMap:
         ends = self.edges["rooms"]
         require(not len(ends) or (ends.min() >= 0 and ends.max() < len(self.rooms)), "an edge's room does not exist")
         require(bool((ends[:, 0] != ends[:, 1]).all()), "an edge must join two rooms")
+        first, second = self.windows["rooms"].T
+        require(int(first.min(initial=0)) >= 0 and int(second.min(initial=0)) >= -1, "a window's room does not exist")
+        require(int(self.windows["rooms"].max(initial=-1)) < len(self.rooms), "a window's room does not exist")
+        require(bool((first != second).all()), "a window must not lead from a room into itself")
         storey = self.rooms["storey"]
         require(not len(storey) or (storey.min() >= 0 and storey.max() < len(self.storeys)), "a room's storey is missing")
         require(self.provenance is None or len(self.provenance) == len(self.grid), "provenance: one value a cell")

@@ -196,6 +196,7 @@ def legend(map: TopometricMap) -> Markup:
         ("door", "open door", bool((doors & map.edges["open"]).any())),
         ("shut", "shut door", bool((way & ~map.edges["open"]).any())),
         ("opening", "opening", bool((map.edges["kind"] == "opening").any())),
+        ("window", "window", len(map.windows) > 0),
         ("stairs", "stairs or ramp", bool((~way).any())),
         ("glimpsed", "glimpsed: only looked into", bool(map.rooms["glimpsed"].any())),
         ("narrow", "narrowing within a room", len(map.narrows) > 0),

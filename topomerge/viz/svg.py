@@ -46,6 +46,7 @@ def plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], col
             element("path", class_="seen", d=seen_outline(plan, sheet)),
             _layer("rooms", [_room(map, sheet, i, d, hex_colour(colours[i])) for i, d in outlines.items()]),
             element("path", class_="wall", d=wall_outline(plan, sheet), fill_rule="evenodd"),
+            _layer("windows", _windows(map, sheet, storey)),
             _layer("areas", _narrows(map, sheet, storey)),
             _layer("graph", _graph(map, sheet, storey, everywhere)),
             _layer("doors", _doors(map, sheet, storey)),
@@ -214,3 +215,10 @@ def _narrows(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
         return []
     on_storey = map.rooms["storey"][map.areas["room"][map.narrows["rooms"][:, 0]]] == storey
     return [_line(sheet, *_ends(edge), class_="narrow") for edge in map.narrows[on_storey]]
+
+
+def _windows(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
+    """Thin double lines in a gap of the wall, as in floor plans."""
+    on_storey = map.rooms["storey"][map.windows["rooms"][:, 0]] == storey
+    lines = [[_line(sheet, *_ends(w), class_=name) for name in ("gap", "frame", "pane")] for w in map.windows[on_storey]]
+    return [element("g", *parts, class_="window") for parts in lines]

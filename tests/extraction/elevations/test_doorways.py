@@ -9,9 +9,8 @@ from tests.extraction.elevations.doors import SHUT_DOOR, extracted, niche, three
 from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
 from topomerge.errors import InputError
-from topomerge.extraction.elevations import wall_doors
-from topomerge.extraction.elevations.doorways import doorways
-from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, Elevations
+from topomerge.extraction.elevations.doorways import OPEN, SHUT, doorways
+from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
 from topomerge.extraction.elevations.wall_network import read_network
 from topomerge.types import Sim3
@@ -66,9 +65,9 @@ def test_doorways_of_two_walls_or_two_storeys_stay_two(change):
 def seen(doors, map=None):
     example = two_doors(0)
     elevations = Elevations(example[1], np.array([0, 160]), example[2] / np.float32(255))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wall_doors, "place_doors", lambda _: doors)
-        return door_candidates(example[0] if map is None else map, elevations)
+    classes = np.zeros((len(doors), len(WALL_CLASSES)))
+    classes[:, [OPEN, SHUT]] = doors
+    return door_candidates(example[0] if map is None else map, elevations, classes)
 
 
 def test_a_door_of_the_plan_lies_where_the_wall_shows_it():

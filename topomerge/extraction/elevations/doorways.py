@@ -18,6 +18,7 @@ DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of 
 LEAST_WIDTH = 0.45  # m
 HALF_WALL = 0.06  # m from the face of a wall to its middle, where one face was seen only
 SAME_DOORWAY = 0.45  # m between what two faces show of one doorway
+STOOD = 0.12  # m from the middle of a cell of a floor: a place this near is on it
 DOORWAY_LEVEL = 0.5  # m between their floors
 OPEN, SHUT = WALL_CLASSES.index("open"), WALL_CLASSES.index("shut")
 DOORWAY_DTYPE = np.dtype(
@@ -34,13 +35,20 @@ DOORWAY_DTYPE = np.dtype(
 )
 
 
-def place_doors(walls: Elevations) -> Array:
-    """(n / 2, 2) float32 probability of an open and of a shut door in each place along all strips."""
-    parts = [place_probabilities(walls.strips[low:high])[:, [OPEN, SHUT]] for low, high in _bounds(walls)]
+def place_classes(walls: Elevations) -> Array:
+    """(n / 2, 4) float32 probability of each of `WALL_CLASSES` in each place along all strips."""
+    parts = [place_probabilities(walls.strips[low:high]) for low, high in strip_bounds(walls)]
+    return np.concatenate([np.zeros((0, len(WALL_CLASSES)), np.float32), *parts])
+
+
+def door_places(walls: Elevations, classes: Array) -> Array:
+    """(n / 2, 2) float32 probability of an open and of a shut door in each place, of those of all classes."""
+    parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT]] for low, high in strip_bounds(walls)]
     return np.concatenate([np.zeros((0, 2), np.float32), *parts])
 
 
-def _bounds(walls: Elevations) -> Iterator[tuple[int, int]]:
+def strip_bounds(walls: Elevations) -> Iterator[tuple[int, int]]:
+    """The first element of each strip and that after its last."""
     return zip(walls.first[:-1].tolist(), walls.first[1:].tolist(), strict=True)
 
 
@@ -48,10 +56,10 @@ def doorways(walls: Elevations, doors: Array) -> Array:
     """(D,) DOORWAY_DTYPE, each once however many faces show it.
 
     Args:
-        doors: (n / 2, 2) of `place_doors`.
+        doors: (n / 2, 2) of `door_places`.
     """
     rows = []
-    for face, (low, high) in zip(walls.faces, _bounds(walls), strict=True):
+    for face, (low, high) in zip(walls.faces, strip_bounds(walls), strict=True):
         each = doors[low // PLACES : high // PLACES]
         rows += [_doorway(face, each, start, stop) for start, stop in _runs(each.sum(axis=1))]
     return _joined(np.array(rows, DOORWAY_DTYPE))

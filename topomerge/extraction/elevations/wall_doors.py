@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
-from topomerge.extraction.elevations.doorways import doorways, place_doors
-from topomerge.extraction.elevations.elevation import ALONG, BEFORE, BEHIND, Elevations, wall_elevations
+from topomerge.extraction.elevations.doorways import STOOD, door_places, doorways
+from topomerge.extraction.elevations.elevation import ALONG, BEFORE, BEHIND, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.io.weight_files import read_weights_json
 from topomerge.numpy_nn import sigmoid
-from topomerge.types import EDGE_DTYPE, Array, TopometricMap, VoxelGrid
+from topomerge.types import EDGE_DTYPE, Array, TopometricMap
 
 WALL_DOORS_FILE = "wall_doors.json"
 WALL_DOOR_FEATURES = (
@@ -39,7 +39,6 @@ SOURCES = ("both", "plan", "wall")  # what shows a door: there is a model for ea
 WALL_DOOR_REACH = 1.0  # m between a door of the plan and the same one on the wall
 BEYOND = (0.1, 1.0)  # m from a wall: there the other room begins
 NEAR = 0.3  # m around a door of the plan
-STOOD = 0.12  # m from the middle of a cell of a floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,15 +56,13 @@ class DoorCandidates:
     source: Array
 
 
-def with_wall_doors(map: TopometricMap, cells: VoxelGrid) -> TopometricMap:
+def with_wall_doors(map: TopometricMap, walls: Elevations, classes: Array) -> TopometricMap:
     """The map with the doors that its walls show.
 
     Args:
-        cells: as of `wall_elevations`.
+        classes: (n / 2, 4) of `place_classes`.
     """
-    if not len(map.rooms):
-        return map
-    candidates = door_candidates(map, wall_elevations(map, cells))
+    candidates = door_candidates(map, walls, classes)
     chance = door_chance(candidates)
     edges = candidates.edges.copy()
     edges["confidence"] = chance
@@ -93,9 +90,13 @@ def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]
     return np.where(opening, candidates.features[:, plan], chance)
 
 
-def door_candidates(map: TopometricMap, walls: Elevations) -> DoorCandidates:
-    """All doors and openings that the plan or the walls of a map show."""
-    doors = place_doors(walls)
+def door_candidates(map: TopometricMap, walls: Elevations, classes: Array) -> DoorCandidates:
+    """All doors and openings that the plan or the walls of a map show.
+
+    Args:
+        classes: (n / 2, 4) of `place_classes`.
+    """
+    doors = door_places(walls, classes)
     ways = _with_other_room(map, doorways(walls, doors))
     level = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
     partner = _partners(level, ways)

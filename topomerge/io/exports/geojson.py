@@ -1,4 +1,4 @@
-"""Rooms and walls as polygons, doors as lines and as openings in walls: GeoJSON (RFC 7946), for QGIS, web maps and shapely.
+"""Rooms and walls as polygons, doors and windows as lines and as openings in walls: GeoJSON (RFC 7946), for QGIS and web maps.
 
 With an origin, coordinates are longitude and latitude of WGS84. Without, they are metres in the frame of the map; then `crs` is
 null, which tells readers of the older GeoJSON that there are no degrees, and the member `topomerge` says so in words.
@@ -57,8 +57,8 @@ def parse_origin(text: str) -> Origin:
 
 
 def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: int | None = None) -> None:
-    """Write one FeatureCollection: a feature for each room, then for each door, opening and flight of stairs, each wall, and
-    each door or opening as a hole in its wall.
+    """Write one FeatureCollection: a feature for each room, then for each door, opening and flight of stairs, each window,
+    each wall, and each door, opening or window as a hole in its wall.
 
     Args:
         map: any map.
@@ -75,7 +75,7 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
     if origin is not None:
         _check_near(map)
     place = _metres if origin is None else _on_earth(origin)
-    features = [*_rooms(map, place, storey), *_doors(map, place, storey)]
+    features = [*_rooms(map, place, storey), *_doors(map, place, storey), *_windows(map, place, storey)]
     features += [*_walls(map, place, storey), *_openings(map, place, storey)]
     listing: dict[str, Any] = {"type": "FeatureCollection"}
     if origin is None:
@@ -124,6 +124,18 @@ def _doors(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dic
         yield _feature(f"edge {i}", {"type": "LineString", "coordinates": place(line)}, properties)
 
 
+def _windows(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
+    for k, (window, pane) in enumerate(zip(map.windows, plan_structure(map).windows, strict=True)):
+        if storey in (None, level := int(map.rooms["storey"][window["rooms"][0]])):
+            properties = {"kind": "window", "window": k, "rooms": _sides(window), "storey": level}
+            properties |= {name: _height(window[name]) for name in ("width", "sill", "head", "confidence")}
+            yield _feature(f"window {k}", {"type": "LineString", "coordinates": place(jambs(pane))}, properties)
+
+
+def _height(value: Any) -> float | None:
+    return round(float(value), 3) if np.isfinite(value) else None
+
+
 def _walls(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
     for k, wall in enumerate(plan_structure(map).walls):
         if storey in (None, int(wall["storey"])):
@@ -144,10 +156,18 @@ def _openings(map: TopometricMap, place: Place, storey: int | None) -> Iterator[
             properties |= {"width": round(float(opening["width"]), 3), "height": round(float(opening["height"]), 3) or None}
             shape = shapely.MultiPolygon([wall_part(wall, opening)])
             yield _feature(f"opening {i}", _polygons(shape, float(opening["centre"][2]), place), properties)
+    for pane in structure.windows[structure.windows["wall"] >= 0]:
+        k, wall = int(pane["window"]), structure.walls[pane["wall"]]
+        if storey in (None, int(wall["storey"])):
+            properties = {"kind": "wall_opening", "of": "window", "window": k, "wall": int(pane["wall"])}
+            properties |= {"storey": int(wall["storey"]), "rooms": _sides(map.windows[k]), "width": _height(pane["width"])}
+            properties |= {name: _height(map.windows[name][k]) for name in ("sill", "head")}
+            shape = shapely.MultiPolygon([wall_part(wall, pane)])
+            yield _feature(f"pane {k}", _polygons(shape, float(pane["centre"][2] + pane["sill"]), place), properties)
 
 
 def _sides(wall: Any) -> list[int | None]:
-    """Rooms to the left and to the right of a wall; null where none was seen."""
+    """Rooms on both sides of a wall or a window; null where none was seen."""
     return [r if r >= 0 else None for r in wall["rooms"].tolist()]
 
 

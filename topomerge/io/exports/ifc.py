@@ -1,9 +1,9 @@
-"""A building model, IFC4: site, building, storeys, spaces, doors, stairs; walls, floors and ceilings as far as they were seen.
+"""A building model, IFC4: site, building, storeys, spaces, doors, windows, stairs; walls, floors and ceilings as far as seen.
 
-Spaces, floors, ceilings and walls are extruded polygons. An IfcOpeningElement voids the wall that carries a door, which fills it;
-a door is a box of its clear opening, an opening without a door an IfcVirtualElement, stairs and ramps a plate from their lower to
-their upper end. IfcRelSpaceBoundary says which spaces a door joins. The site is placed where the map lies, so that all else has
-small coordinates. Source: ISO 16739-1, IFC4 ADD2 TC1.
+Spaces, floors, ceilings and walls are extruded polygons. An IfcOpeningElement voids the wall that carries a door or a window,
+and the door or the window, a box, fills it; an opening without a door is an IfcVirtualElement, stairs and ramps are a plate from
+their lower to their upper end. IfcRelSpaceBoundary says which spaces a door joins. The site is placed where the map lies, so
+that all else has small coordinates. Source: ISO 16739-1, IFC4 ADD2 TC1.
 """
 
 from __future__ import annotations
@@ -58,6 +58,15 @@ def save(map: TopometricMap, path: Path) -> None:
         model.contain(storey, [element])
         for r in (a, b):
             model.bound(i, spaces[r], element)
+    for k, pane in enumerate(structure.windows):
+        rooms = [r for r in map.windows["rooms"][k].tolist() if r >= 0]
+        storey = storeys[int(map.rooms["storey"][rooms[0]])]
+        element = model.window(k, pane, storey)
+        if (w := int(pane["wall"])) >= 0:
+            model.pane_hole(k, pane, structure.walls[w], walls[w], element)
+        model.contain(storey, [element])
+        for r in rooms:
+            model.bound(f"window {k}", spaces[r], element, "INTERNAL" if len(rooms) > 1 else "NOTDEFINED")
     with replacing(path) as beside:
         model.file.write(str(beside))
 
@@ -133,17 +142,28 @@ class _Building(Model):
 
     def hole(self, opening: Any, wall: Any, voided: Any, door: Any) -> None:
         """An opening in a wall; a door fills it."""
-        storey_height = float(self.map.storeys["floor"][wall["storey"]])
         low = float(opening["centre"][2])
-        top = float(wall["high"]) + CUT_THROUGH - low
-        height = min(float(opening["height"]), top) if opening["height"] else min(IFC_LINTEL, top)
+        element = self._void(f"opening {opening['edge']}", opening, wall, (low, float(opening["height"]) or IFC_LINTEL), voided)
+        if door.is_a("IfcDoor"):
+            self.root("IfcRelFillsElement", element.GlobalId, RelatingOpeningElement=element, RelatedBuildingElement=door)
+
+    def pane_hole(self, k: int, pane: Any, wall: Any, voided: Any, window: Any) -> None:
+        """The hole in a wall that a window fills."""
+        low = float(pane["centre"][2] + pane["sill"])
+        element = self._void(f"pane {k}", pane, wall, (low, float(pane["head"] - pane["sill"])), voided)
+        self.root("IfcRelFillsElement", element.GlobalId, RelatingOpeningElement=element, RelatedBuildingElement=window)
+
+    def _void(self, name: str, opening: Any, wall: Any, span: tuple[float, float], voided: Any) -> Any:
+        """A hole in a wall; `span`: where it begins, m in the input's frame, and its height, at most up to the wall's top."""
+        low, height = span
+        storey_height = float(self.map.storeys["floor"][wall["storey"]])
+        height = min(height, float(wall["high"]) + CUT_THROUGH - low)
         shape = shapely.MultiPolygon([wall_part(wall, opening, CUT_THROUGH)])
         body = {"Representation": self.prisms(shape, low - storey_height, height), "PredefinedType": "OPENING"}
         at = self.place(voided.ObjectPlacement, 0, 0, 0)
-        element = self.root("IfcOpeningElement", f"opening {opening['edge']}", ObjectPlacement=at, **body)
+        element = self.root("IfcOpeningElement", name, ObjectPlacement=at, **body)
         self.root("IfcRelVoidsElement", element.GlobalId, RelatingBuildingElement=voided, RelatedOpeningElement=element)
-        if door.is_a("IfcDoor"):
-            self.root("IfcRelFillsElement", element.GlobalId, RelatingOpeningElement=element, RelatedBuildingElement=door)
+        return element
 
     def door(self, i: int, opening: Any, storey: Any) -> Any:
         """A door as a box in its opening, or an opening without one as a line on the floor."""
@@ -156,14 +176,32 @@ class _Building(Model):
             line = self.new("IfcPolyline", Points=[self.point(0, 0, 0), self.point(width, 0, 0)])
             shown = self.shape("FootPrint", "Curve3D", [line])
             return self.root("IfcVirtualElement", f"{opening['kind']} {i}", ObjectPlacement=at, Representation=shown)
+        attributes = {"OverallWidth": width, "PredefinedType": "DOOR", "OperationType": "NOTDEFINED"}
+        attributes |= {"OverallHeight": height} if height else {}
+        body = self._box(width, height or IFC_LINTEL)
+        return self.root("IfcDoor", f"door {i}", ObjectPlacement=at, Representation=body, **attributes)
+
+    def _box(self, width: float, height: float) -> Any:
+        """What fills an opening, along x from 0."""
         middle = self.new("IfcAxis2Placement2D", Location=self.point(width / 2, 0))
         box = self.new("IfcRectangleProfileDef", ProfileType="AREA", Position=middle, XDim=width, YDim=LEAF_THICKNESS)
         up = self.new("IfcDirection", DirectionRatios=[0.0, 0.0, 1.0])
-        solid = self.new("IfcExtrudedAreaSolid", SweptArea=box, ExtrudedDirection=up, Depth=height or IFC_LINTEL)
-        attributes = {"OverallWidth": width, "PredefinedType": "DOOR", "OperationType": "NOTDEFINED"}
-        attributes |= {"OverallHeight": height} if height else {}
-        body = self.shape("Body", "SweptSolid", [solid])
-        return self.root("IfcDoor", f"door {i}", ObjectPlacement=at, Representation=body, **attributes)
+        solid = self.new("IfcExtrudedAreaSolid", SweptArea=box, ExtrudedDirection=up, Depth=height)
+        return self.shape("Body", "SweptSolid", [solid])
+
+    def window(self, k: int, pane: Any, storey: Any) -> Any:
+        """A window as a box in its opening, on its sill, and what was seen of it."""
+        across, width, height = float(pane["direction"]), float(pane["width"]), float(pane["head"] - pane["sill"])
+        along = np.array([-np.sin(across), np.cos(across)])
+        x, y, z = pane["centre"] - (*along * width / 2, 0) - self.shift + (0, 0, pane["sill"] - storey.Elevation)
+        sizes = {"OverallWidth": width, "OverallHeight": height, "PredefinedType": "WINDOW"}
+        body = {"ObjectPlacement": self.place(storey.ObjectPlacement, x, y, z, along), "Representation": self._box(width, height)}
+        element = self.root("IfcWindow", f"window {k}", PartitioningType="NOTDEFINED", **sizes, **body)
+        seen = self.map.windows[k]
+        facts = [self._fact("Confidence", "IfcReal", float(seen["confidence"]))]
+        facts += [self._fact(f"{end.title()}Seen", "IfcBoolean", bool(np.isfinite(seen[end]))) for end in ("sill", "head")]
+        self._define(element, self._set("IfcPropertySet", "Topomerge_Window", k, HasProperties=facts))
+        return element
 
     def flight(self, i: int, edge: Any, storey: Any) -> Any:
         """Stairs or a ramp, as a sloping plate."""
@@ -192,8 +230,8 @@ class _Building(Model):
         swept = {"SweptArea": profile, "Position": where, "ExtrudedDirection": out, "Depth": width or 1.0}
         return self.new("IfcExtrudedAreaSolid", **swept)
 
-    def bound(self, i: int, space: Any, element: Any) -> None:
+    def bound(self, i: int | str, space: Any, element: Any, side: str = "INTERNAL") -> None:
         """A space is bounded by an element, which leads out of it."""
-        attributes = {"RelatingSpace": space, "RelatedBuildingElement": element, "InternalOrExternalBoundary": "INTERNAL"}
+        attributes = {"RelatingSpace": space, "RelatedBuildingElement": element, "InternalOrExternalBoundary": side}
         kind = "VIRTUAL" if element.is_a("IfcVirtualElement") else "PHYSICAL"
         self.root("IfcRelSpaceBoundary", f"{i} {space.GlobalId}", PhysicalOrVirtualBoundary=kind, **attributes)

@@ -4,7 +4,8 @@ Rooms end at the faces of their walls, and walls are cells without a State (the 
 them, under its lintel.
 
 Each room is a CellSpace, whose solid is its floor drawn up to its ceiling, and a State; each door or opening a CellSpaceBoundary
-and a Transition; each flight of stairs or ramp a Transition. Source: OGC 19-011r4 and its schema indoorgmlcore.xsd.
+and a Transition; each flight of stairs or ramp a Transition. A window is a CellSpaceBoundary without one, as nobody walks
+through; it leaves no gap in its wall. Source: OGC 19-011r4 and its schema indoorgmlcore.xsd.
 """
 
 from __future__ import annotations
@@ -57,6 +58,8 @@ def save(map: TopometricMap, path: Path) -> None:
     for i, edge in enumerate(map.edges):
         if not is_flight(edge):
             _boundary(_new(place, "cellSpaceBoundaryMember"), i, edge)
+    for k, pane in enumerate(structure.windows):
+        _pane(_new(place, "cellSpaceBoundaryMember"), k, map.windows[k], pane)
     if len(map.rooms):  # a layer without states is none
         places = zip(floors, map.rooms["centroid"], levels[:, 0], strict=True)
         points = [np.append(inside(floor, middle), low) for floor, middle, low in places]
@@ -110,6 +113,8 @@ def _cell(member: Any, map: TopometricMap, r: int, floor: shapely.MultiPolygon, 
     for i in np.flatnonzero((map.edges["rooms"] == r).any(axis=1)):
         if not is_flight(map.edges[i]):
             _link(cell, "partialboundedBy", f"B{i}")
+    for k in np.flatnonzero((map.windows["rooms"] == r).any(axis=1)):
+        _link(cell, "partialboundedBy", f"P{k}")
 
 
 def _solid(cell: Any, id: str, plan: shapely.Polygon, low: float, high: float) -> None:
@@ -182,6 +187,16 @@ def _boundary(member: Any, i: int, edge: Any) -> None:
     up = np.array([0.0, 0.0, float(edge["height"]) or UNSEEN_LINTEL])
     shape = _new(_new(boundary, "cellSpaceBoundaryGeometry"), "geometry3D")
     _polygon(shape, f"B{i}-face", [np.array([a, b, b + up, a + up, a])])
+
+
+def _pane(member: Any, k: int, window: Any, pane: Any) -> None:
+    boundary = _new(member, "CellSpaceBoundary", f"P{k}")
+    facts = {name: f"{window[name]:.2f}" for name in ("width", "sill", "head", "confidence") if np.isfinite(window[name])}
+    _head(boundary, f"window {k}", kind="window", **facts)
+    a, b = jambs(pane) + (0, 0, pane["sill"])
+    up = np.array([0.0, 0.0, float(pane["head"] - pane["sill"])])
+    shape = _new(_new(boundary, "cellSpaceBoundaryGeometry"), "geometry3D")
+    _polygon(shape, f"P{k}-face", [np.array([a, b, b + up, a + up, a])])
 
 
 def _graph(root: Any, map: TopometricMap, points: list[Array]) -> None:
