@@ -220,7 +220,7 @@ def panes(building: Building) -> list[tuple[float, ...]]:
 
 
 def glazed(building: Building) -> list[tuple[float, ...]]:
-    """Windows: their middle at the height of the floor, direction of the normal (rad), width, and sill and head above the floor (m)."""
+    """Windows: middle at the height of the floor, direction of the normal (rad), width, sill and head above the floor (m)."""
     glass = building.triangles[building.labels == SURFACES.index("glass")]
     windows = []
     for triangle in glass[::2]:  # two make a pane
