@@ -70,7 +70,7 @@ def in_map(map: TopometricMap, rows: Array) -> Array:
     unseen = (sides < 0).all(axis=1)
     sides[unseen] = rows["rooms"][unseen]
     sides[sides[:, 0] == sides[:, 1], 1] = -1
-    both = (sides >= 0).all(axis=1)
+    both = np.asarray((sides >= 0).all(axis=1))
     rows["rooms"] = np.where(both[:, None], np.sort(sides, axis=1), -np.sort(-sides, axis=1))
     rows = rows[(rows["rooms"][:, 0] >= 0) & ~_at_doors(map, rows)]
     return rows[np.lexsort((*rows["centre"].T[::-1], *rows["rooms"].T[::-1]))]
