@@ -268,7 +268,10 @@ def grid_arrays(side: str, grid: VoxelGrid, empty: VoxelGrid | None) -> dict[str
     """What is cached of a map: occupied cells with the middles of their points, and empty cells where they are known."""
     out = {f"{side}.cells": grid.cells.astype(np.int16), f"{side}.origin": grid.origin, f"{side}.shape": np.array(grid.shape)}
     out[f"{side}.mean"] = grid.properties["offset"]
-    return out if empty is None else {**out, f"{side}.free": empty.cells.astype(np.int16)}
+    if empty is None:
+        return out
+    out[f"{side}.shape"] = np.maximum(grid.shape, empty.shape)  # floor may be seen past the last wall
+    return {**out, f"{side}.free": empty.cells.astype(np.int16)}
 
 
 def load_grids(path: str | Path) -> GridPair:
