@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from topomerge.kernels.symmetric import solved
+
 
 @njit(cache=True, nogil=True, inline="always")
 def _sample(field, u, v):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
@@ -62,14 +64,11 @@ def refine(points, field, origin, cell, poses, sigmas, rounds, scaled):  # type:
                 if r == rounds or total < 3.0:
                     break
                 for a in range(free):
-                    for b in range(a):
-                        h[a, b] = h[b, a]
                     h[a, a] += 1e-3 * h[a, a] + 1e-3
-                step = np.linalg.solve(h[:free, :free], -g[:free])
-                step[:2] = np.minimum(np.maximum(step[:2], -0.5), 0.5)
-                step[2:] = np.minimum(np.maximum(step[2:], -0.05), 0.05)
+                step = solved(h, g, free)
                 for a in range(free):
-                    out[k, a] += step[a]
+                    most = 0.5 if a < 2 else 0.05  # m, and rad or of the scale's logarithm
+                    out[k, a] -= min(max(step[a], -most), most)
     return out, score
 
 

@@ -44,7 +44,10 @@ def filled(cells, holding, matrix, local, slack, reach, tall):  # type: ignore[n
                     if count == most:
                         most *= 2
                         wider, longer = np.empty((most, 3), np.int64), np.empty(most, np.int64)
-                        wider[:count], longer[:count] = out[:count], rows[:count]
+                        for k in range(count):
+                            longer[k] = rows[k]
+                            for a in range(3):
+                                wider[k, a] = out[k, a]
                         out, rows = wider, longer
                     out[count, 0], out[count, 1], out[count, 2], rows[count] = u, v, q, i
                     count += 1
