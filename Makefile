@@ -7,7 +7,7 @@ TORCH_INDEX ?=
 export TOPOMERGE_DATA ?= $(wildcard ../shared/data)
 export MPLBACKEND := Agg
 
-.PHONY: setup demo test test-slow lint docs bench sealed weights clean
+.PHONY: setup demo test test-longer test-slow lint docs bench sealed weights clean
 setup: .venv/ready
 
 .venv/ready: pyproject.toml constraints.txt
@@ -32,7 +32,10 @@ demo: setup
 	@echo "The map from above: demo/a.png; the merge and why it is believed: demo/merged/report.html"
 
 test: setup
-	$(BIN)/python -m pytest -rs -m 'not slow' -n logical --maxprocesses 4 --dist worksteal
+	$(BIN)/python -m pytest -rs -m 'not slow and not longer' -n logical --maxprocesses 4 --dist worksteal
+
+test-longer: setup
+	$(BIN)/python -m pytest -rs -m 'longer and not slow' -n logical --maxprocesses 4 --dist worksteal
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow

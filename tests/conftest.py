@@ -41,7 +41,7 @@ def skips_told(reasons: list[str], unchosen: int = 0) -> list[str]:
     lacking = [next((what for pattern, what in LACKS.items() if re.search(pattern, reason)), "") for reason in reasons]
     needs = Counter(lacking)
     lines = [f"{needs[what]} tests that need {what} were skipped" for what in LACKS.values()]
-    lines[0] += f"; {unchosen} more are slow and not of this run" if unchosen else ""
+    lines[0] += f"; {unchosen} more take longer and are not of this run" if unchosen else ""
     others = Counter(reason for reason, what in zip(reasons, lacking, strict=True) if not what)
     return [*lines, *(f"{count} tests were skipped: {reason}" for reason, count in sorted(others.items()))]
 

@@ -68,6 +68,7 @@ def test_packaged_data_changes_the_digest_of_its_readers(before, after, module, 
     assert code_digest("topomerge.kernels.voxelise", package=before) == code_digest("topomerge.kernels.voxelise", package=after)
 
 
+@pytest.mark.longer
 def test_every_packaged_weight_and_table_is_seen(before):
     modules = [p for folder in ("topomerge", "datasets", "models") for p in (before.parent / folder).rglob("*.py")]
     seen = {file for path in modules for file in data_files(path)}

@@ -79,6 +79,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.longer
 def test_killed_between_two_renames(tmp_path: Path) -> None:
     """The files of an earlier run never stand beside those of a later one."""
     names = ["a.ply", "b.ply", "truth.json"]

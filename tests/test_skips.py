@@ -47,10 +47,11 @@ def last_lines(folder: Path, text: str, *options: str) -> list[str]:
     return lines
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("options", [(), ("-p", "xdist.plugin", "-n", "2")], ids=["alone", "xdist"])
 def test_the_last_lines_tell_what_was_skipped(tmp_path: Path, options: tuple[str, ...]) -> None:
     assert last_lines(tmp_path / "some", SOME, *options)[-5:] == [
-        "1 tests that need real data (TOPOMERGE_DATA) were skipped; 1 more are slow and not of this run",
+        "1 tests that need real data (TOPOMERGE_DATA) were skipped; 1 more take longer and are not of this run",
         "1 tests that need a browser (Chromium) were skipped",
         "0 tests that need a git checkout, for the wheel were skipped",
         "1 tests that need a package that is not installed were skipped",

@@ -134,6 +134,7 @@ def test_a_storey_has_as_many_rooms_and_walls_as_asked_for() -> None:
     assert 0.05 < np.abs(growth.waved(points) - points).max() <= growth.BEND_SIZE
 
 
+@pytest.mark.longer
 def test_drift_of_a_scan_is_undone_and_grows_with_the_factor() -> None:
     pairs = importlib.import_module("topomerge.datasets.pairs.bent_pairs")
     building = make_building("apartment", 900_003, 1)

@@ -44,6 +44,7 @@ def test_sets_keep_to_their_buildings(benchmark) -> None:
     assert len(cases.chosen(["all"], 1)) == len({c.set for c in cases.chosen(["all"])})
 
 
+@pytest.mark.longer
 @pytest.mark.data
 def test_rooms_of_a_robot_grid_are_those_of_its_segmentation(benchmark, data_dir, tmp_path) -> None:
     """IPA's own lab: at most one of the ten rooms that a person drew is missing, whatever corners are rooms beside them."""

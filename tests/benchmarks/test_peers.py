@@ -52,6 +52,7 @@ def dies(how):
     yield "answer", how
 
 
+@pytest.mark.longer
 def test_an_answer_over_the_cap_is_a_miss_and_those_before_it_count(module) -> None:
     calls = module("peer_calls")
     work = calls.GuardedWork(answers_slowly, seconds=1)

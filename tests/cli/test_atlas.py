@@ -93,6 +93,7 @@ def test_strange_registrations_are_made_anew(run: Run, folder: Path, strange: ob
         path.write_text(before)
 
 
+@pytest.mark.longer
 def test_nothing_connected_is_status_two(run: Run, folder: Path) -> None:
     status, out, err = run("atlas", "add", "two", "west.tmap", "stranger.tmap")
     assert status == 2 and "nothing could be connected: all 2 maps stand apart" in out and err == ""
@@ -101,6 +102,7 @@ def test_nothing_connected_is_status_two(run: Run, folder: Path) -> None:
     assert not list((folder / "two").glob("map_*")) and [p.name for p in (folder / "two" / "maps").iterdir()] == ["west.tmap"]
 
 
+@pytest.mark.longer
 def test_what_is_stated_of_the_maps_is_heard_and_stays(run: Run, folder: Path) -> None:
     """West and east are joined, surer than where nothing is stated; the stranger stays apart; what was said holds for what is
     taken out later."""

@@ -219,6 +219,7 @@ def test_view_serves_the_page_and_nothing_else(tmp_path: Path) -> None:
         server.wait()
 
 
+@pytest.mark.longer
 def test_what_is_served_of_a_map_is_deleted_in_the_end(tmp_path: Path) -> None:
     topomerge.save_map(two_floors(), tmp_path / "a.tmap")
     (tmp_path / "scratch").mkdir()

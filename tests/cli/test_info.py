@@ -9,6 +9,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from tests.cli.processes import Run, process
 from tests.scenes_map import building
 from topomerge.io.maps import save_map
@@ -35,6 +37,7 @@ def test_a_strangers_map_does_not_steer_the_terminal(run: Run, tmp_path: Path) -
     assert status == 1 and "\x1b" not in err
 
 
+@pytest.mark.longer
 def test_info_into_a_pipe_that_closed(tmp_path: Path) -> None:
     save_map(replace(building(1, 1), warnings=()), tmp_path / "a.tmap")
     reader, writer = os.pipe()
@@ -45,6 +48,7 @@ def test_info_into_a_pipe_that_closed(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.longer
 def test_a_terminal_without_umlauts(tmp_path: Path) -> None:
     save_map(building(1, 1), tmp_path / "a.tmap")
     done = process("info", str(tmp_path / "a.tmap"), env={**os.environ, "PYTHONIOENCODING": "ascii"})

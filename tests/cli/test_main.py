@@ -225,6 +225,7 @@ def test_all_outputs_or_none(run: Run, stages: dict[str, Any], tmp_path: Path, m
     assert (tmp_path / "a.tmap").read_text() == "an older one"
 
 
+@pytest.mark.longer
 def test_a_real_failure_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "bad.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n")
     done = process("extract", "bad.ply", "-o", "a.tmap", "--json", "a.json", cwd=tmp_path)

@@ -78,6 +78,7 @@ def test_a_refusal_has_status_two(run: Run, folder: Path) -> None:
     assert status == 2 and out == "" and "not merged" in err and len(err.splitlines()) == 1
 
 
+@pytest.mark.longer
 def test_force_writes_all_and_keeps_the_status(run: Run, folder: Path) -> None:
     status, out, _ = run("b.tmap", "c.tmap", "-o", "forced", "--force")
     assert status == 2 and "force" in out

@@ -91,6 +91,7 @@ def test_one_sensor_gives_one_cloud(tmp_path: Path) -> None:
     assert "T_ab" not in truth(tmp_path)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("hard", ["other-building", "other-storey", "twin-wing"])
 def test_hard_negatives_share_nothing(tmp_path: Path, hard: str) -> None:
     words = ["--building", "office", "--rooms", "4", "--sensors", "depth,depth", "--hard", hard, "-q", "-o", str(tmp_path)]
@@ -110,6 +111,7 @@ def test_free_scale(tmp_path: Path) -> None:
     assert np.isclose(np.linalg.norm(a[1] - a[0]), facts["scale"] * np.linalg.norm(b[1] - b[0]), atol=0.01)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

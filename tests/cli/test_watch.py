@@ -67,6 +67,7 @@ def started(scans: Path, site: Path, *words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(start, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heard)
 
 
+@pytest.mark.longer
 def test_a_ctrl_c_ends_it_with_a_line(scans: Path, tmp_path: Path) -> None:
     process = started(scans, tmp_path / "site")
     assert process.stdout is not None and process.stdout.readline().startswith("0.tmap -> 0: 1 room; ")

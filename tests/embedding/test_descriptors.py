@@ -35,6 +35,7 @@ def permuted(map: TopometricMap, order: np.ndarray) -> TopometricMap:
     return replace(map, room=labels[0], navigable_room=labels[1], rooms=map.rooms[order], edges=edges)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("name", EMBEDDERS)
 @pytest.mark.parametrize("k", [0, 1, 2])
 def test_rows_and_columns(map: TopometricMap, name: str, k: int):
@@ -47,6 +48,7 @@ def test_rows_and_columns(map: TopometricMap, name: str, k: int):
     assert rows.shape[1:] == ((4, 64) if name == "learned" else ((k + 1) * embedder(name, **FAST[name])(map).shape[1],))
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("name", EMBEDDERS)
 def test_order_of_rooms(map: TopometricMap, name: str):
     order = np.array([3, 0, 4, 1, 2])

@@ -94,6 +94,7 @@ def test_the_embedder_that_ships_is_as_with_torch(torch):
         assert np.abs(one - other).max() < 1e-5 and np.allclose(one.sum(axis=1), 1)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("file", sorted(path.stem for path in (CONFIGS / "node").glob("*.yaml")))
 def test_every_node_encoder_is_as_with_torch(torch, file, tmp_path):
     yaml = pytest.importorskip("yaml")
@@ -102,6 +103,7 @@ def test_every_node_encoder_is_as_with_torch(torch, file, tmp_path):
     compare(saved(torch, Network(Geometry(["scalars"], width=16), node, size=24), tmp_path), graphs())
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("file", GEOMETRIES)
 @pytest.mark.parametrize("jump", ["last", "cat", "max"])
 def test_every_geometry_of_numbers_is_as_with_torch(torch, file, jump, tmp_path):
@@ -124,6 +126,7 @@ def test_networks_that_read_points_go_through_torch(torch, tmp_path, monkeypatch
     assert embedder("learned")(building(1)).shape == (3, 4, 64)
 
 
+@pytest.mark.longer
 def test_torch_is_never_imported():
     code = (
         "import sys, topomerge as tm; from tests.scenes_map import building; from topomerge.cli.main import COMMANDS\n"

@@ -29,6 +29,7 @@ def test_columns_are_looked_up_by_name():
         assert len(set(columns)) == len(columns)
 
 
+@pytest.mark.longer
 def test_a_feature_more_makes_everything_wider(tmp_path):
     """One more feature of rooms and of edges, in front of all others: layers, examples and packed columns follow."""
     pytest.importorskip("torch_geometric")

@@ -53,6 +53,7 @@ def test_half_a_wall_twice_is_half():
     assert doubled.sum() == pytest.approx(0.5 * line(30).sum(), abs=8)
 
 
+@pytest.mark.longer
 def test_a_joined_map_of_maps_that_agree_has_no_wall_twice():
     halves = office_map(0), office_map(2)
     joined = fuse(halves, [(0, Sim3()), (1, truth(0, 2))])

@@ -37,6 +37,7 @@ SETS = ("heldout", "heldout_small", "heldout_plans", "real", "robustness")
 SMALL = Pairs(name="two", pairs=2, split="test", maps=True, **SMALL_HOUSES)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("data", SETS)
 def test_every_set_composes(data: str) -> None:
     settings = compose("evaluate", Evaluation, [f"data={data}"])

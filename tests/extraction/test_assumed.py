@@ -30,6 +30,7 @@ def test_points_that_reach_lower_than_that_tell_where_the_floor_is() -> None:
     assert tm.extract(upper_half(-0.3)).storeys["floor"][0] == pytest.approx(-0.3, abs=0.2)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("eyes", [1.0, 1.4, 1.7])
 def test_the_sensor_was_carried_at_a_usual_height(eyes: float) -> None:
     points = upper_half(1.2)

@@ -46,6 +46,7 @@ def test_two_rooms_and_a_door(noise, ceiling):
     assert door["kind"] == "door"
 
 
+@pytest.mark.longer
 def test_a_corridor_with_eight_rooms():
     result = extract(scenes.corridor().points(0.01))
     assert len(result.rooms) == 9

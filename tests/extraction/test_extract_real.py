@@ -35,6 +35,7 @@ def test_no_corner_of_a_robot_grid_is_a_room(lab: TopometricMap) -> None:
     assert 9 <= (lab.rooms["area"] > 5).sum() <= 10 and 9 <= len(lab.rooms) <= 11
 
 
+@pytest.mark.longer
 def test_an_octree_map_keeps_its_free_space(data_dir: Path) -> None:
     result = extract(read_chunks(data_dir / "octomap_freiburg078" / "fr_078_tidyup.bt"))
     assert len(result.storeys) == 1 and 2 <= len(result.rooms) <= 8

@@ -48,6 +48,7 @@ def side_rooms(map: TopometricMap) -> tuple[int, int]:
     return int(order[0]), int(order[1])
 
 
+@pytest.mark.longer
 def test_a_room_without_a_place_of_the_sensor_was_looked_into(points: Array, glimpse: Array) -> None:
     one = extract(scan(points, LEFT), carve=False)
     left, right = side_rooms(one)
@@ -92,6 +93,7 @@ def test_rays_tell_who_was_where(points: Array) -> None:
     assert alone is not None and alone[right].tolist() == [0, 0] and alone[left].tolist() == [1, 1]
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(
     "place", [(np.nan, 0.0, 0.0), (2.0, np.inf, 1.4), (500.0, 500.0, 1.4), (2.0, 2.0, 60.0)], ids=["nan", "inf", "far", "high"]
 )
@@ -149,6 +151,7 @@ def test_damaged_weights_are_named(points: Array, change: dict[str, object], tmp
         extract(points, carve=False)
 
 
+@pytest.mark.longer
 def test_sight_ends_at_what_is_not_free() -> None:
     free = np.ones((9, 9), bool)
     free[4] = False

@@ -38,6 +38,7 @@ def test_equals_numpy_twin():
     assert dict(zip(lattice_of(grid), grid.properties["count"].tolist(), strict=True)) == counts
 
 
+@pytest.mark.longer
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 6))
 def test_order_and_chunks_do_not_matter(seed, parts):

@@ -83,6 +83,7 @@ def test_a_building_that_repeats_itself_is_counted():
     assert repeats(ranked((5.0, {}), (3.0, {"conflict_share": 0.6, "worst_conflict": 0.7, "ratio": 0.2}))) == 0
 
 
+@pytest.mark.longer
 def test_the_places_of_a_registration_lie_in_the_first_map(points, drifted):
     """And seen from the other map they are the same places, in its frame."""
     a, b, _ = drifted

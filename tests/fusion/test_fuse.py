@@ -34,6 +34,7 @@ def joined(halves) -> TopometricMap:
     return fused(*halves, truth(0, 2))
 
 
+@pytest.mark.longer
 def test_provenance_tells_who_saw_each_cell():
     """Two boxes of cells that share a part, the second one moved by whole cells."""
     a, b = (tm.extract(two_rooms().points().astype(np.float32), name=name) for name in "ab")
@@ -111,6 +112,7 @@ def test_a_map_laid_on_itself_is_itself(halves):
     assert rooms[:, 0].tolist() == rooms[:, 1].tolist() == list(range(len(a.rooms))) and (shared > 0.99).all()
 
 
+@pytest.mark.longer
 def test_a_slice_fills_no_room_with_what_stands_in_it(halves):
     """Its furniture becomes walls as high as the room; where another map saw the floor, it only says that it saw something."""
     west = halves[0].grid.cell_bounds(halves[0].grid.cells)[0] + 0.05

@@ -69,6 +69,7 @@ def test_what_it_may_be_and_what_each_place_says_stand_in_the_listing(merged, re
     assert (at[:, :2] > (-1, -1)).all() and (at[:, :2] < (25, 15)).all()  # in the frame of the first map
 
 
+@pytest.mark.longer
 def test_what_the_maps_are_of_raises_what_is_believed_and_a_risk_sets_the_threshold(halves, stranger, refused):
     each = [tm.merge([halves[0], stranger], same=same).probability for same in ("building", "storey")]
     assert refused.probability <= each[0] <= each[1]
@@ -147,11 +148,13 @@ def test_unrelated_maps_are_refused(refused):
     assert "not merged" in refused.reason and refused.probability < 0.9
 
 
+@pytest.mark.longer
 def test_force_joins_them_and_still_says_no(halves, stranger):
     forced = tm.merge([halves[0], stranger], force=True)
     assert forced.status == "abstained" and 1 in forced.transforms and forced.map is not None and "force" in forced.reason
 
 
+@pytest.mark.longer
 def test_a_threshold_is_kept_to(halves, merged):
     assert tm.merge(halves, threshold=1.0).status == "abstained"
     for wrong in (-0.1, 1.1, float("nan")):
@@ -159,6 +162,7 @@ def test_a_threshold_is_kept_to(halves, merged):
             tm.merge(halves, threshold=wrong)
 
 
+@pytest.mark.longer
 def test_cells_of_maps_that_were_joined_before_are_theirs(merged, halves):
     from topomerge.viz.merge_report import _seen
 
@@ -249,6 +253,7 @@ def test_bad_maps_are_refused(halves, stranger):
         MergeResult("perhaps", 0.5, "")
 
 
+@pytest.mark.longer
 def test_maps_with_one_room_or_none_are_tried(stranger):
     room = map_of(Scene().shell(0, 0, 5, 4).points(), "room.ply")
     assert any("room.ply: has one room" in w for w in tm.merge([room, stranger]).warnings)
@@ -280,6 +285,7 @@ def test_three_maps_are_merged_by_an_atlas(tmp_path, remembered):
     assert "All maps belong together" in page and "south" in page and "data-scene=" in page
 
 
+@pytest.mark.longer
 def test_a_first_map_that_stands_apart_is_told(remembered):
     result = tm.merge([another(), office_map(0), office_map(2)])
     assert result.status == "abstained" and not result.transforms and result.map is None

@@ -46,6 +46,7 @@ def test_the_other_way_round_is_the_inverse(halves, joined):
     assert there.probability == back.probability
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("up", [0.0, 0.035, 0.07])
 def test_bent_maps_lie_as_high_as_rigid_ones(points, up):
     """Bending is level: the height is that of the fine registration, finer than a cell."""
@@ -57,6 +58,7 @@ def test_bent_maps_lie_as_high_as_rigid_ones(points, up):
     assert bent.transform.translation[2] == rigid.transform.translation[2]
 
 
+@pytest.mark.longer
 def test_bent_maps_of_unknown_scale_lie_as_high_as_rigid_ones(points):
     """Far above their origin, too, where a little more or less scale is half a metre."""
     frame = Sim3(MOVE.yaw, (*MOVE.translation[:2], 60.0), 0.8)
@@ -103,6 +105,7 @@ def test_maps_of_two_buildings_are_not_believed(points):
     assert not found.accepted and "not believed" in found.reason
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("same", ["nothing", "storey"])
 def test_a_mirrored_twin_is_not_believed(same):
     """The same rooms the other way round, as semi-detached houses are: no turn lays them on each other."""
@@ -141,6 +144,7 @@ def test_one_empty_room_of_one_size_is_not_believed():
     assert found.posterior["wing"] == max(found.posterior[n] for n in WRONG)
 
 
+@pytest.mark.longer
 def test_a_refusal_is_the_same_whichever_map_is_first(row):
     a, b = grid_of(part(row, (3.8, -9), (16.2, 19))), grid_of(part(row, (11.8, -9), (24.2, 19)), MOVE)
     there, back = register(a, b), register(b, a)
@@ -165,6 +169,7 @@ def test_a_corner_in_common_is_not_believed(points):
     assert not found.accepted and found.posterior["here"] <= FEW
 
 
+@pytest.mark.longer
 def test_storeys_of_one_plan_are_told_apart_by_the_other_one():
     """The lower storey has another plan above it in one map: only at the right height do both storeys agree."""
     lower, upper = office(), Scene().shell(0, 0, 24, 14).wall((12, 0), (12, 14), doors=(3.0,)).wall((0, 9), (12, 9), doors=(5.0,))
@@ -174,6 +179,7 @@ def test_storeys_of_one_plan_are_told_apart_by_the_other_one():
     assert off(found.transform, MOVE.inverse(), middle_in_b())[0] < 0.05
 
 
+@pytest.mark.longer
 def test_a_storey_that_fits_two_is_not_believed(points):
     found = register(grid_of(doubled(office())), grid_of(points, MOVE))
     assert not found.accepted

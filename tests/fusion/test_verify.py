@@ -64,6 +64,7 @@ def test_amounts_grow_no_more_on_large_floors():
     assert (small > one + 0.5).all()
 
 
+@pytest.mark.longer
 def test_rooms_without_a_partner_change_nothing(points):
     """A wing that the other map never saw is added: the pose stays."""
     wing = Scene().shell(30, 0, 41, 9).wall((35, 0), (35, 9), doors=(4.0,)).points()

@@ -65,6 +65,7 @@ def npy(shape: tuple[int, ...], kind: str = "<f8", data: bytes = b"") -> bytes:
     return stream.getvalue() + data
 
 
+@pytest.mark.longer
 def test_arrays_that_unpack_to_gigabytes(worker: Worker, tmp_path: Path) -> None:
     zeros = bytes(300 << 20)
     big = packed({"points.npy": npy((len(zeros) // 24, 3), data=zeros[: len(zeros) // 24 * 24])})

@@ -206,6 +206,7 @@ def test_ifc_is_valid(tmp_path, make, rules):
     assert log.statements == []
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("at", [AT, GRID])
 def test_our_own_reader_finds_the_rooms_of_an_ifc(tmp_path, at):
     pytest.importorskip("ifcopenshell")
@@ -231,6 +232,7 @@ def test_a_model_of_a_map_gives_the_map_again(tmp_path):
     assert np.sort(second.rooms["area"]) == pytest.approx(np.sort(first.rooms["area"]), rel=0.1)
 
 
+@pytest.mark.longer
 def test_both_storeys_come_again_from_a_model(tmp_path):
     pytest.importorskip("ifcopenshell")
     first = topomerge.extract(stair_scene().points())

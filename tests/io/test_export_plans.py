@@ -189,6 +189,7 @@ def test_graphml_in_networkx(tmp_path):
     assert networkx.shortest_path(rooms, "r0", "r3") == ["r0", "r2", "r5", "r3"]
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("suffix", ["ply", "las", "laz"])
 @pytest.mark.parametrize("at", [AT, GRID])
 def test_clouds_read_back(tmp_path, suffix, at):

@@ -60,6 +60,7 @@ def test_walls_stand_where_they_were(tmp_path, at):
     assert (grid.image == 205).any(), "what nobody saw is unknown"
 
 
+@pytest.mark.longer
 def test_turned_buildings_and_the_way_back(tmp_path):
     c, s = np.cos(0.4), np.sin(0.4)
     points = corridor().points() @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + (30.0, -20.0, 5.0)
@@ -117,6 +118,7 @@ def joined(nodes: dict[int, dict], edges: list[dict]) -> bool:
     return seen == set(nodes)
 
 
+@pytest.mark.longer
 def test_routes_lead_from_room_to_room_without_walls_between(tmp_path):
     for name, map in (("hand", building(3)), ("seen", topomerge.extract(corridor().points()))):
         files = write(map, tmp_path / name)

@@ -62,6 +62,7 @@ def assert_the_room(cloud: PointCloud, expected: PointCloud) -> None:
     np.testing.assert_allclose(cloud.poses, camera_poses(), atol=1e-6)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
 @pytest.mark.parametrize("form", ["16UC1", "32FC1", "packed"])
 def test_the_same_cloud_as_from_files(tmp_path: Path, expected: PointCloud, kind: str, form: str) -> None:
@@ -122,6 +123,7 @@ def values(**new: object) -> object:
     return lambda message: message.__dict__.update(new)
 
 
+@pytest.mark.longer
 def test_bad_images(tmp_path: Path) -> None:
     named = "message 2 of /camera/depth/image_raw "
     for number, (change, says) in enumerate(

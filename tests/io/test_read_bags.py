@@ -327,6 +327,7 @@ def test_cut_bags(tmp_path: Path, walk: Walk, kind: str) -> None:
         assert refusal_of(path).startswith(f"{path}: ")
 
 
+@pytest.mark.longer
 @pytest.mark.usefixtures("bags_here")
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 def test_damaged_bags(tmp_path: Path, walk: Walk, kind: str) -> None:

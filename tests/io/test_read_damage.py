@@ -165,6 +165,7 @@ def test_e57_pages_are_checked_before_the_library_sees_them(samples: dict[str, P
         read_points(tmp_path / "a.e57")
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(
     ("does", "says"),
     [

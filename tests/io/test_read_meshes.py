@@ -111,6 +111,7 @@ def test_outline_of_a_body_with_a_hole_and_of_one_without_floor() -> None:
     assert area(outline(body, walls)) == pytest.approx(16)
 
 
+@pytest.mark.longer
 def test_ifc_rooms_walls_and_doors(samples: dict[str, Path]) -> None:
     cloud = read_points(samples["model.ifc"], spacing=0.1)
     built = cloud.points[(cloud.points[:, 0] > 3.999) & (cloud.points[:, 0] < 4.201)]

@@ -103,6 +103,7 @@ def test_records_behind_the_points_are_not_needed(tmp_path: Path) -> None:
         assert_same_points(read_points(path), room_tree())
 
 
+@pytest.mark.longer
 def test_bad_copc(tmp_path: Path) -> None:
     path = write_copc(tmp_path / "a.copc.laz", room_tree())
     data = path.read_bytes()
@@ -258,6 +259,7 @@ def test_bad_potree(octrees: dict[str, Path], tmp_path: Path) -> None:
         assert "a node" in refusal_of(listed)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("name", ["ept laszip", "ept binary", "potree bin", "potree 1.4"])
 def test_damaged_octrees(octrees: dict[str, Path], tmp_path: Path, name: str) -> None:
     """Points or one line, whatever is flipped."""

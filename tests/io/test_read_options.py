@@ -120,6 +120,7 @@ def test_samples_stay_small() -> None:
     assert sample.points[:, 0].max() > 99_000
 
 
+@pytest.mark.longer
 def test_progress_runs_from_start_to_end(samples: dict[str, Path]) -> None:
     for path in samples.values():
         said: list[float] = []

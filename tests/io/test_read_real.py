@@ -14,6 +14,7 @@ from topomerge.io.ifc import area
 pytestmark = pytest.mark.data
 
 
+@pytest.mark.longer
 def test_octomap_of_freiburg(data_dir: Path) -> None:
     cloud = read_points(data_dir / "octomap_freiburg078" / "fr_078_tidyup.bt")
     assert len(cloud) == 287_664  # as octomap itself counts them
@@ -60,6 +61,7 @@ def test_apartment_of_halmstad(data_dir: Path) -> None:
     assert sum(len(c) for c in chunks) == len(cloud) and len(chunks) > 2
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(
     ("name", "rooms", "storeys", "size"),
     [("duplex", 21, {0, 1, 2}, (9.3, 26.6, 8.2)), ("ExampleHOM", 11, {0, 1, 2}, (8.6, 11.4, 10.6))],

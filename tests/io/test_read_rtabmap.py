@@ -97,6 +97,7 @@ def test_formats_of_scans(tmp_path: Path, walk: Walk) -> None:
     assert "the scan of node 1 is in a format that is not known (99, 3 numbers a point)" in refusal_of(write_rtabmap(path, [bad]))
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("version", VERSIONS)
 def test_depth_images_show_the_room(tmp_path: Path, version: str) -> None:
     """The same cloud as the same images in the layout of TUM; colours may be larger than depth."""

@@ -43,6 +43,7 @@ def test_what_the_library_saves_is_read_with_its_colours(tmp_path: Path) -> None
         read_points(tmp_path / "dsg.json")
 
 
+@pytest.mark.longer
 def test_two_scene_graphs_in_one_out(tmp_path: Path) -> None:
     """Small faces around the points of two walks through one flat, in two frames."""
     dsg = pytest.importorskip("spark_dsg")

@@ -31,6 +31,7 @@ def test_a_chain_of_a_thousand_passes(tmp_path: Path) -> None:
     step.check_references(step_file(tmp_path / "a.ifc", *chain(1000), "#1001=IFCNOTE('#1001')"))
 
 
+@pytest.mark.longer
 def test_a_model_with_such_a_chain_is_read(samples: dict[str, Path], tmp_path: Path) -> None:
     """The whole model stands on it: its lowest placement is the last of the chain."""
     pytest.importorskip("ifcopenshell")

@@ -23,6 +23,7 @@ def run(folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", NOWHERE], capture_output=True, text=True, env=env, timeout=120, check=False)
 
 
+@pytest.mark.longer
 def test_without_a_home_in_a_private_folder(tmp_path: Path) -> None:
     done = run(tmp_path)
     assert (done.returncode, done.stdout) == (0, "[7]\n"), done.stderr
@@ -44,6 +45,7 @@ def test_never_in_a_folder_of_others(tmp_path: Path, kind: str) -> None:
     assert not any(place.iterdir()) and (kind == "link" or not any(folder.iterdir()))
 
 
+@pytest.mark.longer
 def test_threads_are_the_same_ones_with_open3d() -> None:
     """Open3D brings TBB, whose threads now and then kept a process from ending."""
     pytest.importorskip("open3d")

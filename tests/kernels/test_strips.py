@@ -33,6 +33,7 @@ def frames(rng, count):
     return np.column_stack([rng.uniform(-3, 3, (count, 2)), along, across, rng.uniform(-0.5, 0.5, count)])
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("seed", range(4))
 def test_every_point_counts_where_it_lies(seed):
     rng = np.random.default_rng(seed)

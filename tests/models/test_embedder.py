@@ -229,6 +229,7 @@ def test_a_pickle_under_another_name_is_not_run(tmp_path):
         load_embedder(tmp_path)
 
 
+@pytest.mark.longer
 def test_an_embedder_of_maps():
     map = building(2, 2)
     describe = learned(network("scalars", "engineered", "shapedna", "pointnet", node=Node("gat", doors=1, near=True)))

@@ -41,6 +41,7 @@ def is_room(outline: shapely.MultiPolygon, polygon: shapely.Polygon) -> bool:
     return same and part.hausdorff_distance(polygon) < NEAR
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("turn", [0.0, np.radians(30), np.radians(45), 1.2])
 @pytest.mark.parametrize("noise", [0.0, 0.015])
 def test_a_room_whose_walls_are_seen_from_inside(turn, noise):
@@ -131,6 +132,7 @@ def same(a: PlanStructure, b: PlanStructure, moved) -> None:
         assert shapely.transform(mine, moved).symmetric_difference(other).area < 0.01 * other.area
 
 
+@pytest.mark.longer
 def test_a_moved_map_has_the_same_walls_moved():
     map = topomerge.extract(corridor().points())
     shift = np.array([432100.0, 5812300.0, 40.0])

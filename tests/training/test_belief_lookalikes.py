@@ -69,6 +69,7 @@ def test_scores_part_who_could_be_told_apart_by_hand() -> None:
     assert lookalike_scores([{}], np.array([0.9]), np.array([0]), 0.8) == {}
 
 
+@pytest.mark.longer
 def test_without_look_alikes_the_weights_are_as_before_and_judging_them_changes_none(words, tmp_path) -> None:
     weights, ordinary = {}, set()
     for taken in ("none", "judged", "fitted"):

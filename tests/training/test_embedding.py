@@ -55,6 +55,7 @@ def settings(cache, tmp_path) -> Training:
     return Training(**common, epochs=3, batch=4, rate=0.01, network=SMALL)
 
 
+@pytest.mark.longer
 def test_a_set_is_packed_once(cache):
     said: list[str] = []
     pairs = load_pairs(cache / "some.jsonl", ["engineered", "shapedna", "near"], said.append)
@@ -152,6 +153,7 @@ def weights(folder: Path) -> bytes:
     return (folder / "embedder.safetensors").read_bytes()
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("parts", [("scalars",), ("scalars", "pointnet")])
 def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch, parts):
     settings.network = replace(SMALL, geometry=Geometry(list(parts), width=16))
@@ -242,6 +244,7 @@ GROUPS = [("geometry", p.stem) for p in sorted((CONFIGS / "geometry").glob("*.ya
 GROUPS += [(group, p.stem) for group in ("node", "loss", "experiment") for p in sorted((CONFIGS / group).glob("*.yaml"))]
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(("group", "name"), GROUPS)
 def test_every_config_composes_and_builds(group, name):
     config = from_words([f"{group}={name}"])
@@ -251,6 +254,7 @@ def test_every_config_composes_and_builds(group, name):
         assert config.name == name
 
 
+@pytest.mark.longer
 def test_typos_name_their_key(tmp_path):
     for word in ("epoch=3", "network.node.layer=3", "loss.kinds=triplet", "epochs=many", "data.pears=3", "geometry=pointnets"):
         with pytest.raises(InputError, match=word.split("=")[0].split(".")[-1]):
@@ -275,6 +279,7 @@ def run(words: list[str]) -> subprocess.CompletedProcess:
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, env=environment)
 
 
+@pytest.mark.longer
 def test_without_hydra(settings, tmp_path, capsys):
     """On a machine with no Hydra and no Open3D, and without importing the extraction."""
     (tmp_path / "run.json").write_text(json.dumps({**to_dict(settings), "epochs": 1}))

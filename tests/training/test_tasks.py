@@ -104,6 +104,7 @@ def read(task: str) -> Any:
     }[task]()
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("task", [*NETWORKS, *FITS])
 def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monkeypatch) -> None:
     shipped = read(task)
@@ -128,6 +129,7 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
     assert weights_of(task, "").is_file() and judge_task(task, words(task, f"folder={tmp_path / 'eval'}"), quiet).scores
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("task", list(NETWORKS))
 def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
     jobs = {"plan_segmentation": plan_segmentation.PlanJob, "door_classification": door_classification.DoorJob}
@@ -153,6 +155,7 @@ def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> Non
         train(settings_of(words(task, "name=none", "resume=true")), quiet)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("task", FITS)
 def test_a_fit_that_ended_is_left_as_it_is(task, words, tmp_path) -> None:
     first = train(settings_of(words(task)), quiet)

@@ -38,6 +38,7 @@ def test_steps_run_in_order_and_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert weights.main([f"runs={tmp_path}", "only=nothing"]) == 1 and "only=nothing" in capsys.readouterr().err
 
 
+@pytest.mark.longer
 def test_each_step_is_a_task_with_its_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[object] = []
     monkeypatch.setattr(weights, "train", lambda settings, say: asked.append(settings))

@@ -126,6 +126,7 @@ addEventListener("load", () => setTimeout(() => {
 """
 
 
+@pytest.mark.longer
 def test_the_slider_bends_the_outlines_in_a_browser(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "PROBE", PROBE)
     page = tmp_path / "report.html"

@@ -101,6 +101,7 @@ def test_the_most_constrained_room_is_next(joins: int) -> None:
     assert colour_numbers(60, pairs).tolist() == [numbers[i] for i in range(60)]
 
 
+@pytest.mark.longer
 def test_same_map_same_file(tmp_path: Path) -> None:
     for name in ("a.png", "a.svg", "a.pdf"):
         save_figure(building(1, 1), tmp_path / name)

@@ -21,6 +21,7 @@ def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.M
         RerunLog(tmp_path / "a.rrd")
 
 
+@pytest.mark.longer
 def test_a_watch_writes_a_file_that_can_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rerun")
     monkeypatch.chdir(tmp_path)

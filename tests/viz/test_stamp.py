@@ -13,6 +13,7 @@ from tests.viz.chromium import Page
 from topomerge.fusion.atlas.store import add
 
 
+@pytest.mark.longer
 def test_an_open_page_shows_the_atlas_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", lambda *_: ())
     add(tmp_path / "house", [("one", room(0))], tm.atlas_html)

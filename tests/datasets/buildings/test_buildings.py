@@ -23,6 +23,7 @@ def digest(building: Building) -> str:
     return hashlib.sha256(b"".join(a.tobytes() for a in arrays)).hexdigest()
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("kind", BUILDING_KINDS)
 @pytest.mark.parametrize("storeys", [1, 3])
 def test_buildings_of_every_kind_are_sound(kind: str, storeys: int) -> None:
@@ -43,12 +44,14 @@ def test_buildings_of_every_kind_are_sound(kind: str, storeys: int) -> None:
     assert (climbed["tread"] >= 0.25).all()
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("shape", SHAPES)
 def test_every_shape_of_corridor_can_be_asked_for(shape: str) -> None:
     building = make_building("office", 5, 1, EMPTY, shape=shape)
     assert connected(building) and len(building.rooms) >= 5
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("stairs", ["straight", "dogleg", "spiral", "ramp"])
 def test_every_kind_of_stairs_can_be_asked_for(stairs: str) -> None:
     building = make_building("office", 5, 2, EMPTY, stairs=stairs)
@@ -77,6 +80,7 @@ def test_hotels_have_near_identical_rooms_with_a_bath() -> None:
     assert sum(r.kind == "bath" for r in building.rooms) >= 8
 
 
+@pytest.mark.longer
 def test_each_difficulty_does_what_it_says() -> None:
     def share(difficulty: Difficulty, label: str) -> float:
         building = make_building("office", 8, 1, difficulty, shape="double")
@@ -117,6 +121,7 @@ def test_wrong_arguments_are_refused(wrong: tuple[str, int, int], reason: str) -
         make_building("office", 1, shape="star")
 
 
+@pytest.mark.longer
 def test_rooms_of_a_kind_differ_and_closets_are_cut_out() -> None:
     def areas(difficulty: Difficulty) -> np.ndarray:
         rooms = [r for seed in range(4) for r in make_building("office", seed, 1, difficulty, shape="double").rooms]

@@ -40,6 +40,7 @@ def test_bad_atlases() -> None:
         Atlas("x", (), (), {}, (), "procedural", "x")
 
 
+@pytest.mark.longer
 def test_pictures(tmp_path: Path) -> None:
     building = make_building("house", 3, 2)
     pair = make_pair(building, PairSettings(0.5, ("depth", "depth"), 4), 2)

@@ -59,6 +59,7 @@ def test_what_is_there_is_not_made_again(whole: Path) -> None:
     assert contents(whole) == before and set(before) == {"small.jsonl", *(f"pairs/{i.name}.npz" for i in draw_items(SMALL, {}))}
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(("addition", "maps", "same"), [
     ("ANOTHER = 1", True, False), ("# another word", True, True), ("ANOTHER = 1", False, True),
 ])  # fmt: skip
@@ -80,6 +81,7 @@ def test_other_weights_of_the_extraction_refuse_cached_pairs(monkeypatch, tmp_pa
     assert item.name != before
 
 
+@pytest.mark.longer
 def test_what_is_missing_or_damaged_is_made_again(whole: Path, tmp_path: Path) -> None:
     for name, data in contents(whole).items():
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -146,6 +146,7 @@ def test_a_mirror_image_is_a_reflection_and_lies_on_the_building_where_it_can() 
     assert np.allclose(lying.translation, 0.0, atol=1e-6) and lying.yaw == 0.0
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("kind", LOOKALIKES)
 @pytest.mark.parametrize("furniture", FURNISHED)
 def test_places_of_each_kind_hold_the_furniture_that_is_asked_for(kind: str, furniture: str) -> None:

@@ -51,6 +51,7 @@ def test_a_building_without_such_parts_is_refused() -> None:
         two_parts(make_building("house", 3), 20, -0.1, np.random.default_rng(0))
 
 
+@pytest.mark.longer
 def test_twin_rooms_lie_above_each_other() -> None:
     building = make_building("hotel", 5, 3)
     for i, j in twin_rooms(building).items():

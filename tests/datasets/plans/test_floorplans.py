@@ -135,6 +135,7 @@ def test_erects_to_the_same_rooms_and_door(make: Callable[[Path], Path], tmp_pat
 # Real data
 
 
+@pytest.mark.longer
 @pytest.mark.data
 def test_first_apartments(data_dir: Path) -> None:
     results = [r for _, (_, r) in zip(range(150), iter_plans(data_dir / "plans_r2v_apartments"), strict=False)]
@@ -172,6 +173,7 @@ def test_school_storeys(data_dir: Path) -> None:
     assert len(building.rooms) == 18 and len(set(building.parts().tolist())) == 1
 
 
+@pytest.mark.longer
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("folder", "least"),

@@ -146,6 +146,7 @@ def write_house(folder: Path, regions: bool = True, lines: int | None = None, pr
     return folder
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("regions", [True, False])
 @pytest.mark.parametrize("prefix", ["", "ASCII 1.1\n"])
 def test_matterport_regions_become_rooms_on_levels(tmp_path, regions, prefix):

@@ -62,6 +62,7 @@ def test_no_other_set_is_of_it() -> None:
     assert not set(compose("evaluate", Evaluation, ["data=real"]).data.real) & set(sources.DEVELOPMENT_FOLDERS)
 
 
+@pytest.mark.longer
 @pytest.mark.data
 def test_walls_agree_though_drift_bends_them(data_dir: Path) -> None:
     makers = list(office_floor.pairs(data_dir / sources.DEVELOPMENT_FOLDERS["office_floor"]))

@@ -42,6 +42,7 @@ def check(name: str, pair: Pair | Refusal) -> None:
         assert pair.a.free.contains(inside).mean() > 0.9  # a robot stands where it is free
 
 
+@pytest.mark.longer
 @pytest.mark.data
 def test_walls_agree_in_halmstad_pairs(data_dir):
     makers = list(halmstad.pairs(data_dir / sources.REAL_FOLDERS["halmstad"]))
@@ -53,6 +54,7 @@ def test_walls_agree_in_halmstad_pairs(data_dir):
         assert (abs(pair.truth.scale - 1) > 0.1) == drawn
 
 
+@pytest.mark.longer
 @pytest.mark.data
 @pytest.mark.parametrize("wanted", QUICK)
 def test_walls_agree_in_single_pairs(data_dir, wanted):

@@ -186,6 +186,7 @@ def test_a_room_that_cannot_be_reached_is_named() -> None:
         scan(building)
 
 
+@pytest.mark.longer
 def test_a_scan_of_a_storey_is_quick(office: Building) -> None:
     scan(office, "tls")
     start = time.process_time()

@@ -62,6 +62,7 @@ def corridor() -> Array:
     return scenes.corridor().points(0.01)
 
 
+@pytest.mark.longer
 def test_without_lintels(corridor: Array) -> None:
     scene = scenes.Scene().shell(0, 0, 16, 10)
     for y in (4, 6):
@@ -89,6 +90,7 @@ def test_furniture_hides_the_floor_and_stays_in_the_room() -> None:
     assert on_counter.any() and not standing[on_counter].any() and standing.mean() > 0.6
 
 
+@pytest.mark.longer
 def test_sparse_points_get_larger_cells(corridor: Array) -> None:
     few = corridor[np.random.default_rng(0).random(len(corridor)) < 0.05]
     result = extract(few)
@@ -97,6 +99,7 @@ def test_sparse_points_get_larger_cells(corridor: Array) -> None:
     assert extract(corridor).grid.edge == 0.1
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("poses", [True, False])
 def test_a_slice_gets_walls_and_a_floor(corridor: Array, poses: bool) -> None:
     points = corridor[np.abs(corridor[:, 2] - 0.3) < 0.04]
@@ -113,6 +116,7 @@ def test_a_slice_gets_walls_and_a_floor(corridor: Array, poses: bool) -> None:
     is_the_corridor(result, 0.2)
 
 
+@pytest.mark.longer
 def test_the_upper_half_gets_a_floor(corridor: Array) -> None:
     upper = corridor[corridor[:, 2] > 1.0]
     grid = voxelise(upper, 0.1, [])
@@ -125,6 +129,7 @@ def test_the_upper_half_gets_a_floor(corridor: Array) -> None:
     assert has_floor(whole, navigable_volume(Scan(whole), PRESETS["default"])[1], 1.75)
 
 
+@pytest.mark.longer
 def test_turning_shuffling_and_other_cells_change_little(corridor: Array) -> None:
     result = extract(corridor)
     shuffled = extract(corridor[np.random.default_rng(0).permutation(len(corridor))], carve=False)

@@ -42,6 +42,7 @@ def cluttered(seed: int, n: int = 250, size: int = 14) -> VoxelGrid:
     return VoxelGrid.from_cells(cells, np.array([-0.7, 3.1, 0.2]), 0.1)
 
 
+@pytest.mark.longer
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([0.4, 0.9, 5.0]))
 def test_same_set_as_brute_force(seed, radius):
@@ -111,6 +112,7 @@ def test_jaccard_equals_sets(sets, threshold):
     np.testing.assert_allclose(visibility.matrix().sum(axis=1), [len(s) for s in sets])
 
 
+@pytest.mark.longer
 def test_views_of_other_heights_are_not_compared():
     rows = [[1, 2, 70], [2, 70, 90], [100, 101]]
     heights = np.arange(128) // 64

@@ -26,6 +26,7 @@ def change(folder: Path) -> None:
             (place / name).write_text("2")
 
 
+@pytest.mark.longer
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a copy of this process")
 def test_a_kill_at_any_moment_leaves_the_old_or_the_new(tmp_path):
     """Every call that changes a file system is the last one once."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -58,6 +59,7 @@ def told(assembly: Assembly) -> tuple:
     return sorted(tuple(sorted((k, p.matrix.tobytes()) for k, p in c.items())) for c in assembly.components), of_links
 
 
+@pytest.mark.longer
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_assembled_by_sets_it_is_what_it_is_at_once(seed: int) -> None:

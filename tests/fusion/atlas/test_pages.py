@@ -87,6 +87,7 @@ def test_each_joined_map_has_its_page_and_the_report_names_them(tmp_path: Path) 
     assert "room-2" in page and "room-3" in page and "room-0" not in page and "room-4" not in page
 
 
+@pytest.mark.longer
 def test_pages_of_what_did_not_change_are_taken_over_and_those_of_what_is_gone_go(tmp_path: Path) -> None:
     folder, counted = tmp_path / "house", Counted()
     add(folder, named(0, 1, 2, 3), counted)
@@ -123,6 +124,7 @@ def test_an_atlas_from_before_there_were_pages_opens_and_gets_them(tmp_path: Pat
     assert pages(folder) == ["map_0.html", "map_1.html"] and (folder / "map_0.tmap").read_bytes() == joined
 
 
+@pytest.mark.longer
 def test_stopped_between_two_pages_and_taken_up_again_it_is_the_same(tmp_path: Path) -> None:
     def stopped(*args: object, **words: object) -> str:
         if words.get("component") == 1:
@@ -140,6 +142,7 @@ def test_stopped_between_two_pages_and_taken_up_again_it_is_the_same(tmp_path: P
     assert content(folder) == content(tmp_path / "whole" / "house")
 
 
+@pytest.mark.longer
 def test_two_that_add_at_once_give_what_one_gives(tmp_path: Path) -> None:
     rooms = named(*range(8))
 

@@ -22,6 +22,7 @@ def maps() -> list[TopometricMap]:
     return [office_map(k) for k in range(4)]
 
 
+@pytest.mark.longer
 def test_an_ambiguous_pair_is_settled_by_the_others(maps):
     """South and north share a corridor only: three places are about as good; west and east know which is right."""
     inner = Maps(maps)

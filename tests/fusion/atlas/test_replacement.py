@@ -29,6 +29,7 @@ def near(pose: Sim3, true: Sim3, limit: float = 0.2) -> bool:
     return float(np.linalg.norm(pose.apply(at) - true.apply(at), axis=1).max()) < limit
 
 
+@pytest.mark.longer
 def test_the_rest_of_a_building_makes_a_map_longer_and_not_shorter():
     stored = Stored(Path("house"))
     longer = longer_version("west", office_map(0), whole(), stored)

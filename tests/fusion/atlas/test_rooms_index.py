@@ -81,6 +81,7 @@ def indexed(small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     return folder
 
 
+@pytest.mark.longer
 def test_a_shortlist_gives_what_the_comparison_with_all_maps_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     maps = many_maps()
     folder = write_atlas(tmp_path / "town", {str(k): of for k, of in enumerate(maps)})
@@ -95,6 +96,7 @@ def test_a_shortlist_gives_what_the_comparison_with_all_maps_gives(tmp_path: Pat
     assert len(look(folder, seen_again(maps, 1), MAPS, monkeypatch)) == MAPS  # who asks for all gets all
 
 
+@pytest.mark.longer
 def test_index_and_exact_search_name_the_same_maps(indexed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     maps = many_maps()
     assert (indexed / INDEX_FILE).exists()

@@ -104,6 +104,7 @@ def test_a_claim_against_two_surer_ones_is_not_believed(maps, registrations):
     )  # never at the wrong place
 
 
+@pytest.mark.longer
 def test_a_poisoned_map_is_not_let_in(maps, registrations):
     """A stranger that one pair believes to be surely part of the building stands on free floor there."""
     west, other = maps[0], maps[4]
@@ -129,6 +130,7 @@ def test_the_joined_map_is_that_of_the_whole(atlas, maps):
         assert np.allclose(back.max(axis=0), own.max(axis=0), atol=0.2)
 
 
+@pytest.mark.longer
 def test_files_are_read_when_needed(maps, atlas, registrations, tmp_path):
     paths = []
     for k in (0, 1, 2, 3, 4):
@@ -142,6 +144,7 @@ def test_files_are_read_when_needed(maps, atlas, registrations, tmp_path):
     assert promise(inner, 0, 2) > promise(inner, 0, 4)
 
 
+@pytest.mark.longer
 def test_of_many_maps_only_those_that_look_alike_are_registered(maps, atlas, registrations, monkeypatch):
     monkeypatch.setattr("topomerge.fusion.atlas.partners.MOST_PARTNERS", 2)
     made = dict(registrations)

@@ -74,6 +74,7 @@ def test_adding_later_is_building_at_once(built, tmp_path):
     assert (later / "pairs.json").read_bytes() == (built / "pairs.json").read_bytes()
 
 
+@pytest.mark.longer
 def test_taking_out_takes_back(folder, built):
     before = listing_of(built)
     registered = (folder / "pairs.json").read_bytes()

@@ -53,6 +53,7 @@ def backwards(tasks: Sequence[PairTask]) -> Iterator[Numbered]:
         yield k, register_pair(tasks[k])
 
 
+@pytest.mark.longer
 def test_who_is_killed_goes_on_and_the_order_in_which_pairs_end_changes_nothing(alone, tmp_path):
     asked: list[int] = []
 

@@ -140,6 +140,7 @@ def test_many_maps_that_cannot_be_bent_say_why(straight, bent_map, sensor, up, r
     assert bend_together(maps, start, [(0, 1)]) == (start, {}, reason)
 
 
+@pytest.mark.longer
 def test_many_maps_bend_together(points, straight, bent_map):
     """What the second map says straightens the third, which the first never saw."""
     west, east = part(points, high=(14, 99)), part(points, low=(10, -99))

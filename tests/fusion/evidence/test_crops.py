@@ -53,6 +53,7 @@ def test_walls_furniture_and_ceilings_are_where_they_are(points):
     assert seen.looked[:, :, 0].max() == 0 and seen.looked[:, :, 1:].min() == 1
 
 
+@pytest.mark.longer
 def test_maps_that_share_nothing_share_no_square(points):
     left, right = storeys(part(points, high=(9, 99))), storeys(part(points, low=(15, -99)))
     assert len(crops(left, right, Sim3())) == 0
@@ -68,6 +69,7 @@ def test_heights_of_a_map_of_another_scale_grow_with_it(points):
     assert len(seen) > 8 and np.abs(np.diff(seen.ceiling.astype(int), axis=1)[:, 0][both]).mean() < 6
 
 
+@pytest.mark.longer
 def test_the_floor_above_is_no_other_ceiling(points):
     """Below another storey the highest thing of a room is that one's floor: all of it higher, and no contradiction."""
     both = storeys(doubled(office()))

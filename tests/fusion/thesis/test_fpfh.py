@@ -44,6 +44,7 @@ def test_features_do_not_change_when_all_is_turned():
     assert there.shape == (33, 300) and same.mean() > 0.98  # an angle on the border of two bins may fall on either side
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("yaw", [0.4, -3.1])
 def test_a_turned_room_is_brought_back(yaw):
     truth = Sim3(yaw, (4.0, -7.0, 0.5))

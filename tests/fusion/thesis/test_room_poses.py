@@ -35,6 +35,7 @@ def partners(flats):
     return rooms
 
 
+@pytest.mark.longer
 def test_rooms_that_match_agree_about_the_pose(flats, partners):
     clusters = room_poses(*flats, partners, np.ones(len(partners)))
     metres, degrees = off(clusters[0][0], MOVE.inverse(), tuple(MOVE.apply(np.array([[6.0, 4.0, 1.0]]))[0]))
@@ -42,6 +43,7 @@ def test_rooms_that_match_agree_about_the_pose(flats, partners):
     assert [w for _, w in clusters] == sorted((w for _, w in clusters), reverse=True)
 
 
+@pytest.mark.longer
 def test_one_wrong_match_is_outvoted(flats, partners):
     wrong = np.array([[partners[0, 0], partners[1, 1]]])
     clusters = room_poses(*flats, np.concatenate([wrong, partners]), np.ones(len(partners) + 1))
@@ -52,6 +54,7 @@ def test_no_matches_give_no_pose(flats):
     assert room_poses(*flats, np.zeros((0, 2), np.int64), np.zeros(0)) == []
 
 
+@pytest.mark.longer
 def test_merge_by_rooms_alone(flats):
     result = tm.merge(flats, poses="rooms")
     metres, degrees = off(result.registration.transform, MOVE.inverse(), tuple(MOVE.apply(np.array([[6.0, 4.0, 1.0]]))[0]))
@@ -69,6 +72,7 @@ def test_merge_by_rooms_is_for_two_maps_of_one_scale(flats):
         tm.merge(flats, poses="thesis")
 
 
+@pytest.mark.longer
 def test_the_same_maps_give_the_same_poses(flats, partners):
     first, again = (room_poses(*flats, partners, np.ones(len(partners))) for _ in range(2))
     assert again == first
