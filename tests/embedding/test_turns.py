@@ -12,7 +12,16 @@ from topomerge.embedding.graph import graph_arrays
 from topomerge.embedding.sheets import sheet_arrays
 from topomerge.embedding.surroundings import CROP_PART as CROP
 from topomerge.embedding.surroundings import crops
-from topomerge.embedding.turns import TurnedRows, aligned, edge_ways, quarter_turned, quarters_between
+from topomerge.embedding.turns import (
+    ONE_PLACE,
+    TurnedRows,
+    aligned,
+    edge_ways,
+    moved_alike,
+    quarter_turned,
+    quarters_between,
+    way_between,
+)
 from topomerge.errors import InputError
 
 
@@ -49,6 +58,19 @@ def test_strange_rooms_do_not_hide_the_turn():
     other = TurnedRows(np.concatenate([again.rows, strange.rows]), np.concatenate([again.places, strange.places]))
     a, b = aligned(rows, other)
     assert (a @ b.T).argmax(axis=1)[:5].tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_rooms_of_one_map_are_moved_by_one_way(turns):
+    rows = some_rows(7)
+    other = turned_rows(rows, turns)
+    quarters, way = way_between(rows, other)
+    assert quarters == turns and way == pytest.approx(-(5 - 2j) * 1j**turns, abs=0.02)
+    there = moved_alike(rows, other, quarters, way)
+    assert np.diag(there) == pytest.approx(1.0, abs=1e-3)
+    apart = np.linalg.norm(rows.places[:, None] - rows.places[None], axis=2)
+    assert there == pytest.approx(np.exp(-(apart**2) / (2 * ONE_PLACE**2)), abs=0.02)
+    assert way_between(rows, some_rows(0)) == (0, 0)
 
 
 def test_the_order_of_two_maps_does_not_matter():

@@ -20,6 +20,7 @@ FACTS = width("x") + 2
 SHARPNESS = 6.0  # that cosines are multiplied with before rooms choose partners; chosen, as those below, on validation pairs
 PARTNERS = 4  # pairs of rooms that vote, times the number of rooms
 WAYS_ALIKE = 0.5  # m, standard deviation of how far rooms that are one are moved
+ONE_PLACE = 1.0  # m, that of the middles of one room in two maps, of which one may have looked into it only
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,22 +79,39 @@ def aligned(a: Rows, b: Rows) -> tuple[Array, Array]:
 
 
 def quarters_between(a: TurnedRows, b: TurnedRows) -> int:
-    """Quarter turns by which b is to be turned: those for which the most votes agree on one way from b to a. Each two rooms vote
-    for the way between them, the more the more alike they are, and the less alike others are to them."""
+    """Quarter turns by which b is to be turned (`way_between`)."""
+    return way_between(a, b)[0]
+
+
+def way_between(a: TurnedRows, b: TurnedRows) -> tuple[int, complex]:
+    """Quarter turns by which b is to be turned, and the way that its rooms are moved by then, m: those on which the most votes
+    agree. Each two rooms vote for the way between them, the more the more alike they are, and the less alike others are to
+    them."""
     if not len(a) or not len(b):
-        return 0
+        return 0, 0j
     flat, x, y = a.flat(), _complex(a.places), _complex(b.places)
-    return int(np.argmax([_most_votes(flat @ b.flat(k).T, x, y * 1j**k) for k in range(QUARTERS)]))
+    voted = [_most_votes(flat @ b.flat(k).T, x, y * 1j**k) for k in range(QUARTERS)]
+    best = int(np.argmax([votes for votes, _ in voted]))
+    return best, voted[best][1]
 
 
-def _most_votes(cosine: Array, x: Array, y: Array) -> float:
+def moved_alike(a: TurnedRows, b: TurnedRows, quarters: int, way: complex) -> Array:
+    """(R_a, R_b) from 0 to 1: is a room of b, turned and moved (`way_between`), where a room of a is?"""
+    off = _complex(a.places)[:, None] - _complex(b.places)[None] * 1j**quarters - way
+    out: Array = np.exp(-(np.abs(off) ** 2) / (2 * ONE_PLACE**2))
+    return out
+
+
+def _most_votes(cosine: Array, x: Array, y: Array) -> tuple[float, complex]:
     weight = np.exp(SHARPNESS * (cosine - 1))
     vote = weight / np.sqrt(weight.sum(axis=1, keepdims=True) * weight.sum(axis=0))
     most = min(PARTNERS * (len(x) + len(y)), vote.size)
     first, second = np.unravel_index(np.argpartition(-vote, most - 1, axis=None)[:most], vote.shape)
     way = x[first] - y[second]
-    near = np.exp(-(np.abs(way[:, None] - way[None]) ** 2) / (2 * WAYS_ALIKE**2))
-    return float((near @ vote[first, second]).max())
+    near = np.exp(-(np.abs(way[:, None] - way[None]) ** 2) / (2 * WAYS_ALIKE**2)) * vote[first, second]
+    total = near.sum(axis=1)
+    best = int(total.argmax())
+    return float(total[best]), complex(near[best] @ way / total[best])
 
 
 def _complex(places: Array) -> Array:

@@ -50,6 +50,14 @@ def test_rooms_seen_again_and_turned_lead_to_their_map() -> None:
     assert sum(s.share for s in ranked(list("abcde"), maps, new, 5)) == pytest.approx(1.0)
 
 
+def test_rooms_that_stand_to_each_other_as_those_of_the_new_map_count_more() -> None:
+    here = unit_rows(5, 0)
+    shuffled = TurnedRows(here.rows, here.places[[1, 2, 3, 4, 0]])  # the same rooms in another building
+    new = TurnedRows(here.rows, here.places + 3.0)
+    first, second = ranked(["shuffled", "here"], [shuffled, here], new, 2)
+    assert first.name == "here" and first.share > 2 * second.share
+
+
 def test_plain_rows_and_maps_without_rooms() -> None:
     rows = [np.eye(4)[:2], np.zeros((0, 4)), np.eye(4)[2:]]
     sightings = ranked(["a", "none", "b"], rows, np.eye(4)[[3]], 3)

@@ -37,7 +37,7 @@ def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array) -> Arr
         return region
     at = np.argwhere(in_region & suspect[np.where(in_region, region, 0)])
     low, base = columns_of(plan, grid)
-    cells = np.ascontiguousarray(np.column_stack([at + low, base[tuple(at.T)]]))  # as elsewhere: each layout is compiled by itself
+    cells = np.ascontiguousarray(np.column_stack([at + low, base[tuple(at.T)]]))  # each layout is compiled by itself
     heights = (round(height / grid.edge) for height in (SHEET_THICKNESS, *STOREY_BELOW))
     hollow = hollow_below(*grid._bricks, cells, 1, *heights)
     thin = np.bincount(region[tuple(at.T)], hollow, minlength=count) > 0.5 * size

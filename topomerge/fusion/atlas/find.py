@@ -1,8 +1,8 @@
 """Which maps and rooms of an atlas does a new map show? The rows of all rooms are compared; nothing is registered.
 
 Each room of the new map has one vote. It goes to the rooms of the atlas that look most like it, shared by how alike they are; a
-map is turned by the one quarter turn at which all of it is most alike. A map's share is that of the votes that its rooms
-got: it says where to look first, not whether the place is there at all. That is what `merge` is for.
+map is turned by the one quarter turn, and moved by the one way, at which all of it is most alike. A map's share is that of the
+votes that its rooms got: it says where to look first, not whether the place is there at all. That is what `merge` is for.
 
 Of an atlas of more than `SHORTLIST` maps only so many are compared that closely: those for which the nearest neighbours of the
 new map's rooms speak, by exact search or an index (`rooms_index`).
@@ -18,7 +18,7 @@ import numpy as np
 
 from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.embedders import embedder as make_embedder
-from topomerge.embedding.turns import Rows, aligned
+from topomerge.embedding.turns import Rows, TurnedRows, moved_alike, way_between
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.neighbours import VOTE_SHARPNESS, nearest, owners, queries, votes
 from topomerge.fusion.atlas.room_rows import RoomRows, embedder_signature
@@ -28,6 +28,7 @@ from topomerge.matching.match import checked
 from topomerge.types import Array, TopometricMap
 
 SHORTLIST = 50  # maps that are compared room by room
+ELSEWHERE = 0.1  # of a room's vote counts for a room that does not lie where those of most rooms do
 
 
 @dataclass(frozen=True)
@@ -91,8 +92,8 @@ def shortlist(scores: Array, number: int) -> list[int]:
 
 def ranked(names: Sequence[str], rows: Sequence[Rows], new: Rows, number: int) -> tuple[Sighting, ...]:
     """`find` with rows of length 1 of each map and of the new one."""
-    alike = [_cosines(new, of) for of in rows]
-    weight = [np.exp(VOTE_SHARPNESS * (cosine - 1)) for cosine in alike]
+    both = [_alike(new, of) for of in rows]
+    alike, weight = [cosine for cosine, _ in both], [np.exp(VOTE_SHARPNESS * (cosine - 1)) * there for cosine, there in both]
     total = np.maximum(np.sum([w.sum(axis=1) for w in weight], axis=0), 1e-300)
     sightings = []
     for name, w, cosine in zip(names, weight, alike, strict=True):
@@ -109,8 +110,16 @@ def _mutual(cosine: Array) -> tuple[tuple[int, int, float], ...]:
     return tuple(sorted(pairs, key=lambda pair: -pair[2]))
 
 
-def _cosines(new: Rows, rows: Rows) -> Array:
-    """(R_new, R) how alike rooms are."""
-    a, b = (side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12) for side in aligned(new, rows))
-    out: Array = a @ b.T
+def _alike(new: Rows, rows: Rows) -> tuple[Array, Array]:
+    """(R_new, R) how alike rooms are, and by how much their vote counts: less where they are not moved as most are."""
+    if not isinstance(new, TurnedRows) or not isinstance(rows, TurnedRows):
+        cosine = _units(np.asarray(new)) @ _units(np.asarray(rows)).T
+        return cosine, np.ones_like(cosine)
+    quarters, way = way_between(new, rows)
+    there = ELSEWHERE + (1 - ELSEWHERE) * moved_alike(new, rows, quarters, way)
+    return _units(new.flat()) @ _units(rows.flat(quarters)).T, there
+
+
+def _units(rows: Array) -> Array:
+    out: Array = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
     return out
