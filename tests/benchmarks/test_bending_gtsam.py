@@ -19,6 +19,7 @@ def of_six_rooms():
     return bending_gtsam.problem(6)
 
 
+@pytest.mark.longer
 def test_both_get_the_factors_of_the_last_round_by_plan():
     before = alignment.settle
     anchors, joints, measured, prior = of_six_rooms()

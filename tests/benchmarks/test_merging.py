@@ -25,6 +25,7 @@ def test_kinds_and_bins_do_not_depend_on_the_order(module) -> None:
     assert [pairs.bin_of(m2) for m2 in (1.0, 39.9, 40.0, 80.0)] == ["<40 m²", "<40 m²", "40–80 m²", "≥80 m²"]
 
 
+@pytest.mark.longer
 def test_plans_that_differ_only_where_nobody_looked_are_the_same() -> None:
     drawings = importlib.import_module("topomerge.datasets.pairs.grid_drawings")
     building = make_building("office", 5, 2)

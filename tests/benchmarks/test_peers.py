@@ -61,6 +61,7 @@ def test_an_answer_over_the_cap_is_a_miss_and_those_before_it_count(module) -> N
     work.close()
 
 
+@pytest.mark.longer
 def test_a_peer_that_dies_or_fails_is_a_miss_and_the_next_call_works(module) -> None:
     calls = module("peer_calls")
     work = calls.GuardedWork(dies)

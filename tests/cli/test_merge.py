@@ -119,6 +119,7 @@ def test_bad_folders(run: Run, folder: Path) -> None:
     assert sorted(p.name for p in (folder / "merged").iterdir()) == MERGE_FILES
 
 
+@pytest.mark.longer
 def test_the_report_in_a_browser(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The slider fades one map, rooms that are one light up together, and nothing is said on the console."""
     from tests.viz import test_report as report

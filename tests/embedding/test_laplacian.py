@@ -53,6 +53,7 @@ def box_elements(sides: tuple[int, int, int], step: float, number: int) -> Array
     return smallest_eigenvalues((sparse.diags(np.asarray(both.sum(1)).ravel()) - both, mass), number)
 
 
+@pytest.mark.longer
 def test_sphere_to_one_percent():
     true = np.array([l * (l + 1) for l in range(1, 6) for _ in range(2 * l + 1)])
     eigenvalues = smallest_eigenvalues(surface_laplacian(fibonacci_sphere(4000)), len(true))

@@ -58,6 +58,7 @@ def twin(grid, kernel, function, values):
     return np.array(out).reshape(len(grid), *values.shape[1:])
 
 
+@pytest.mark.longer
 @COMPILED
 @given(grids(size=9), kernels(), st.sampled_from(["sum", "max"]), st.sampled_from([(), (1,), (3,), (2, 2)]))
 def test_sum_and_max(grid, kernel, function, shape):
@@ -67,6 +68,7 @@ def test_sum_and_max(grid, kernel, function, shape):
     assert np.array_equal(result, twin(grid, kernel, function, values))
 
 
+@pytest.mark.longer
 @COMPILED
 @given(grids(size=9), kernels(lowest=0), st.integers(0, 99), st.sampled_from([np.int32, np.int64, np.int8]))
 def test_most_common(grid, kernel, seed, dtype):
@@ -76,6 +78,7 @@ def test_most_common(grid, kernel, seed, dtype):
     assert np.array_equal(result, twin(grid, kernel, "most_common", labels))
 
 
+@pytest.mark.longer
 @COMPILED
 @given(grids(size=9), kernels())
 def test_occupancy(grid, kernel):
@@ -84,6 +87,7 @@ def test_occupancy(grid, kernel):
         assert np.array_equal(convolve(grid, kernel, function), twin(grid, kernel, function, ones))
 
 
+@pytest.mark.longer
 @COMPILED
 @given(grids(size=20), kernels(), st.lists(st.tuples(*[st.integers(-12, 30)] * 3), max_size=20))
 def test_count_and_any_at_cells_that_may_be_empty(grid, kernel, cells):

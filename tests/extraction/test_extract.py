@@ -84,6 +84,7 @@ def test_flying_points_do_not_shut_a_door():
     assert len(extract(points).edges) == 1
 
 
+@pytest.mark.longer
 def test_the_thesis_cuts_the_corridor():
     """Its known fault, kept: the range of 5 m cuts what is longer (findings.md)."""
     result = extract(scenes.corridor().points(0.01), preset="thesis")
@@ -175,6 +176,7 @@ def test_turned_about_the_vertical(turn):
         assert np.linalg.norm(middle[:2].T - (x, y), axis=1).min() < 0.35
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("voxel", [0.05, 0.15])
 def test_other_voxel_sizes(voxel):
     result = extract(scenes.two_rooms().points(0.005), voxel_size=voxel)
@@ -182,6 +184,7 @@ def test_other_voxel_sizes(voxel):
     np.testing.assert_allclose(sorted(result.rooms["area"]), (15, 20), rtol=0.15)
 
 
+@pytest.mark.longer
 def test_sparse_points():
     points = scenes.corridor().points(0.01)
     few = np.random.default_rng(0).choice(points, len(points) // 5, replace=False)
@@ -221,6 +224,7 @@ def test_the_thesis_preset_is_the_table_of_the_method():
     assert (p.noise, p.sparse, p.bridge) == (0, 0, 0)
 
 
+@pytest.mark.longer
 def test_cells_finer_than_the_points_still_give_the_rooms():
     result = extract(scenes.two_rooms().points()[::5], voxel_size=0.02)
     assert len(result.rooms) == 2

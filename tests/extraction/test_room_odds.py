@@ -108,6 +108,7 @@ def test_places_over_no_room_say_nothing(points: Array, place: tuple[float, floa
     assert pose_features(map, (some, points)) is not None
 
 
+@pytest.mark.longer
 def test_odds_are_probabilities_whatever_the_order_and_the_turn(glimpse: Array) -> None:
     plain = extract(glimpse, carve=False).rooms
     assert all(((plain[name] >= 0) & (plain[name] <= 1)).all() for name in ROOM_ODDS)
@@ -131,6 +132,7 @@ def test_no_rooms_no_odds(points: Array) -> None:
     assert len(with_room_odds(empty).rooms) == 0 and room_features(empty).shape == (0, len(ROOM_FEATURES))
 
 
+@pytest.mark.longer
 def test_by_the_outline_alone(points: Array) -> None:
     """Maps of the thesis' preset, and of earlier files."""
     rooms = extract(points, carve=False).rooms

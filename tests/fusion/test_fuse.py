@@ -56,6 +56,7 @@ def test_provenance_tells_who_saw_each_cell():
     assert len((of_a | of_b) - both) < 0.05 * len(both)  # the copies, and cells that the extraction takes for noise
 
 
+@pytest.mark.longer
 def test_bits_of_joined_maps_follow(halves, joined):
     again = fused(joined, halves[1], truth(0, 2))
     assert np.bitwise_or.reduce(again.provenance) == 0b111

@@ -189,6 +189,7 @@ def test_json_has_the_schema(merged, refused):
     json.dumps(listing, allow_nan=False)
 
 
+@pytest.mark.longer
 def test_save_writes_all_and_a_refusal_takes_back_the_rest(merged, refused, tmp_path):
     folder = tmp_path / "deep" / "merged"
     merged.save(folder)
@@ -216,6 +217,7 @@ def test_saving_leaves_nothing_half_written(merged, tmp_path, monkeypatch):
         merged.save(tmp_path / "file" / "merged")
 
 
+@pytest.mark.longer
 def test_the_report_says_it_all(merged, refused):
     from topomerge.viz.merge_report import merge_html
 

@@ -82,6 +82,7 @@ def test_a_hypothesis_is_tried_and_refined(halves):
     assert off(found.transform, MOVE.inverse(), middle_in_b())[0] < 0.03
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("scale", [0.8])
 def test_an_unknown_scale_is_found(points, scale):
     frame = Sim3(MOVE.yaw, MOVE.translation, scale)

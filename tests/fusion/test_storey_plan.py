@@ -63,6 +63,7 @@ def test_slices_of_two_storeys():
     assert found[1].levels[0] - found[0].levels[0] == pytest.approx(3.1, abs=0.05)
 
 
+@pytest.mark.longer
 def test_storeys_above_each_other():
     found = plans(grid_of(doubled(office())))
     assert len(found) == 2

@@ -76,6 +76,7 @@ def test_rooms_without_a_partner_change_nothing(points):
     assert abs(alone.probability - more.probability) < 0.15
 
 
+@pytest.mark.longer
 def test_the_alternatives_have_probabilities(points):
     found = register(grid_of(part(points, high=(16, 99))), grid_of(part(points, low=(5, -99)), MOVE))
     every = [a.probability for a in found.alternatives]

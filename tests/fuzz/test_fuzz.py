@@ -39,6 +39,7 @@ def test_the_same_seed_breaks_a_file_in_the_same_way() -> None:
     assert len(set(made[0])) > 80
 
 
+@pytest.mark.longer
 def test_the_driver_sees_what_must_not_happen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader that dies, hangs, eats memory or raises something else is found out."""
     (tmp_path / "sitecustomize.py").write_text(

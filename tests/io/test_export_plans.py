@@ -97,6 +97,7 @@ def radii(latitude: float) -> tuple[float, float]:
     return normal * (1 - e2) / (1 - e2 * sine**2), normal * np.cos(np.radians(latitude))
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(("latitude", "heading"), [(0.0, 0.0), (52.52, 0.0), (-33.9, 90.0), (64.1, 237.0)])
 def test_longitude_and_latitude(tmp_path, latitude, heading):
     plain = geojson(building(1), tmp_path)["features"]
@@ -139,6 +140,7 @@ def test_a_national_grid_keeps_its_digits(tmp_path):
     assert geojson(building(1, 1, GRID), tmp_path)["features"][0]["geometry"]["coordinates"][0][0][0] > 432000
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("name", ["geojson", "graphml", "indoorgml", "dsg", "ply", "las", "ifc"])
 def test_empty_maps_and_maps_without_doors(tmp_path, name):
     for kind, map in (("none", nothing()), ("closed", without_doors())):

@@ -140,6 +140,7 @@ def test_around_corners(tmp_path):
     assert free_ways(files["storey_0_route.geojson"], Grid(files["storey_0.yaml"]))
 
 
+@pytest.mark.longer
 def test_stairs_are_no_floor_for_robots(tmp_path):
     map = topomerge.extract(stair_scene().points())
     assert len(map.storeys) == 2 and "stairs" in map.edges["kind"].tolist()

@@ -43,6 +43,7 @@ def exact(path: Path) -> Array:
 FORMATS = ["little.ply", "ascii.ply", "big.ply", "binary.pcd", "table.csv", "array.npz", "cloud.las", "cloud.laz", "cloud.e57"]
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("name", FORMATS)
 def test_points_of_every_format_are_moved(samples: dict[str, Path], tmp_path: Path, name: str) -> None:
     source = samples[name]

@@ -82,6 +82,7 @@ def test_a_trajectory_places_the_images(tmp_path: Path, expected: PointCloud) ->
     assert "nothing moves the frame 'camera_optical' of /camera/depth/image_raw" in refusal_of(path)
 
 
+@pytest.mark.longer
 def test_which_topic_is_read(tmp_path: Path, expected: PointCloud) -> None:
     """Plain images before packed ones, points before images, images before slices; of two cameras one has to be named."""
     both = joined(image_messages(), without(image_messages("packed"), "/tf", INFO_TOPIC, "/camera/color/image_raw"))

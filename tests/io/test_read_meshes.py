@@ -131,6 +131,7 @@ def test_ifc_rooms_walls_and_doors(samples: dict[str, Path]) -> None:
     np.testing.assert_array_equal(read_points(samples["model.ifc"], spacing=0.1).points, cloud.points)
 
 
+@pytest.mark.longer
 def test_ifc_floors_are_made_only_where_no_slab_is(tmp_path: Path) -> None:
     write_ifc(tmp_path / "slab.ifc", slab=True)
     cloud = read_points(tmp_path / "slab.ifc", spacing=0.1)

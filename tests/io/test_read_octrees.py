@@ -67,6 +67,7 @@ def test_coarser_levels(octrees: dict[str, Path], name: str) -> None:
     assert_same_points(read_points(octrees[name], spacing=SPACING / 1000), room_tree())
 
 
+@pytest.mark.longer
 def test_chunks_are_the_cloud(octrees: dict[str, Path]) -> None:
     for path in octrees.values():
         joined = np.concatenate([c.points for c in read_chunks(path, chunk=700)])

@@ -41,6 +41,7 @@ def test_ipad_clouds_that_stand(data_dir: Path) -> None:
         assert len(cloud) > 36_000 and cloud.colors is not None
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize(("floor", "corner"), [("1", (-60.45, -23.4)), ("2", (-53.95, -29.15)), ("1s", (-50.0, -50.0))])
 def test_robot_maps_of_texas(data_dir: Path, floor: str, corner: tuple[float, float]) -> None:
     path = data_dir / "utexas_gdc_floors" / "maps" / "real" / floor / f"{floor}.yaml"

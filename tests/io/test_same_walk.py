@@ -63,6 +63,7 @@ def assert_same_map(map: TopometricMap, expected: TopometricMap) -> None:
     np.testing.assert_array_equal(map.edges["rooms"], expected.edges["rooms"])
 
 
+@pytest.mark.longer
 def test_free_space_is_what_the_rays_crossed() -> None:
     """Half-way along each ray is free space, or something that was met from elsewhere; views from guessed places miss some."""
     walk = house_walk()

@@ -31,6 +31,7 @@ def test_without_a_home_in_a_private_folder(tmp_path: Path) -> None:
     assert cache.stat().st_mode & 0o777 == 0o700 and list(cache.rglob("*.nbi"))
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("kind", ["open", "link"])
 def test_never_in_a_folder_of_others(tmp_path: Path, kind: str) -> None:
     folder, place = tmp_path / f"topomerge-{os.getuid()}", tmp_path / "elsewhere"

@@ -86,6 +86,7 @@ def test_cover_finds_the_strip() -> None:
     assert cover(lintel, 10.0, 10.0, 0.0, 1.0, 4.0, 4.0, 2) == pytest.approx(5 / 9)
 
 
+@pytest.mark.longer
 def test_carved_cells_are_those_that_rays_cross() -> None:
     rng = np.random.default_rng(2)
     starts, ends = rng.uniform(1, 9, (2, 50, 3))

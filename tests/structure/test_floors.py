@@ -38,6 +38,7 @@ def test_rooms_of_a_storey_do_not_overlap():
     assert sum(f.area for f in floors) == pytest.approx(shapely.union_all(floors).area, rel=1e-9)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 4, 1.2])
 def test_walls_are_straight_however_the_building_stands(turn):
     c, s = np.cos(turn), np.sin(turn)

@@ -101,6 +101,7 @@ def test_a_pillar_is_no_wall():
     assert is_room(plan.rooms[0], box(0, 0, 6, 5)) and len(plan.walls) == 4
 
 
+@pytest.mark.longer
 def test_a_round_wall_is_several_straight_ones():
     turns = np.arange(0, 2 * np.pi, 0.04 / 3)
     ring = 3 * np.column_stack([np.cos(turns), np.sin(turns)])
@@ -179,6 +180,7 @@ def test_a_turned_map_has_the_same_walls_turned():
     same(plan_structure(map), plan_structure(turned), lambda p: p[:, ::-1] * (-1, 1))
 
 
+@pytest.mark.longer
 def test_storeys_have_walls_of_their_own():
     plan = plan_structure(topomerge.extract(stair_scene().points()))
     for storey, floor in enumerate((0.0, 3.0)):
@@ -199,6 +201,7 @@ def test_a_neighbours_face_is_not_taken_for_ones_own():
     assert is_room(left, box(0, 0, 4 - THICK / 2, 5))
 
 
+@pytest.mark.longer
 def test_openings_lie_in_walls_that_part_their_rooms():
     map = topomerge.extract(corridor().points())
     plan = plan_structure(map)
@@ -247,6 +250,7 @@ def test_noise_gives_valid_walls_and_rooms(seed):
     assert (np.hypot(*(plan.walls["end"] - plan.walls["start"]).T) > 0.02).all()
 
 
+@pytest.mark.longer
 def test_a_storey_without_rooms():
     map = topomerge.extract(stair_scene().points())
     below = map.rooms["storey"] == 0

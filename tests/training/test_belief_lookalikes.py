@@ -93,6 +93,7 @@ def test_none_are_built_where_none_are_taken(monkeypatch) -> None:
     assert settings.alike.split == "train" and settings.alike_heldout.split == "test"
 
 
+@pytest.mark.longer
 def test_the_models_of_rigid_poses_may_stay_as_they_are(words: list[str]) -> None:
     rows = [row for row in tiny.belief_rows() if "drawing" not in row["sensors"]]
     shipped = merge_belief.model()["solid"]["pose"]

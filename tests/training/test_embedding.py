@@ -135,6 +135,7 @@ def test_other_losses_train(settings, kind):
     assert np.isfinite(fit(replace(settings, epochs=1), quiet)["train/loss"])
 
 
+@pytest.mark.longer
 def test_a_run_is_a_folder(settings, tmp_path):
     best = fit(replace(settings, name="a", tensorboard=True), quiet)
     rows = [json.loads(line) for line in (tmp_path / "a" / "metrics.jsonl").read_text().splitlines()]
@@ -194,6 +195,7 @@ def test_it_stops_early(settings):
     assert len(said) < 10
 
 
+@pytest.mark.longer
 def test_geometry_alone_then_frozen(settings, tmp_path):
     alone = replace(settings, name="alone", network=replace(SMALL, node=Node("none")))
     fit(alone, quiet)

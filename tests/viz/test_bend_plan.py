@@ -21,6 +21,8 @@ from topomerge.viz.bend_plan import PieceShifts, arrow_factor, arrows, bend_tabl
 from topomerge.viz.merge_report import merge_html
 from topomerge.viz.sheet import lay_out
 
+pytestmark = pytest.mark.longer  # all are of one merge
+
 
 @pytest.fixture(scope="module")
 def merged() -> MergeResult:
@@ -126,7 +128,6 @@ addEventListener("load", () => setTimeout(() => {
 """
 
 
-@pytest.mark.longer
 def test_the_slider_bends_the_outlines_in_a_browser(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "PROBE", PROBE)
     page = tmp_path / "report.html"

@@ -226,6 +226,7 @@ def with_probe(text: str) -> str:
     return text.replace("</body>", f"<script>{PROBE}</script></body>")
 
 
+@pytest.mark.longer
 def test_in_a_browser(tmp_path: Path) -> None:
     page = tmp_path / "a.html"
     map = replace(building(2, 2), source=EVIL, warnings=(EVIL,))
@@ -243,6 +244,7 @@ def test_in_a_browser(tmp_path: Path) -> None:
     assert seen["scene"] == "shown" and seen["moves"]
 
 
+@pytest.mark.longer
 def test_without_webgl_words_stand_there(tmp_path: Path) -> None:
     page = tmp_path / "a.html"
     save_report(building(1, 1), page)

@@ -25,6 +25,7 @@ def test_an_open_page_shows_the_atlas_as_it_is(tmp_path: Path, monkeypatch: pyte
         assert "two" in page.run("document.body.innerText") and not page.console
 
 
+@pytest.mark.longer
 def test_a_page_alone_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("topomerge.fusion.atlas.solve.hypotheses", lambda *_: ())
     add(tmp_path / "house", [("one", room(0))], tm.atlas_html)

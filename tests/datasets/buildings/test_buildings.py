@@ -62,6 +62,7 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
     assert digest(make_building("lab", 4)) == digest(make_building("lab", 4)) != digest(make_building("lab", 5))
 
 
+@pytest.mark.longer
 def test_storeys_repeat_or_differ_as_the_difficulty_says() -> None:
     same = make_building("office", 6, 3, replace(EMPTY, differ=0, atria=0))
     other = make_building("office", 6, 3, replace(EMPTY, differ=1, atria=0))
@@ -145,6 +146,7 @@ def test_ducts_hang_below_the_ceiling_and_above_the_heads() -> None:
     assert len(low) > 12 and low.min() > 2.1 and low.max() < max(r.ceiling for r in building.rooms)
 
 
+@pytest.mark.longer
 def test_each_building_has_its_own_make_of_doors() -> None:
     widths = [make_building("school", seed, 1, EMPTY).doors["width"] for seed in range(3)]
     assert len({round(float(np.median(w)), 2) for w in widths}) > 1

@@ -87,6 +87,7 @@ def test_what_is_replaced_leaves_the_shell_alone(row) -> None:
     assert np.array_equal(same.thing_of, filled.thing_of)
 
 
+@pytest.mark.longer
 def test_only_clutter_is_strewn_anew(row) -> None:
     rng = np.random.default_rng(1)
     rooms = range(len(row.building.rooms))

@@ -107,6 +107,7 @@ def test_storeys_that_are_nearly_alike() -> None:
     assert twins == {i: i + 5 for i in range(5)}
 
 
+@pytest.mark.longer
 def test_a_twin_wing_is_nearly_the_same() -> None:
     building = make_building("hotel", 5)
     for seed in range(3):

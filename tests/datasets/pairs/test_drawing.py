@@ -45,6 +45,7 @@ def test_the_plan_lies_where_the_scan_would_be() -> None:
         with_plan(replace(pair, kind="twin-wing", shared=()), building)
 
 
+@pytest.mark.longer
 def test_the_upper_storey_has_its_own_rooms_and_doors() -> None:
     building = make_building("office", 5, 2)
     for storey in range(2):

@@ -117,6 +117,7 @@ def test_a_pair_is_tellable_only_if_each_of_its_poses_is() -> None:
     assert judged_poses(plain, plain, [Sim3(0.0, (100.0, 0.0, 0.0))]) == (True, {}, None)
 
 
+@pytest.mark.longer
 @pytest.mark.parametrize("layout", ["room", "ensuite", "suite"])
 def test_a_row_moved_by_whole_periods_has_equal_walls_and_by_half_a_period_has_not(layout: str) -> None:
     row = make_row(replace(draw_module(layout, np.random.default_rng(2)), both=False), 6, Difficulty(), 2, "row")
@@ -136,6 +137,7 @@ def test_wrong_poses_of_a_row_are_whole_periods_and_never_the_true_one() -> None
     assert all(p.yaw == 0 and p.translation[1:] == (0.0, 0.0) for p in row_poses(row, 0, 1, 3))
 
 
+@pytest.mark.longer
 def test_a_mirror_image_is_a_reflection_and_lies_on_the_building_where_it_can() -> None:
     places = draw_places("mirror", "same", 5)
     (a, b), (rooms, _) = places.buildings, places.visited
@@ -196,6 +198,7 @@ def test_the_same_item_gives_the_same_bytes_and_rooms_of_two_places_have_no_trut
     assert pair.about["lookalike"] == "same-room" and pair.about["tellable"] in (True, False)
 
 
+@pytest.mark.longer
 def test_parts_of_a_row_have_their_true_pose_and_a_false_one_whole_rooms_away() -> None:
     item = LookalikeItem("shifted-row", 0, 3, "same", ("depth", "depth"), False)
     places = draw_places(item.kind, item.furniture, item.seed)

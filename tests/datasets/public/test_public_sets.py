@@ -159,6 +159,7 @@ def test_matterport_regions_become_rooms_on_levels(tmp_path, regions, prefix):
         assert (x.min(), x.max()) == pytest.approx((3.2 * k, 3.2 * k + 3.0), abs=0.02)
 
 
+@pytest.mark.longer
 def test_matterport_pair(tmp_path):
     agrees(only(public.iter_public_pairs(write_house(tmp_path), "matterport")))
 

@@ -111,6 +111,7 @@ def test_a_frame_moves_points_poses_and_rooms_alike(office: Building) -> None:
     assert moved.rooms[3].ceiling == pytest.approx(1.5 + 1.3 * own.rooms[3].ceiling)
 
 
+@pytest.mark.longer
 def test_drift_bends_the_map_by_centimetres(office: Building) -> None:
     straight = replace(SENSORS["depth"], drift=0.0, tilt=0.0)
     true, bent = scan(office, straight, seed=4), scan(office, replace(straight, drift=0.5), seed=4)

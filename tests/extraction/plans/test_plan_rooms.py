@@ -72,6 +72,7 @@ def test_without_lintels(corridor: Array) -> None:
     is_the_corridor(extract(scene.points(0.01)))
 
 
+@pytest.mark.longer
 def test_nothing_above_two_metres(corridor: Array) -> None:
     is_the_corridor(extract(corridor[corridor[:, 2] < 2.0]))
 
@@ -148,6 +149,7 @@ def test_a_wide_opening_keeps_both_readings() -> None:
     assert len(whole.rooms) == len(whole.areas) == 1 and not len(whole.narrows)
 
 
+@pytest.mark.longer
 def test_free_space_is_what_rays_crossed() -> None:
     points = scenes.two_rooms().points()
     right = points[:, 0] > 4.3

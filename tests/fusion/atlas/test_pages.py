@@ -111,6 +111,7 @@ def test_an_atlas_that_is_renamed_says_so_on_its_pages(tmp_path: Path) -> None:
     assert "All of yard" in (tmp_path / "yard" / "map_0.html").read_text()
 
 
+@pytest.mark.longer
 def test_an_atlas_from_before_there_were_pages_opens_and_gets_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "house"
     with monkeypatch.context() as before:

@@ -116,6 +116,7 @@ def test_a_poisoned_map_is_not_let_in(maps, registrations):
     assert [link.maps for link in result.rejected] == [(0, 4)] and "west, stranger" in result.words()
 
 
+@pytest.mark.longer
 def test_the_joined_map_is_that_of_the_whole(atlas, maps):
     joined = atlas.joined(0)
     assert 9 <= len(joined.rooms) <= 11 and joined.rooms["area"].sum() == pytest.approx(24 * 14, rel=0.15)

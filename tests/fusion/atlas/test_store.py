@@ -89,6 +89,7 @@ def test_taking_out_takes_back(folder, built):
     assert names(folder) == ["atlas.json", *WHOLE[-3:]] and listing_of(folder)["reason"] == "no map"
 
 
+@pytest.mark.longer
 def test_registrations_are_made_once(folder, monkeypatch):
     def fail(*_):
         raise AssertionError("registered again")

@@ -106,6 +106,7 @@ def in_a_copy(work: object) -> int:
     return child
 
 
+@pytest.mark.longer
 @forks
 @pytest.mark.parametrize("kills", ["three", pytest.param("twenty", marks=pytest.mark.slow)])
 def test_killed_at_random_moments_it_ends_as_if_never_killed(scans, apart, tmp_path, kills):
@@ -128,6 +129,7 @@ def test_killed_at_random_moments_it_ends_as_if_never_killed(scans, apart, tmp_p
     assert killed and state(atlas) == state(tmp_path / "whole")
 
 
+@pytest.mark.longer
 @forks
 def test_two_that_add_at_once_lose_nothing(apart, tmp_path):
     rooms = [room(k) for k in range(6)]
