@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 
 from topomerge.kernels.lookup import row
-from topomerge.kernels.symmetric import axes
 
 
 @njit(cache=True, nogil=True)
@@ -34,10 +33,9 @@ def normals(table, bricks, cells, points, chosen, reach, least):  # type: ignore
             for v in range(u + 1):
                 square[u, v] = square[u, v] / n - mean[u] * mean[v] / (n * n)
                 square[v, u] = square[u, v]
-        values, vectors = axes(square)
+        values, vectors = np.linalg.eigh(square)
         if values[1] > 1e-12:
-            for u in range(3):
-                out[k, u] = vectors[u, 0]
+            out[k] = vectors[:, 0]
             flat[k] = 1.0 - max(values[0], 0.0) / values[1]
     return out, flat
 
