@@ -182,7 +182,7 @@ def _outline(storey: _StoreyFloor, own: Array, window: tuple[slice, slice]) -> d
     step = max(round(VIEW_STEP / storey.edge), 1)
     views = np.argwhere(beyond[::step, ::step]) * step
     walls = np.argwhere(end & ~contact & near)
-    hidden = ~seen_from(free, walls, views, SIGHT_REACH / storey.edge)
+    hidden = ~seen_from(free, np.ascontiguousarray(walls), np.ascontiguousarray(views), SIGHT_REACH / storey.edge)
     around = max(int(end.sum()), 1)
     return {
         "log_width": float(np.log(2 * own.sum() / around * storey.edge)),

@@ -53,7 +53,8 @@ def _walk(triangles, spacing, first, points, owner, fill):  # type: ignore[no-un
             x = (np.ceil(left / spacing - start) + start) * spacing
             while x < right:
                 if fill:
-                    points[count] = a + x * u + row * v
+                    for k in range(3):
+                        points[count, k] = a[k] + x * u[k] + row * v[k]
                     owner[count] = i
                 count += 1
                 x += spacing

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 CORNERS = 40  # of a cell, at most: each neighbour adds one
 
@@ -36,7 +36,7 @@ def _clip(corners, owner, count, x, y, half, name):  # type: ignore[no-untyped-d
     return m
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def voronoi_weights(flat, spacing):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Area of each point's cell, and the weight of each of its neighbours: length of the common side over the distance.
 
@@ -49,20 +49,29 @@ def voronoi_weights(flat, spacing):  # type: ignore[no-untyped-def]  # pragma: n
     """
     n, k = flat.shape[:2]
     area, weight = np.zeros(n), np.zeros((n, k))
-    for i in prange(n):
+    for i in range(n):
         corners, owner = np.empty((CORNERS, 2)), np.empty(CORNERS, np.int64)
         r = 2 * spacing[i]
         for c in range(4):  # a square, counter-clockwise; the owner is that of the side that begins at a corner
             corners[c, 0], corners[c, 1], owner[c] = r if c in (1, 2) else -r, r if c > 1 else -r, -1
-        count = 4
-        for j in range(k):
-            half = 0.5 * (flat[i, j, 0] ** 2 + flat[i, j, 1] ** 2)
-            if half > 1e-12:
-                count = _clip(corners, owner, count, flat[i, j, 0], flat[i, j, 1], half, j)
-        away_x, away_y = -flat[i, :, 0].sum(), -flat[i, :, 1].sum()
-        length = np.sqrt(away_x**2 + away_y**2)
-        if length > 1e-9 and (owner[:count] < 0).any():
-            count = _clip(corners, owner, count, away_x / length, away_y / length, 0.5 * spacing[i], -1)
+        count, sum_x, sum_y = np.int64(4), 0.0, 0.0
+        for j in range(k + 1):  # one call for all half planes: each further one is compiled anew
+            if j < k:
+                x, y, name = flat[i, j, 0], flat[i, j, 1], j
+                sum_x += x
+                sum_y += y
+                half = 0.5 * (x**2 + y**2)
+                if not half > 1e-12:
+                    continue
+            else:  # on the side that has no neighbour
+                length = np.sqrt(sum_x**2 + sum_y**2)
+                is_open = False
+                for c in range(count):
+                    is_open |= owner[c] < 0
+                if not (length > 1e-9 and is_open):
+                    continue
+                x, y, name, half = -sum_x / length, -sum_y / length, -1, 0.5 * spacing[i]
+            count = _clip(corners, owner, count, x, y, half, name)
         for c in range(count):
             d = (c + 1) % count
             area[i] += 0.5 * (corners[c, 0] * corners[d, 1] - corners[d, 0] * corners[c, 1])
