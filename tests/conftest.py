@@ -19,6 +19,13 @@ LACKS = {  # what a test says that it lacks, in the reason of its skip -> what t
 UNCHOSEN = pytest.StashKey[int]()  # tests that need real data and are not among the chosen ones
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    if hasattr(config, "workerinput"):  # one of several processes of xdist
+        from tests.compiling import compile_once
+
+        compile_once()
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of real data named by TOPOMERGE_DATA; tests that ask for it are marked `data` and skip without it."""

@@ -82,7 +82,8 @@ def _refined(v: PlanFields, w: PlanFields, group: Sequence[PoseHypothesis], scal
     middle = walls.mean(axis=0)
     start = np.array([[*_placed(h.transform, middle), h.transform.yaw, np.log(h.transform.scale)] for h in group])
     field = (*v.field, v.plan.edge)
-    poses, score = align.refine(np.ascontiguousarray(walls - middle), *field, start, np.array(REFINE.sigmas), REFINE.rounds, scaled)
+    about = np.ascontiguousarray(walls - middle)
+    poses, score = align.refine(about, *field, start, np.array(REFINE.sigmas), REFINE.rounds, scaled)
     moved = []
     for hypothesis, (x, y, yaw, size), value in zip(group, poses, score, strict=True):
         turned = Sim3(wrapped(yaw), (0.0, 0.0, 0.0), float(np.exp(size)))
