@@ -6,6 +6,8 @@ PIP := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet
 TORCH_INDEX ?=
 export TOPOMERGE_DATA ?= $(wildcard ../shared/data)
 export MPLBACKEND := Agg
+unexport PYTHONDONTWRITEBYTECODE
+test test-longer: export OMP_NUM_THREADS := 1
 
 .PHONY: setup demo test test-longer test-slow lint docs bench sealed weights clean
 setup: .venv/ready

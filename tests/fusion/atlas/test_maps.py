@@ -7,6 +7,8 @@ from dataclasses import replace
 import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map, stranger
+from topomerge.fusion.atlas import maps as atlas_maps
+from topomerge.fusion.atlas import memory
 from topomerge.fusion.atlas.memory import map_key
 
 
@@ -16,3 +18,13 @@ def test_keys_tell_maps_by_what_they_hold():
     assert map_key(maps[0]) == map_key(replace(maps[0], source="other", seconds={"x": 1.0}))
     moved = replace(maps[0], grid=replace(maps[0].grid, origin=maps[0].grid.origin + 1.0))
     assert len({map_key(m) for m in (*maps, moved)}) == 6
+
+
+@pytest.mark.longer
+def test_areas_are_remembered_of_maps_whose_plans_are_not(monkeypatch):
+    prepared, prepare = [], atlas_maps.prepare
+    monkeypatch.setattr(memory, "PREPARED_AT_ONCE", 1)
+    monkeypatch.setattr(atlas_maps, "prepare", lambda map: prepared.append(map.source) or prepare(map))
+    maps = atlas_maps.Maps([office_map(0), stranger()])
+    areas = [maps.area(k) for k in (0, 1, 0, 1)]
+    assert areas[:2] == areas[2:] and min(areas) > 20 and len(prepared) == 2

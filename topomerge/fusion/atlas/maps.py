@@ -73,8 +73,11 @@ class Maps:
 
     def area(self, k: int) -> float:
         """Floor area, m2, of what is known from above."""
-        storeys = self.prepared(k).storeys
-        return self.answer(("area",), (k,), lambda: float(sum(v.plan.explored.sum() * v.plan.edge**2 for v in storeys)))
+
+        def make() -> float:
+            return float(sum(v.plan.explored.sum() * v.plan.edge**2 for v in self.prepared(k).storeys))
+
+        return self.answer(("area",), (k,), make)
 
     def middle(self, k: int) -> Array:
         """(3,) of its cells, m."""
