@@ -46,6 +46,7 @@ class PlanRecipe:
         split: train, validation or test: of which real plans, and in which range the seeds lie.
         scans: how many; seed: of the first one, from the beginning of the split's range on.
         folder: of the real data; empty: procedural buildings only.
+        flat: slices and grid maps, where walls are learned from.
     """
 
     name: str = "plan_scans"
@@ -53,6 +54,7 @@ class PlanRecipe:
     scans: int = 300
     seed: int = 100_000
     folder: str = ""
+    flat: bool = False
 
 
 @dataclass(frozen=True, eq=False)

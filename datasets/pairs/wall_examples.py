@@ -1,7 +1,8 @@
 """Walls unrolled as the extraction sees them, with what is truly in them: what the network of elevations learns from.
 
 Scans of procedural buildings and of real plans of the split, by every sensor that sees whole walls, at the spacing of its points
-or finer; doors have frames and handles or none, and stand anywhere in their walls. A file holds the walls of one scan.
+or finer; doors have frames and handles or none, and stand anywhere in their walls. A file holds the walls of one scan. A set may
+be of slices and grid maps instead, which show no walls at heights: of these a file holds the map and its plans alone.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,40 +26,56 @@ from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.pairs.items import digest
 from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanRecipe, build_scans
 from topomerge.datasets.pairs.plan_truth import drawn_map
-from topomerge.datasets.pairs.scan_items import PlanItem, Plans, draw_difficulty
+from topomerge.datasets.pairs.scan_items import PlanItem, Plans, draw_difficulty, scanned
 from topomerge.datasets.simulation.scanner import moved, scan
 from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.spoils import drift_between, exact_sensor
 from topomerge.datasets.simulation.walk import part
 
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.elevation import ALONG, WALL_CLASSES, Elevations, wall_elevations
-from topomerge.extraction.extract import extract
+from topomerge.extraction.classified_storey import ClassifiedStorey
+from topomerge.extraction.elevations.elevation import (
+    ALONG,
+    DEPTHS,
+    FACE_DTYPE,
+    STRIP_CHANNELS,
+    WALL_CLASSES,
+    Elevations,
+    wall_elevations,
+)
+from topomerge.extraction.extract import rooms_and_passages
+from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.scan import FINE_CELL
+from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import archive
 from topomerge.io.listing import plain
 from topomerge.types import ROOM_DTYPE, Array, PointCloud, Sim3, TopometricMap, VoxelGrid
 
-WALL_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
+WALL_FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.6, "r2v": 0.25, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.35, "depth": 0.25, "lidar": 0.2, "tablet": 0.12, "mono": 0.08}
+MAP_CELL = 0.1  # m
 ROOMS_VISITED = (4, 11)  # at least, less than
 FINER = (0.5, 1.0)  # of a sensor's spacing
 COARSE_SHARE = 0.15  # of the scans that are seen in the cells of the map
 DRAWN_EVERY = 8  # seeds: one is a grid map of the plan, as robots and draughtsmen make them
 EXACT_SHARE = 0.5  # of the scans without drift
+SLICE_SHARE, POSED_SHARE = 0.6, 0.6  # of flat maps by a 2D laser, and of these with the sensor's places
 DEEP = 0.3  # m beside a wall's middle: a strip there is of that wall
 ASKEW = 0.26  # sine of the angle between a wall and a strip along it
 SAME_FLOOR = 0.6  # m between floors of one storey
 WALL_ARRAYS = ("first", "strips", "truth", "doors", "faces")
 MAP_ARRAYS, ROOMS_HELD = ("edges", "storeys", "navigable_room"), ("storey", "completeness")
 LOW_SILL = 0.3  # m: panes that begin lower are walls of glass
+NO_WALLS = Elevations(np.zeros(0, FACE_DTYPE), np.zeros(1, np.int64), np.zeros((0, DEPTHS, STRIP_CHANNELS), np.float32))
 
 
 @dataclass(frozen=True)
 class WallItem(PlanItem):
-    """As of plans: everything that the bytes of one file depend on."""
+    """As of plans: everything that the bytes of one file depend on; and is it a slice or a grid map?"""
+
+    flat: bool = False
 
     @property
     def name(self) -> str:
@@ -74,7 +92,8 @@ class WallExample:
         strips: (n, 32, 14) uint8, of 255, as of `Elevations`.
         truth: (n,) uint8, index into `WALL_CLASSES`.
         doors: (D, 3) where the true doors are, m, in the map's frame.
-        map: the map, without its cells; of the rooms storey and completeness alone.
+        map: the map, without its cells; of the rooms storey and completeness alone, of the edges what the plans show.
+        storeys: what probably stands in the columns of its plans.
         faces: (F,) FACE_DTYPE.
         source: sensor/where the building is from.
     """
@@ -84,29 +103,32 @@ class WallExample:
     truth: Array
     doors: Array
     map: TopometricMap
+    storeys: tuple[ClassifiedStorey, ...]
     faces: Array
     source: str
 
     @property
-    def elevations(self) -> Elevations:
-        """The walls as the extraction has them."""
+    def elevations(self) -> Elevations | None:
+        """The walls as the extraction has them; None of a flat map."""
+        if not len(self.faces):
+            return None
         return Elevations(self.faces, self.first, (self.strips / np.float32(255)).astype(np.float32))
 
 
 def build_walls(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
     """The files of a set, made where they are missing, in the order of the seeds."""
-    return build_scans(recipe, "walls", draw_wall_item, make_wall_file, sharing, say)
+    return build_scans(recipe, "walls", partial(draw_wall_item, flat=recipe.flat), make_wall_file, sharing, say)
 
 
-def draw_wall_item(seed: int, plans: Plans) -> WallItem:
+def draw_wall_item(seed: int, plans: Plans, flat: bool) -> WallItem:
     """The item of a seed; `make_walls` draws the same numbers again."""
     rng = np.random.default_rng([seed, 7])
     source = str(rng.choice(list(SOURCE_SHARES), p=list(SOURCE_SHARES.values())))
     entries = plans.get(source, ())
     if not entries:
-        return WallItem(seed, "procedural", 0, "", "")
+        return WallItem(seed, "procedural", 0, "", "", flat)
     name, plan = entries[int(rng.integers(len(entries)))]
-    return WallItem(seed, source, len(entries), name, digest((plan,)))
+    return WallItem(seed, source, len(entries), name, digest((plan,)), flat)
 
 
 def make_wall_file(item: WallItem, plan: Plan | None, folder: str) -> Row:
@@ -120,6 +142,9 @@ def wall_arrays(item: WallItem, example: WallExample) -> dict[str, Array]:
     arrays: dict[str, Any] = {name: getattr(example, name) for name in WALL_ARRAYS}
     arrays |= {f"map.{name}": getattr(example.map, name) for name in MAP_ARRAYS}
     arrays |= {f"rooms.{name}": example.map.rooms[name] for name in ROOMS_HELD}
+    for k, storey in enumerate(example.storeys):
+        arrays[f"plan{k}.classes"] = np.rint(255 * storey.probability).astype(np.uint8)
+        arrays[f"plan{k}.frame"] = np.array([*storey.origin, storey.edge, storey.height])
     floor = example.map.navigable
     arrays |= {"floor.cells": floor.cells, "floor.origin": floor.origin, "floor.edge": np.array(floor.edge)}
     return {**arrays, "source": np.array(example.source), "about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
@@ -139,7 +164,12 @@ def load_walls(path: Path) -> WallExample:
     for name in ROOMS_HELD:
         rooms[name] = arrays[f"rooms.{name}"]
     map = TopometricMap(grid, none, floor, room, rooms, edges, storeys)
-    return WallExample(**{name: arrays[name] for name in WALL_ARRAYS}, map=map, source=str(arrays["source"]))
+    plans = []
+    for k in range(sum(name.endswith(".classes") for name in arrays)):
+        x, y, edge, height = arrays[f"plan{k}.frame"].tolist()
+        plans.append(ClassifiedStorey(arrays[f"plan{k}.classes"] / np.float32(255), np.array([x, y]), edge, height))
+    walls = {name: arrays[name] for name in WALL_ARRAYS}
+    return WallExample(**walls, map=map, storeys=tuple(plans), source=str(arrays["source"]))
 
 
 def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
@@ -152,19 +182,28 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     else:
         building = make_building(str(rng.choice(BUILDING_KINDS)), seed, 1, difficulty)
     visited = part(building, int(rng.integers(*ROOMS_VISITED)), rng)
-    name, cloud, shift = _seen(building, visited, seed, rng)
+    name, cloud, shift = _flat(building, visited, seed, rng) if item.flat else _seen(building, visited, seed, rng)
     frame = Sim3(float(rng.uniform(-np.pi, np.pi)))
     cloud = replace(moved(cloud, frame), rooms=())
-    map = extract(cloud, carve=False, walls=False)
-    cells = map.grid if rng.random() < COARSE_SHARE else voxelise(cloud, FINE_CELL)
-    walls = wall_elevations(map, cells)
-    if not len(walls.faces):
+    scan, _, floor, map = rooms_and_passages(cloud, MAP_CELL, PRESETS["default"], Stopwatch())
+    cells = scan.grid if rng.random() < COARSE_SHARE else voxelise(cloud, FINE_CELL)
+    walls = NO_WALLS if item.flat else wall_elevations(map, cells)
+    if not item.flat and not len(walls.faces):
         raise InputError(f"{seed}: no wall was seen")
     strips, truth = np.rint(255 * walls.strips).astype(np.uint8), true_classes(building, walls, frame, shift)
     doors = building.doors["centre"]
     if shift is not None:
         doors = doors - shift[1][cKDTree(shift[0] + shift[1]).query(doors)[1]]
-    return WallExample(walls.first, strips, truth, frame.apply(doors), map, walls.faces, f"{name}/{item.source}")
+    source = f"{name}/{item.source}"
+    return WallExample(walls.first, strips, truth, frame.apply(doors), map, floor.classified_storeys, walls.faces, source)
+
+
+def _flat(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
+    """As `_seen`, by a 2D laser or as a grid map."""
+    if rng.random() >= SLICE_SHARE:
+        return "drawn", drawn_map(building, visited, rng), None
+    cloud, shift = scanned(building, "laser2d", visited, rng, seed)
+    return "laser2d", cloud if rng.random() < POSED_SHARE else replace(cloud, poses=None, pose_of=None), shift
 
 
 def _seen(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:

@@ -50,7 +50,7 @@ def wall_files(folder: Path, count: int) -> list[Path]:
     paths = []
     for k in range(count):
         map, faces, strips, truth, doors = two_doors(2 * k)
-        example = WallExample(np.array([0, len(truth)]), strips, truth, doors, map, faces, "tls/procedural")
+        example = WallExample(np.array([0, len(truth)]), strips, truth, doors, map, (), faces, "tls/procedural")
         path = folder / f"{k}.npz"
         archive.write(wall_arrays(WallItem(k, "procedural", 0, "", ""), example), path)
         paths.append(path)

@@ -13,6 +13,13 @@ COLUMN_CLASSES = ("inside", "wall", "doorway", "shut", "outside")  # furniture i
 INSIDE_CLASS, WALL_CLASS, DOORWAY_CLASS, SHUT_CLASS = range(4)  # of them
 DOOR_CHANCE, WALL_CHANCE = 0.3, 0.02  # less of a door and more of a wall around it, and a passage leads through a wall
 PASSAGE_REACH = 0.3  # m around a passage
+WALL_REACH = 0.5  # m around it, in which walls and leaves are looked for
+PLAN_SIGNS = (
+    "doorway",
+    "doorway_most",
+    "walled",
+    "leaf",
+)  # around a passage: mean, highest, mean of a wall, highest of a shut door
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +43,34 @@ def leads_through_wall(storeys: Sequence[ClassifiedStorey], centre: Array) -> bo
     """Does a passage at `centre` (3,) m lead through a wall: none of its columns is of a door, and some are of a wall?"""
     if not storeys:
         return False
-    storey = min(storeys, key=lambda s: abs(s.height - float(centre[2])))
-    reach = max(int(PASSAGE_REACH / storey.edge), 1)
-    low = np.floor((centre[:2] - storey.origin) / storey.edge).astype(np.int64) - reach
-    box = tuple(slice(max(k, 0), max(k + 2 * reach + 1, 0)) for k in low.tolist())
-    near = storey.probability[box]
+    near = _around(_nearest(storeys, centre), centre, PASSAGE_REACH)
     if not near.size:
         return False
     return bool(
         near[..., DOORWAY_CLASS : SHUT_CLASS + 1].sum(axis=-1).max() < DOOR_CHANCE and near[..., WALL_CLASS].mean() > WALL_CHANCE
     )
+
+
+def plan_signs(storeys: Sequence[ClassifiedStorey], centres: Array) -> Array:
+    """(n, 4) `PLAN_SIGNS` at passages (n, 3) m; zeros where no plan is."""
+    signs = np.zeros((len(centres), len(PLAN_SIGNS)))
+    for row, centre in zip(signs, centres if storeys else (), strict=False):
+        storey = _nearest(storeys, centre)
+        near, wider = (_around(storey, centre, reach) for reach in (PASSAGE_REACH, WALL_REACH))
+        if near.size:
+            doorway = near[..., DOORWAY_CLASS]
+            row[:] = doorway.mean(), doorway.max(), wider[..., WALL_CLASS].mean(), wider[..., SHUT_CLASS].max()
+    return signs
+
+
+def _nearest(storeys: Sequence[ClassifiedStorey], centre: Array) -> ClassifiedStorey:
+    return min(storeys, key=lambda s: abs(s.height - float(centre[2])))
+
+
+def _around(storey: ClassifiedStorey, centre: Array, reach: float) -> Array:
+    """(a, b, 5) of the columns at most `reach` m from a place, along each axis."""
+    columns = max(int(reach / storey.edge), 1)
+    low = np.floor((np.asarray(centre)[:2] - storey.origin) / storey.edge).astype(np.int64) - columns
+    box = tuple(slice(max(k, 0), max(k + 2 * columns + 1, 0)) for k in low.tolist())
+    near: Array = storey.probability[box]
+    return near

@@ -10,13 +10,14 @@ from topomerge.extraction.elevations.doorways import place_classes
 from topomerge.extraction.elevations.elevation import wall_elevations
 from topomerge.extraction.elevations.wall_doors import with_wall_doors
 from topomerge.extraction.elevations.windows import with_windows
+from topomerge.extraction.floor import Floor
 from topomerge.extraction.free_space import free_space
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
 from topomerge.extraction.plans.plan_rooms import rooms_of_plans
 from topomerge.extraction.room_odds import with_room_odds
 from topomerge.extraction.scan import Scan, read_scan
-from topomerge.extraction.slices import with_raised_slice
+from topomerge.extraction.slices import is_slice, with_raised_slice
 from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.views.view_rooms import rooms_of_views
@@ -52,24 +53,10 @@ def extract(
     p = chosen_parameters(preset, overrides)
     watch = Stopwatch(progress)
 
-    watch.begin("read and voxelise", 0.0)
-    scan = read_scan(source, voxel_size, p.sparse)  # 2.2
-    scan = with_raised_slice(scan) if p.assume else scan
-
-    watch.begin("navigable volume", 0.3)
-    scan, navigable = navigable_volume(scan, p)  # 2.3
-
-    watch.begin("rooms", 0.4)
-    if isinstance(p, ThesisParameters):
-        floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
-    else:
-        floor = rooms_of_plans(scan.grid, navigable, p.door, p.narrow, p.standing_height)
-
-    watch.begin("topology", 0.85)
-    map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+    scan, navigable, floor, map = rooms_and_passages(source, voxel_size, p, watch)
 
     watch.begin("odds of rooms, doors on walls", 0.87)
-    map, doubts = _with_odds_and_openings(map, scan, p)
+    map, doubts = _with_odds_and_openings(map, scan, floor, p)
 
     watch.begin("free space", 0.9)
     free = free_space(scan, navigable, p.range) if p.carve else scan.free
@@ -85,18 +72,48 @@ def extract(
     )
 
 
-def _with_odds_and_openings(map: TopometricMap, scan: Scan, p: Parameters) -> tuple[TopometricMap, list[str]]:
+def rooms_and_passages(
+    source: PointCloud | VoxelGrid | Array | Iterable[PointCloud], voxel_size: float, p: Parameters, watch: Stopwatch
+) -> tuple[Scan, VoxelGrid, Floor, TopometricMap]:
+    """The scan, its navigable volume, its floors cut into rooms, and the map of these with what the floors show of doors.
+
+    Args:
+        source, voxel_size: as of `extract`.
+        p: of its preset.
+
+    Raises:
+        InputError: as `extract`.
+    """
+    watch.begin("read and voxelise", 0.0)
+    scan = read_scan(source, voxel_size, p.sparse)  # 2.2
+    flat = is_slice(scan.grid)
+    scan = with_raised_slice(scan) if p.assume else scan
+
+    watch.begin("navigable volume", 0.3)
+    scan, navigable = navigable_volume(scan, p)  # 2.3
+
+    watch.begin("rooms", 0.4)
+    if isinstance(p, ThesisParameters):
+        floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
+    else:
+        floor = rooms_of_plans(scan.grid, navigable, p.slice_door if flat else p.door, p.narrow, p.standing_height)
+
+    watch.begin("topology", 0.85)
+    return scan, navigable, floor, topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+
+
+def _with_odds_and_openings(map: TopometricMap, scan: Scan, floor: Floor, p: Parameters) -> tuple[TopometricMap, list[str]]:
     """The map with how likely each room is one, with the doors and windows that its walls show, and with the doors that the
     sensor was carried through; and what is odd about its way."""
     if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
         return replace(map, rooms=with_outline_odds(map.rooms)), []
     map = with_room_odds(map, scan.rays)
     walls = wall_elevations(map, scan.fine) if p.walls and scan.fine is not None and len(map.rooms) else None
-    if walls is not None:
-        classes = place_classes(walls)
-        map = with_wall_doors(map, walls, classes)
+    classes = None if walls is None else place_classes(walls)
+    if p.walls:
+        map = with_wall_doors(map, floor.classified_storeys, walls, classes)
     map, doubt = with_walked_doors(map, scan.places)
-    if walls is not None:
+    if walls is not None and classes is not None:
         map = with_windows(map, walls, classes)
     return map, [doubt] if doubt else []
 

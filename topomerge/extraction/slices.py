@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from topomerge.extraction.cell_means import MIDDLE
 from topomerge.extraction.scan import Scan
-from topomerge.kernels.carve import carve
+from topomerge.kernels.carve import count_rays
 from topomerge.types import Array, VoxelGrid
 
 SLICE_HEIGHT = 0.6  # m: what is flatter is a slice
@@ -19,6 +19,9 @@ RAISED_FROM, BELOW_TOP = 0.5, 0.3  # m above the floor, and m below the top of t
 ENCLOSED_SHARE = 0.75  # of the directions in which a place inside sees a wall
 SIGHT_DIRECTIONS = 24
 SIGHT_RANGE = 15.0  # m
+SEEN_THROUGH = 20  # rays through a column for each that ends in it: what hangs there is no wall
+FEW_POINTS = 0.25  # of the usual number in the columns around, where rays are unknown: likewise
+AROUND = 0.3  # m
 
 
 def with_raised_slice(scan: Scan) -> Scan:
@@ -67,13 +70,20 @@ def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
     """
     low, _ = _extent(grid)
     columns, column = np.unique(grid.cells[:, :2], axis=0, return_inverse=True)
-    wall = np.zeros(grid.shape[:2], bool)
-    wall[tuple(columns.T)] = True
-    inside = _crossed(grid, *rays) if rays is not None else _enclosed(wall, grid.edge)
+    points = np.zeros(grid.shape[:2], np.int64)
+    count = grid.properties.get("count", np.ones(len(grid), np.int64))
+    points[tuple(columns.T)] = np.bincount(column.ravel(), count)
+    if rays is not None:
+        passed, met = _rays_of_columns(grid, *rays)
+        wall, inside = (points > 0) & (passed <= SEEN_THROUGH * np.maximum(met, 1)), passed > 0
+    else:
+        wall = _filled_columns(points, grid.edge)
+        inside = _enclosed(wall, grid.edge)
     inside = ndimage.binary_closing(np.pad(inside, 2), np.ones((3, 3)))[2:-2, 2:-2] & ~wall
     high = round(EXTRUDED_HEIGHT / grid.edge)
     levels = np.arange(low + 1, low + high)
-    walls = np.column_stack([np.repeat(columns, len(levels), axis=0), np.tile(levels, len(columns))])
+    filled = wall[tuple(columns.T)]
+    walls = np.column_stack([np.repeat(columns[filled], len(levels), axis=0), np.tile(levels, int(filled.sum()))])
     shape = (grid.shape[0], grid.shape[1], max(grid.shape[2], low + high + 1))
     floor = np.column_stack([np.argwhere(inside), np.full(int(inside.sum()), low)])
     offset = np.full((len(walls) + len(floor), 3), MIDDLE, np.uint8)
@@ -81,17 +91,25 @@ def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
         many = np.bincount(column.ravel())
         for k in (0, 1):
             mean = np.bincount(column.ravel(), grid.properties["offset"][:, k]) / many
-            offset[: len(walls), k] = np.repeat(mean, len(levels))
+            offset[: len(walls), k] = np.repeat(mean[filled], len(levels))
     return VoxelGrid.from_cells(np.concatenate([walls, floor]), grid.origin, grid.edge, shape, {"offset": offset})
 
 
-def _crossed(grid: VoxelGrid, starts: Array, ends: Array) -> Array:
-    """(nx, ny) columns that rays crossed, seen from above."""
-    flat = np.zeros((*grid.shape[:2], 1), bool)
-    at, to = ((np.asarray(p, np.float64) - grid.origin) / grid.edge for p in (starts, ends))
-    at[:, 2], to[:, 2] = 0.5, 0.5
-    carve(np.ascontiguousarray(at), np.ascontiguousarray(to), 1.0, flat)
-    return flat[:, :, 0]
+def _rays_of_columns(grid: VoxelGrid, starts: Array, ends: Array) -> tuple[Array, Array]:
+    """(nx, ny) how many rays go through each column and how many end in it, seen from above."""
+    passed, met = np.zeros(grid.shape[:2], np.int32), np.zeros(grid.shape[:2], np.int32)
+    at, to = ((np.asarray(p, np.float64)[:, :2] - grid.origin[:2]) / grid.edge for p in (starts, ends))
+    count_rays(np.ascontiguousarray(at), np.ascontiguousarray(to), 1.0, passed, met)
+    return passed, met
+
+
+def _filled_columns(points: Array, edge: float) -> Array:
+    """(nx, ny) columns that hold about as many points (nx, ny) as others around them: single ones hang in doorways."""
+    size = 2 * round(AROUND / edge) + 1
+    some = points > 0
+    near = ndimage.uniform_filter(some.astype(float), size, mode="constant")
+    usual = ndimage.uniform_filter(points.astype(float), size, mode="constant") / np.maximum(near, 1e-9)
+    return np.asarray(some & (points >= FEW_POINTS * usual))
 
 
 def _enclosed(wall: Array, edge: float) -> Array:

@@ -1,4 +1,4 @@
-"""Marking the cells that rays cross."""
+"""Marking and counting the cells that rays cross."""
 
 from __future__ import annotations
 
@@ -68,3 +68,32 @@ def sweep(table, bricks, starts, directions, reach, coarser, crossed):  # type: 
                 if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
                     crossed[x, y, z] = True
                 t += coarser / 2
+
+
+@njit(cache=True)
+def count_rays(starts, ends, margin, passed, met):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Adds to `passed` and `met` (nx, ny) int32 how many rays go through each column, from `starts` until `margin` columns before
+    `ends` ((k, 2) float64, in columns), and how many end in it: as `carve`, in the plane."""
+    nx, ny = passed.shape
+    for i in range(len(starts)):
+        dx, dy = ends[i, 0] - starts[i, 0], ends[i, 1] - starts[i, 1]
+        x, y = int(np.floor(ends[i, 0])), int(np.floor(ends[i, 1]))
+        if 0 <= x < nx and 0 <= y < ny:
+            met[x, y] += 1
+        length = np.sqrt(dx**2 + dy**2)
+        if not length > margin:
+            continue
+        stop = (length - margin) / length
+        x, y = int(np.floor(starts[i, 0])), int(np.floor(starts[i, 1]))
+        sx, sy = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+        tx = (x + (sx > 0) - starts[i, 0]) / dx if dx != 0 else np.inf
+        ty = (y + (sy > 0) - starts[i, 1]) / dy if dy != 0 else np.inf
+        ux, uy = (abs(1 / dx) if dx != 0 else np.inf), (abs(1 / dy) if dy != 0 else np.inf)
+        t = 0.0
+        while t < stop:
+            if 0 <= x < nx and 0 <= y < ny:
+                passed[x, y] += 1
+            if tx <= ty:
+                t, tx, x = tx, tx + ux, x + sx
+            else:
+                t, ty, y = ty, ty + uy, y + sy

@@ -104,6 +104,7 @@ class WallSegmentation(NetworkTask):
 @dataclass
 class WallDoors(TaskSettings):
     """Args:
+    data, flat: scans that show walls, and slices and grid maps; heldout, heldout_flat: likewise, of other buildings.
     pull: to 0, of all weights but the constants.
     folds: of scans, for the scores.
     """
@@ -111,7 +112,9 @@ class WallDoors(TaskSettings):
     task: str = "wall_doors"
     name: str = "wall_doors"
     data: PlanRecipe = field(default_factory=PlanRecipe)
+    flat: PlanRecipe = field(default_factory=PlanRecipe)
     heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout_flat: PlanRecipe = field(default_factory=PlanRecipe)
     pull: float = 1.0
     folds: int = 5
     watch: str = "precision"

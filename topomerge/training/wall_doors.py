@@ -1,7 +1,7 @@
 """Task `wall_doors`: how much what plans and what walls show says of a door (`extraction.elevations.wall_doors`).
 
-The extraction's candidates in scans that did not train the network of elevations, which ships; a candidate is a door where a true
-one lies as near as the doors of a map must lie to be right. There is a logistic model for each of what shows it.
+The extraction's candidates in scans that did not train the network of elevations, which ships, and in slices and grid maps;
+a candidate is a door where a true one lies near. There is a logistic model for each of what shows it.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from topomerge.training.loop import Say
 from topomerge.training.scan_settings import WallDoors
 from topomerge.types import Array
 
+NEAR_DOOR = 0.7  # m: of a door that lies farther off than the metrics allow (0.5 m) the rooms that it joins may still be right
 Candidates = tuple[DoorCandidates, Array]  # of a scan, and (n,) which are doors
 
 
@@ -34,8 +35,8 @@ def fit(settings: WallDoors, say: Say) -> dict[str, float]:
 
 
 def fit_doors(settings: WallDoors, say: Say) -> Fitted:
-    """Weights of the three models from all scans, and scores of those that were fitted without each scan."""
-    scans = candidates_of(settings.data, settings, say)
+    """Weights of the models from all scans, and scores of those that were fitted without each scan."""
+    scans = [*candidates_of(settings.data, settings, say), *candidates_of(settings.flat, settings, say)]
     parts = [scans[k :: settings.folds] for k in range(settings.folds)]
     left_out = []
     for k, part in enumerate(parts):
@@ -55,9 +56,10 @@ def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Can
     scans = []
     for path in paths:
         example = load_walls(path)
-        candidates = door_candidates(example.map, walls := example.elevations, place_classes(walls))
+        walls = example.elevations
+        candidates = door_candidates(example.map, example.storeys, walls, None if walls is None else place_classes(walls))
         right = np.zeros(len(candidates.edges), bool)
-        right[match_places(example.doors, candidates.edges["centre"])[:, 1]] = True
+        right[match_places(example.doors, candidates.edges["centre"], NEAR_DOOR)[:, 1]] = True
         scans.append((candidates, right))
     if len(scans) < settings.folds:
         raise InputError(f"data.scans={recipe.scans}: too few scans for {settings.folds} folds")
@@ -95,4 +97,5 @@ def door_figures(scans: Sequence[tuple[Array, Array]]) -> dict[str, float]:
 def judge(settings: WallDoors, file: Path, say: Say) -> dict[str, Any]:
     """Scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
-    return door_figures([(door_chance(c, weights), y) for c, y in candidates_of(settings.heldout, settings, say)])
+    scans = [*candidates_of(settings.heldout, settings, say), *candidates_of(settings.heldout_flat, settings, say)]
+    return door_figures([(door_chance(c, weights), y) for c, y in scans])

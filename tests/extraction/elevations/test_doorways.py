@@ -67,7 +67,7 @@ def seen(doors, map=None):
     elevations = Elevations(example[1], np.array([0, 160]), example[2] / np.float32(255))
     classes = np.zeros((len(doors), len(WALL_CLASSES)))
     classes[:, [OPEN, SHUT]] = doors
-    return door_candidates(example[0] if map is None else map, elevations, classes)
+    return door_candidates(example[0] if map is None else map, (), elevations, classes)
 
 
 def test_a_door_of_the_plan_lies_where_the_wall_shows_it():
@@ -76,7 +76,11 @@ def test_a_door_of_the_plan_lies_where_the_wall_shows_it():
     assert candidates.source.tolist() == [SOURCES.index("both")] and edge["centre"][0] == pytest.approx(2.45)
     assert edge["width"] == pytest.approx(0.855) and edge["rooms"].tolist() == [0, 1]
     at = dict(zip(WALL_DOOR_FEATURES, candidates.features[0], strict=True))
-    assert at["plan"] == pytest.approx(0.9) and at["wall"] == pytest.approx(0.95) and at["apart"] == pytest.approx(0.05, abs=0.02)
+    assert (
+        at["plan"] == pytest.approx(0.9)
+        and at["wall"] == pytest.approx(np.log(0.95 / 0.05))
+        and at["apart"] == pytest.approx(0.05, abs=0.02)
+    )
 
 
 def test_a_shut_door_that_the_wall_alone_shows_joins_the_rooms_on_its_two_sides():
@@ -98,10 +102,10 @@ def test_a_doorway_into_nothing_joins_nothing():
 
 
 def test_a_model_each_for_what_shows_a_door():
-    candidates = DoorCandidates(seen(chances(8)).edges[[0, 0, 0]], np.eye(3, len(WALL_DOOR_FEATURES)), np.arange(3))
+    candidates = DoorCandidates(seen(chances(8)).edges[[0] * 4], np.eye(4, len(WALL_DOOR_FEATURES)), np.arange(4))
     zeros = [0.0] * len(WALL_DOOR_FEATURES)
-    models = {"both": [0.0, 2.0, *zeros[1:]], "plan": [-1.0, *zeros], "wall": [1.0, *zeros]}
-    assert door_chance(candidates, models) == pytest.approx(1 / (1 + np.exp([-2.0, 1.0, -1.0])))
+    models = {"both": [0.0, 2.0, *zeros[1:]], "plan": [-1.0, *zeros], "wall": [1.0, *zeros], "flat": [2.0, *zeros]}
+    assert door_chance(candidates, models) == pytest.approx(1 / (1 + np.exp([-2.0, 1.0, -1.0, -2.0])))
 
 
 def test_damaged_weights_are_refused(tmp_path):

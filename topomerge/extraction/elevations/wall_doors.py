@@ -2,7 +2,7 @@
 
 What both show lies where the wall shows it: a leaf that stands open hides from the plan where its doorway ends. What the plan
 alone shows is dropped where the wall is seen and closed; what the wall alone shows is a door that the plan missed, mostly a shut
-one: it joins two rooms, too.
+one: it joins two rooms, too. Slices and grid maps show no walls at heights: there the plan alone is weighed.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
 from topomerge.extraction.elevations.doorways import STOOD, door_places, doorways
 from topomerge.extraction.elevations.elevation import ALONG, BEFORE, BEHIND, Elevations
@@ -23,7 +24,7 @@ from topomerge.types import EDGE_DTYPE, Array, TopometricMap
 
 WALL_DOORS_FILE = "wall_doors.json"
 WALL_DOOR_FEATURES = (
-    "wall",  # probability of a door that the wall shows, the highest along it
+    "wall",  # log odds of a door that the wall shows, the highest along it
     "wall_mean",  # and on average
     "both_sides",  # 0 or 1: seen on two faces
     "shut",  # share of that which speaks for a shut one
@@ -34,11 +35,13 @@ WALL_DOOR_FEATURES = (
     "complete",  # of the less complete of the two rooms
     "apart",  # m between where plan and wall show it
     "wide",  # 0 or 1: an opening
+    *PLAN_SIGNS,
 )
-SOURCES = ("both", "plan", "wall")  # what shows a door: there is a model for each
+SOURCES = ("both", "plan", "wall", "flat")  # what shows a door, flat: the plan of a map without walls; there is a model for each
 WALL_DOOR_REACH = 1.0  # m between a door of the plan and the same one on the wall
 BEYOND = (0.1, 1.0)  # m from a wall: there the other room begins
 NEAR = 0.3  # m around a door of the plan
+SUREST = 0.0005  # probability: what walls show is not taken for surer
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +50,7 @@ class DoorCandidates:
 
     Args:
         edges: (n,) EDGE_DTYPE.
-        features: (n, 11) `WALL_DOOR_FEATURES`.
+        features: (n, 15) `WALL_DOOR_FEATURES`.
         source: (n,) int8, index into `SOURCES`.
     """
 
@@ -56,13 +59,17 @@ class DoorCandidates:
     source: Array
 
 
-def with_wall_doors(map: TopometricMap, walls: Elevations, classes: Array) -> TopometricMap:
-    """The map with the doors that its walls show.
+def with_wall_doors(
+    map: TopometricMap, storeys: Sequence[ClassifiedStorey], walls: Elevations | None, classes: Array | None
+) -> TopometricMap:
+    """The map with the doors that its plans and walls show.
 
     Args:
-        classes: (n / 2, 4) of `place_classes`.
+        storeys: what probably stands in the columns of its plans.
+        walls: None of a map that shows none at heights.
+        classes: (n / 2, 4) of `place_classes`, of its walls.
     """
-    candidates = door_candidates(map, walls, classes)
+    candidates = door_candidates(map, storeys, walls, classes)
     chance = door_chance(candidates)
     edges = candidates.edges.copy()
     edges["confidence"] = chance
@@ -90,15 +97,19 @@ def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]
     return np.where(opening, candidates.features[:, plan], chance)
 
 
-def door_candidates(map: TopometricMap, walls: Elevations, classes: Array) -> DoorCandidates:
-    """All doors and openings that the plan or the walls of a map show.
+def door_candidates(
+    map: TopometricMap, storeys: Sequence[ClassifiedStorey], walls: Elevations | None, classes: Array | None
+) -> DoorCandidates:
+    """All doors and openings that the plans or the walls of a map show.
 
     Args:
-        classes: (n / 2, 4) of `place_classes`.
+        storeys, walls, classes: as of `with_wall_doors`.
     """
+    level = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
+    if walls is None or classes is None:
+        return _flat_candidates(map, storeys, level)
     doors = door_places(walls, classes)
     ways = _with_other_room(map, doorways(walls, doors))
-    level = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
     partner = _partners(level, ways)
     edges, features, source = [], [], []
     for edge, i in zip(level, partner, strict=True):
@@ -121,15 +132,33 @@ def door_candidates(map: TopometricMap, walls: Elevations, classes: Array) -> Do
             features.append([*_seen(way), 0, 0, 1, *_size(way["width"], complete, 0)])
             source.append(SOURCES.index("wall"))
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
-    return DoorCandidates(table, np.array(features, float).reshape(-1, len(WALL_DOOR_FEATURES)), np.array(source, np.int8))
+    return _candidates(table, features, storeys, np.array(source, np.int8))
+
+
+def _flat_candidates(map: TopometricMap, storeys: Sequence[ClassifiedStorey], edges: Array) -> DoorCandidates:
+    """The doors of the plans of a map without walls."""
+    complete = map.rooms["completeness"][edges["rooms"]].min(axis=1).tolist()
+    sizes = [_size(width, c, 0) for width, c in zip(edges["width"], complete, strict=True)]
+    features = [[0, 0, 0, 0, float(e["confidence"]), 0, 0, *size] for e, size in zip(edges, sizes, strict=True)]
+    return _candidates(edges, features, storeys, np.full(len(edges), SOURCES.index("flat"), np.int8))
+
+
+def _candidates(
+    edges: Array, features: Sequence[Sequence[float]], storeys: Sequence[ClassifiedStorey], source: Array
+) -> DoorCandidates:
+    """With the signs of the plan beside what was measured; where walls alone show a door the plan is not asked."""
+    measured = np.array(features, float).reshape(len(edges), len(WALL_DOOR_FEATURES) - len(PLAN_SIGNS))
+    signs = np.where(source[:, None] == SOURCES.index("wall"), 0.0, plan_signs(storeys, edges["centre"]))
+    return DoorCandidates(edges, np.hstack([measured, signs]), source)
 
 
 def _seen(way: Array) -> list[float]:
-    return [float(way["probability"]), float(way["mean"]), float(way["faces"] > 1), 1 - float(way["open"])]
+    chances = np.clip([way["probability"], way["mean"]], SUREST, 1 - SUREST)
+    return [*np.log(chances / (1 - chances)).tolist(), float(way["faces"] > 1), 1 - float(way["open"])]
 
 
 def _size(width: float, complete: float, apart: float) -> tuple[float, ...]:
-    """The last four of `WALL_DOOR_FEATURES`."""
+    """The last four of `WALL_DOOR_FEATURES` before the signs of the plan."""
     odd = abs(float(np.log(max(float(width), 0.1) / 0.9)))
     return odd, complete, apart, float(width > DOOR_MOST_WIDTH)
 
