@@ -13,7 +13,7 @@ COLUMN_CLASSES = ("inside", "wall", "doorway", "shut", "outside")  # furniture i
 INSIDE_CLASS, WALL_CLASS, DOORWAY_CLASS, SHUT_CLASS = range(4)  # of them
 DOOR_CHANCE, WALL_CHANCE = 0.3, 0.02  # less of a door and more of a wall around it, and a passage leads through a wall
 PASSAGE_REACH = 0.3  # m around a passage
-WALL_REACH = 0.5  # m around it, in which walls and leaves are looked for
+SIGNS_REACH = 0.5  # m around it, in which walls and leaves are looked for
 PLAN_SIGNS = (
     "doorway",
     "doorway_most",
@@ -56,7 +56,7 @@ def plan_signs(storeys: Sequence[ClassifiedStorey], centres: Array) -> Array:
     signs = np.zeros((len(centres), len(PLAN_SIGNS)))
     for row, centre in zip(signs, centres if storeys else (), strict=False):
         storey = _nearest(storeys, centre)
-        near, wider = (_around(storey, centre, reach) for reach in (PASSAGE_REACH, WALL_REACH))
+        near, wider = (_around(storey, centre, reach) for reach in (PASSAGE_REACH, SIGNS_REACH))
         if near.size:
             doorway = near[..., DOORWAY_CLASS]
             row[:] = doorway.mean(), doorway.max(), wider[..., WALL_CLASS].mean(), wider[..., SHUT_CLASS].max()

@@ -21,7 +21,7 @@ SIGHT_DIRECTIONS = 24
 SIGHT_RANGE = 15.0  # m
 SEEN_THROUGH = 20  # rays through a column for each that ends in it: what hangs there is no wall
 FEW_POINTS = 0.25  # of the usual number in the columns around, where rays are unknown: likewise
-AROUND = 0.3  # m
+COLUMNS_AROUND = 0.3  # m
 
 
 def with_raised_slice(scan: Scan) -> Scan:
@@ -105,7 +105,7 @@ def _rays_of_columns(grid: VoxelGrid, starts: Array, ends: Array) -> tuple[Array
 
 def _filled_columns(points: Array, edge: float) -> Array:
     """(nx, ny) columns that hold about as many points (nx, ny) as others around them: single ones hang in doorways."""
-    size = 2 * round(AROUND / edge) + 1
+    size = 2 * round(COLUMNS_AROUND / edge) + 1
     some = points > 0
     near = ndimage.uniform_filter(some.astype(float), size, mode="constant")
     usual = ndimage.uniform_filter(points.astype(float), size, mode="constant") / np.maximum(near, 1e-9)

@@ -73,8 +73,9 @@ def with_wall_doors(
     chance = door_chance(candidates)
     edges = candidates.edges.copy()
     edges["confidence"] = chance
+    likely = (chance >= 0.5) | _only_ways(candidates, chance, len(map.rooms))
     flights = map.edges[~np.isin(map.edges["kind"], ("door", "opening"))]
-    edges = np.concatenate([edges[chance >= 0.5], flights])
+    edges = np.concatenate([edges[likely], flights])
     return replace(map, edges=edges[np.lexsort((*edges["centre"].T[::-1], edges["rooms"][:, 1], edges["rooms"][:, 0]))])
 
 
@@ -133,6 +134,18 @@ def door_candidates(
             source.append(SOURCES.index("wall"))
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
     return _candidates(table, features, storeys, np.array(source, np.int8))
+
+
+def _only_ways(candidates: DoorCandidates, chance: Array, rooms: int) -> Array:
+    """(n,) bool: passages of a map without walls by which alone one walks from some rooms to others, the likeliest: what parts a
+    room wrongly must not part the graph."""
+    ways, group = np.zeros(len(chance), bool), np.arange(rooms)
+    for k in np.argsort(-chance, kind="stable").tolist():
+        a, b = group[candidates.edges["rooms"][k]].tolist()
+        if a != b and candidates.source[k] == SOURCES.index("flat"):
+            ways[k] = True
+            group[group == b] = a
+    return ways
 
 
 def _flat_candidates(map: TopometricMap, storeys: Sequence[ClassifiedStorey], edges: Array) -> DoorCandidates:
