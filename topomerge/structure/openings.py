@@ -76,7 +76,7 @@ def windows_in_walls(map: TopometricMap, walls: Array) -> Array:
 
 
 def _pane(sill: float, head: float) -> tuple[float, float]:
-    """Sill and head above the floor, usual ones where they were not seen; what is seen to end below the floor is LEAST_PANE high."""
+    """Sill and head above the floor, usual ones where they were not seen; LEAST_PANE high what ends below the floor."""
     low = sill if np.isfinite(sill) else min(USUAL_SILL, head - LEAST_PANE) if np.isfinite(head) else USUAL_SILL
     low = max(low, 0.0)
     if not np.isfinite(head):
