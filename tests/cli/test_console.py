@@ -47,3 +47,9 @@ def test_bars_only_when_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_bars_without_a_terminal() -> None:
     with console.Bars(delay=0.0) as bars:
         assert bars.task("read") is None
+
+
+def test_a_failure_is_one_line_whatever_the_file_is_called() -> None:
+    name = "no\nsuch.tmap"
+    assert console.failure_line(ValueError(f"{name}: no such file"), [name]) == "no such.tmap: no such file"
+    assert console.failure_line(ValueError("is empty"), [name]) == "no such.tmap: is empty"

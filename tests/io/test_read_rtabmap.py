@@ -237,7 +237,7 @@ def test_bad_blobs(tmp_path: Path, walk: Walk) -> None:
 def test_other_and_unfinished_databases(tmp_path: Path, walk: Walk) -> None:
     path = tmp_path / "a.db"
     path.write_bytes(b"hello\n" * 50)
-    assert "is not an RTAB-Map database" in refusal_of(path)
+    assert "is not an RTAB-Map database (it does not start with SQLite format 3);" in refusal_of(path)
     path.unlink()
     change(path, "CREATE TABLE Node (id INTEGER)")
     assert "is no RTAB-Map database (it has no tables Node, Data, Admin)" in refusal_of(path)

@@ -14,7 +14,7 @@ from tests.io.export_maps import flat, nothing, stair_scene, two_floors
 from tests.scenes import HEIGHT, THICK, Scene, corridor, rectangle, two_rooms
 from topomerge.structure.plan_structure import PlanStructure, plan_structure
 from topomerge.structure.walls import wall_part
-from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, TopometricMap, VoxelGrid
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, WINDOW_DTYPE, TopometricMap, VoxelGrid
 
 OFF = np.array([0.013, 0.017])  # by which scenes are moved off the lattice
 NEAR = 0.03  # m
@@ -269,3 +269,14 @@ def test_two_rooms_are_apart_and_valid():
     plan = structure(two_rooms(), noise=0.02)
     assert all(room.is_valid and not room.is_empty for room in plan.rooms)
     assert plan.rooms[0].intersection(plan.rooms[1]).area == 0
+
+
+def test_windows_below_the_floor_are_drawn_above_it() -> None:
+    """A map whose windows end below the floor: a pane of less than no height is no solid."""
+    map = topomerge.extract(two_rooms().points(0.0).astype(np.float32))
+    windows = np.zeros(4, WINDOW_DTYPE)
+    windows["rooms"], windows["centre"], windows["width"] = (0, -1), map.rooms["centroid"][0], 1.0
+    windows["sill"], windows["head"] = [-3.0, np.nan, -0.5, 0.9], [-2.0, -2.0, np.nan, 1.1]
+    panes = plan_structure(replace(map, windows=windows)).windows
+    assert (panes["sill"] >= 0).all() and (panes["head"] > panes["sill"]).all()
+    assert panes["sill"][3] == pytest.approx(0.9) and panes["head"][3] == pytest.approx(1.1)  # what was seen stays

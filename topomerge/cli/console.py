@@ -103,9 +103,10 @@ def failure_line(error: BaseException, paths: Sequence[str]) -> str:
     else:
         text = f"unexpected {type(error).__name__}: {error} (a fault in topomerge: run again with -v -v and report it)"
     text = " ".join(text.split()) or type(error).__name__
-    if paths and not text.startswith("--") and not any(path in text for path in paths):  # an option is no file's fault
+    named = any(" ".join(path.split()) in text for path in paths)
+    if paths and not text.startswith("--") and not named:  # an option is no file's fault
         text = f"{paths[0]}: {text}"
-    return text
+    return " ".join(text.split())
 
 
 def signal_behind(error: BaseException | None) -> BaseException | None:

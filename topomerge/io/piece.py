@@ -44,7 +44,8 @@ def read_head(path: Path, kind: str, magic: bytes, length: int) -> bytes:
     with path.open("rb") as stream:
         head = stream.read(length)
     if not head.startswith(magic):
-        raise InputError(f"{path}: is not {kind} (it does not start with {magic.decode()}); check the file's suffix")
+        start = magic.rstrip(b"\0").decode()
+        raise InputError(f"{path}: is not {kind} (it does not start with {start}); check the file's suffix")
     if len(head) < length:
         raise damaged(path, kind, "its header is cut short")
     return head

@@ -76,9 +76,12 @@ def windows_in_walls(map: TopometricMap, walls: Array) -> Array:
 
 
 def _pane(sill: float, head: float) -> tuple[float, float]:
-    """Sill and head, usual ones where they were not seen."""
+    """Sill and head above the floor, usual ones where they were not seen; LEAST_PANE high what ends below the floor."""
     low = sill if np.isfinite(sill) else min(USUAL_SILL, head - LEAST_PANE) if np.isfinite(head) else USUAL_SILL
-    return max(low, 0.0), head if np.isfinite(head) else max(USUAL_HEAD, low + LEAST_PANE)
+    low = max(low, 0.0)
+    if not np.isfinite(head):
+        return low, max(USUAL_HEAD, low + LEAST_PANE)
+    return low, head if head > low else low + LEAST_PANE
 
 
 def _carrier(edge: Array, walls: Array, storeys: Array) -> int:
