@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -27,6 +26,7 @@ from topomerge.cli.extract import EXTRACT
 from topomerge.cli.info import INFO
 from topomerge.cli.match import MATCH
 from topomerge.cli.merge import MERGE
+from topomerge.cli.signals import leave_on_signals
 from topomerge.cli.simulate import SIMULATE
 from topomerge.cli.view import VIEW
 from topomerge.cli.watch import WATCH
@@ -137,11 +137,6 @@ def _run(args: argparse.Namespace) -> int:
         return 1
 
 
-def _terminate(*_: object) -> NoReturn:
-    """On SIGTERM: leave through the `finally` clauses that delete half-written files."""
-    raise SystemExit(143)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -152,7 +147,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status, see `EXIT_STATUSES`.
     """
     if argv is None:
-        signal.signal(signal.SIGTERM, _terminate)
+        leave_on_signals()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without m² must not end the work

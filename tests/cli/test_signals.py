@@ -1,0 +1,59 @@
+"""Who stops a command while kernels are compiled is heard, too."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from topomerge.cli.signals import leave_on_signals
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+WAIT = 5.0  # s
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """The process has its own again afterwards."""
+    own = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)}
+    leave_on_signals()
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    for number, handler in own.items():
+        signal.signal(number, handler)
+
+
+def as_compiler(file: str) -> Callable[[Callable[[], Any]], list[str]]:
+    """A function of a file that calls another one and swallows what it raises, as a callback from C does."""
+    space: dict[str, Any] = {}
+    source = (
+        "def call(f):\n    try:\n        f()\n    except BaseException as e:\n        return [type(e).__name__]\n    return []"
+    )
+    exec(compile(source, file, "exec"), space)
+    call: Callable[[Callable[[], Any]], list[str]] = space["call"]
+    return call
+
+
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)])
+def test_a_signal_within_the_compiler_is_raised_when_it_has_returned(number: int, error: type[BaseException]) -> None:
+    call = as_compiler(os.sep + os.path.join("lib", "llvmlite", "binding", "ffi.py"))
+
+    def compile_and_go_on() -> None:
+        assert call(lambda: os.kill(os.getpid(), number)) == []
+        time.sleep(WAIT)
+
+    with pytest.raises(error) as raised:
+        compile_and_go_on()
+    assert not isinstance(raised.value, SystemExit) or raised.value.code == 143
+
+
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)])
+def test_elsewhere_it_is_raised_at_once(number: int, error: type[BaseException]) -> None:
+    with pytest.raises(error):
+        os.kill(os.getpid(), number)
+    assert as_compiler("somewhere.py")(lambda: os.kill(os.getpid(), number)) == [error.__name__]
