@@ -33,9 +33,11 @@ NOTHING_LACKED = [
 
 def last_lines(folder: Path, text: str, *options: str) -> list[str]:
     """What a run of these tests says last, without the line that counts all."""
-    folder.mkdir()
-    shutil.copy(ROOT / "tests" / "conftest.py", folder)
-    (folder / "test_some.py").write_text(text)
+    tests = folder / "tests"
+    tests.mkdir(parents=True)
+    for name in ("conftest.py", "compiling.py"):
+        shutil.copy(ROOT / "tests" / name, tests)
+    (tests / "test_some.py").write_text(text)
     (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  slow: s\n  data: d\n")
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("TOPOMERGE_", "PYTEST_"))}
     environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take seconds
