@@ -42,7 +42,7 @@ def atlas_html(
         component: the page of this one alone, which says nothing of the others, nor how long it took.
     """
     if component is not None:
-        return _component_html(result, component, joined[component], title)
+        return _component_html(result, component, joined[component], title, stamp)
     sections = [_verdict(result, _counts(result) if pages else result.words().split("; ")), warnings(result.warnings)]
     data: dict[str, Any] = {}
     if pages:
@@ -56,12 +56,13 @@ def atlas_html(
     return page(title, f"Atlas of {len(result.names)} maps", sections, data, stamp)
 
 
-def _component_html(result: AtlasResult, n: int, map: TopometricMap, title: str) -> str:
+def _component_html(result: AtlasResult, n: int, map: TopometricMap, title: str, stamp: str) -> str:
     """The page of one component."""
     sections, data = _joined(result, n, map, True)
     back = element("p", element("a", f"All of {title}", href="report.html"), class_="note")
     sections = [back, *sections, _maps(result, [n]), _links(result, result.components[n])]
-    return page(f"{title}, joined map {n}", f"{len(result.components[n])} maps of an atlas", sections, data)
+    kind = f"{len(result.components[n])} maps of an atlas"
+    return page(f"{title}, joined map {n}", kind, sections, data, stamp, f"stamp-{n}")
 
 
 def _joined(result: AtlasResult, n: int, map: TopometricMap, in_space: bool) -> tuple[list[Markup], dict[str, Any]]:

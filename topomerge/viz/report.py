@@ -60,7 +60,9 @@ def report_html(map: TopometricMap) -> str:
     return page(title, "Topometric map", sections, {"scene-data": scene_data(map, turn=sheet.turn)})
 
 
-def page(title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, Any], stamp: str = "") -> str:
+def page(
+    title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, Any], stamp: str = "", stamped: str = "stamp"
+) -> str:
     """A whole page from the template.
 
     Args:
@@ -69,6 +71,7 @@ def page(title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, A
         sections: its content.
         data: id -> a JSON value that the scripts read, as `scene_data`.
         stamp: of the page; an open one loads itself anew when `report_stamp.css` beside it holds another one. Empty: never.
+        stamped: the name under which that file holds it.
     """
     script = "".join(_template(name) for name in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
@@ -78,7 +81,7 @@ def page(title: str, kind: str, sections: Sequence[Markup], data: Mapping[str, A
         "style": element("style", Markup(_template("report.css"))),
         "hash": Markup(digest),
         "styles": Markup(BESIDE if stamp else ""),
-        "content": join([*sections, *([element("i", id="stamp", data_stamp=stamp, hidden=True)] if stamp else [])]),
+        "content": join([*sections, *([element("i", id="stamp", data_stamp=stamp, data_name=stamped, hidden=True)] if stamp else [])]),
         "data": join(json_data(value, id) for id, value in data.items()),
         "script": element("script", Markup(script)),
         "version": Markup(__version__),

@@ -16,6 +16,7 @@ import pytest
 
 import topomerge as tm
 from tests.fusion.atlas.test_watch import room
+from tests.viz.chromium import Page
 from topomerge.fusion.atlas import store
 from topomerge.fusion.atlas.maps import MapFiles, Maps
 from topomerge.fusion.atlas.memory import map_key
@@ -102,6 +103,22 @@ def test_pages_of_what_did_not_change_are_taken_over_and_those_of_what_is_gone_g
     assert pages(folder) == ["map_0.html", "map_1.html"] and not (folder / "map_2.tmap").exists()
     remove(folder, ["room-0"], counted)
     assert pages(folder) == [] and 'id="joined-0"' in (folder / "report.html").read_text()
+
+
+@pytest.mark.longer
+def test_the_open_page_of_a_joined_map_follows_the_atlas(tmp_path: Path) -> None:
+    folder = tmp_path / "house"
+    add(folder, named(0, 1, 2, 3, 4, 5), tm.atlas_html)
+    with Page(folder / "map_1.html", tmp_path / "profile") as page:
+        page.run("window.opened = true")
+        page.wait("performance.now() > 5000 && window.opened === true")  # nothing changed: nothing is loaded
+        remove(folder, ["room-0"], tm.atlas_html)
+        page.wait("document.readyState === 'complete' && window.opened === undefined")
+        assert "room-4" in page.run("document.body.innerText") and "room-2" not in page.run("document.body.innerText")
+        page.run("window.opened = true")
+        remove(folder, ["room-2"], tm.atlas_html)  # one joined map is left, which the report shows
+        page.wait("document.readyState === 'complete' && window.opened === undefined")
+        assert page.run("location.pathname").endswith("report.html")
 
 
 def test_an_atlas_that_is_renamed_says_so_on_its_pages(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@
 | map_N.tmap, merged_N.ply | the joined map of component N |
 | report.html | everything to look at; of more than four joined maps it names their pages |
 | map_N.html | the page of component N, then |
-| report_stamp.css | which report that is: an open page that has another one loads itself anew |
+| report_stamp.css | which report and pages these are: an open page of before loads itself anew |
 | watch.json | which files gave which maps (`sources`) |
 
 Maps that are added later give what building all at once gives: all is put together anew, only registrations are remembered.
@@ -20,7 +20,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -41,7 +41,7 @@ from topomerge.io.maps import save_map
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.types import Sim3, TopometricMap
 
-Report = Callable[..., str]  # (atlas, joined maps, title, stamp=…, pages=…), of one of them (…, component=…) -> HTML
+Report = Callable[..., str]  # (atlas, joined maps, title, stamp=…, pages=…), of one of them (…, component=…, stamp=…) -> HTML
 JOINED_ON_ONE_PAGE = 4  # joined maps; of more each has a page of its own
 STAMP_FILE = "report_stamp.css"
 
@@ -186,7 +186,7 @@ def change(
         pairs = json.dumps(registrations_to_json(registrations, keys, stored.settings))
         stamp = hashlib.sha256(json_text(listing | {"seconds": 0}).encode()).hexdigest()[:16]
         page = report(atlas, joined, title, stamp=stamp, pages=pages)
-        css = f':root {{ --stamp: "{stamp}"; }}\n'
+        css = "".join(f':root {{ --{name}: "{value}"; }}\n' for name, value in _stamps(stamp, components))
         texts = {PAIRS_FILE: pairs, "report.html": page, STAMP_FILE: css, "atlas.json": json_text(listing)}
         for name, text in (texts | dict(wanted.files)).items():
             _write(place / name, text)
@@ -224,8 +224,14 @@ def _pages(
     for n in joined:
         components[n] |= {"page": f"map_{n}.html", "shown": shown_of(atlas, n, components[n], title)}
         if not _copied(before, components[n], "shown", ("page",), place):
-            _write(place / components[n]["page"], page(component=n))
+            _write(place / components[n]["page"], page(component=n, stamp=components[n]["shown"]))
     return {n: components[n]["page"] for n in joined}
+
+
+def _stamps(stamp: str, components: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
+    """By what each page is told: name, stamp."""
+    yield "stamp", stamp
+    yield from ((f"stamp-{n}", component["shown"]) for n, component in enumerate(components) if "shown" in component)
 
 
 def _copied(before: Stored, component: Mapping[str, Any], digest: str, kinds: Sequence[str], place: Path) -> bool:

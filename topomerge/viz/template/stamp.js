@@ -10,9 +10,11 @@ function startStamp(mark) {
     const sheet = document.createElement("link");
     sheet.rel = "stylesheet";
     sheet.onload = () => {
-      const stamp = getComputedStyle(mark).getPropertyValue("--stamp").trim().replaceAll('"', "");
+      const held = (name) => getComputedStyle(mark).getPropertyValue(`--${name}`).trim().replaceAll('"', "");
+      const [stamp, whole] = [held(mark.dataset.name), held("stamp")];
       sheet.remove();
       if (stamp && stamp !== mark.dataset.stamp) location.reload();
+      else if (whole && !stamp) location.replace("report.html"); // this joined map has no page any more
       else setTimeout(look, STAMP_EVERY);
     };
     sheet.onerror = () => {
