@@ -74,6 +74,7 @@ def page(
         stamped: the name under which that file holds it.
     """
     script = "".join(_template(name) for name in SCRIPTS)
+    mark = [element("i", id="stamp", data_stamp=stamp, data_name=stamped, hidden=True)] if stamp else []
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     parts = {
         "title": element("title", f"{title} – {kind}"),
@@ -81,7 +82,7 @@ def page(
         "style": element("style", Markup(_template("report.css"))),
         "hash": Markup(digest),
         "styles": Markup(BESIDE if stamp else ""),
-        "content": join([*sections, *([element("i", id="stamp", data_stamp=stamp, data_name=stamped, hidden=True)] if stamp else [])]),
+        "content": join([*sections, *mark]),
         "data": join(json_data(value, id) for id, value in data.items()),
         "script": element("script", Markup(script)),
         "version": Markup(__version__),
