@@ -18,6 +18,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "merge_growth": {"rooms": [10]},
     "room_search": {"rooms": [2000]},
     "build_pairs": {"pairs": 2, "rooms": 4},
+    "bags": {"gigabytes": [0.02], "spacing": 0.1},
 }
 
 

@@ -113,8 +113,8 @@ class Gatherer:
     def _place(self, piece: Piece) -> _Part:
         points = frame.place_points(piece.points, self.rotation, self.factor)
         part = _Part(points, piece.colors, piece.labels, piece.pose_of)
-        finite = np.asarray((np.abs(points) < BEYOND).all(axis=1))  # false for nan
-        if not finite.all():
+        if not (points.min() > -BEYOND and points.max() < BEYOND):  # so of nan, too
+            finite = np.asarray((np.abs(points) < BEYOND).all(axis=1))
             self.dropped += int(len(points) - finite.sum())
             part = part.at(finite)
         if self.shift is None and len(part.points):

@@ -56,8 +56,8 @@ def pieces(scans: Iterable[PosedScan], warnings: Iterable[str] = ()) -> Iterator
 def _placed(scan: PosedScan) -> PosedScan:
     """The scan with its points in the fixed frame."""
     points = np.asarray(scan.points, np.float64)
-    met = np.isfinite(points).all(axis=1)
-    met &= (points != 0).any(axis=1) | scan.registered
+    far = np.einsum("ij,ij->i", points, points)
+    met = np.isfinite(far) & ((far > 0) | scan.registered)
     points, colors = (points, scan.colors) if met.all() else (points[met], None if scan.colors is None else scan.colors[met])
     if scan.pose is not None and not scan.registered:
         points = points @ scan.pose[:3, :3].T + scan.pose[:3, 3]

@@ -37,8 +37,13 @@ class Trajectory:
         return len(self.poses)
 
     @cached_property
-    def _rotations(self) -> Rotation:
-        return Rotation.from_matrix(self.poses[:, :3, :3])
+    def _turns(self) -> tuple[Array, Array]:
+        """(K, 3, 3) rotations of the poses, and (K, 3) rotation vectors from each to the next, 0 of the last."""
+        rotations = Rotation.from_matrix(self.poses[:, :3, :3])
+        steps = np.zeros((len(self), 3))
+        if len(self) > 1:
+            steps[:-1] = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
+        return rotations.as_matrix(), steps
 
     def gap(self, times: Array) -> Array:
         """(n,) s from each of the (n,) times to the nearest pose."""
@@ -55,10 +60,9 @@ class Trajectory:
         before, after = last - 1, np.minimum(last, len(self) - 1)
         span = self.times[after] - self.times[before]
         share = np.clip(np.divide(times - self.times[before], span, out=np.zeros(len(times)), where=span > 0), 0.0, 1.0)
-        start = self._rotations[before]
-        turn = (start.inv() * self._rotations[after]).as_rotvec() * share[:, None]
+        start, steps = self._turns
         poses = np.tile(np.eye(4), (len(times), 1, 1))
-        poses[:, :3, :3] = (start * Rotation.from_rotvec(turn)).as_matrix()
+        poses[:, :3, :3] = start[before] @ Rotation.from_rotvec(steps[before] * share[:, None]).as_matrix()
         poses[:, :3, 3] = (1 - share[:, None]) * self.poses[before, :3, 3] + share[:, None] * self.poses[after, :3, 3]
         return poses
 
