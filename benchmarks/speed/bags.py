@@ -84,7 +84,8 @@ def measure(path: str, alone: bool) -> dict[str, float]:
 def in_a_process(path: Path, alone: bool) -> dict[str, float]:
     """`measure` in a process of its own."""
     command = [sys.executable, "-m", "benchmarks.speed.bags", "--measure", str(path), "alone" if alone else "extract"]
-    result: dict[str, float] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    result: dict[str, float] = json.loads(said.splitlines()[-1])
     return result
 
 
@@ -99,7 +100,8 @@ def main(gigabytes: Iterable[float] = (1.0,), spacing: float = SPACING) -> None:
             ours, alone = in_a_process(path, alone=False), in_a_process(path, alone=True)
             line(f"bag_{size:g}_GB", ours["seconds"], alone["seconds"])
             rate = f"{megabytes / ours['seconds']:.0f} MB/s, {ours['rooms']:.0f} rooms, at most {ours['peak']:.0f} MiB"
-            print(f"# {megabytes:.0f} MB: {rate}; the library alone {megabytes / alone['seconds']:.0f} MB/s, {alone['peak']:.0f} MiB")
+            bare = f"{megabytes / alone['seconds']:.0f} MB/s, {alone['peak']:.0f} MiB"
+            print(f"# {megabytes:.0f} MB: {rate}; the library alone {bare}", flush=True)
 
 
 if __name__ == "__main__":
