@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from topomerge.errors import InputError
-from topomerge.extraction import voxels
 from topomerge.extraction.cell_means import cell_middles, with_means
+from topomerge.extraction.lattice_cells import LatticeCells
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import with_raised_slice
 from topomerge.extraction.sparsity import without_gaps
@@ -86,12 +86,39 @@ def test_without_points_a_cell_lies_in_its_middle():
     assert np.abs(cell_middles(with_means(grid, np.zeros((0, 3)))) - grid.centroids()).max() < 0.2 / 256
 
 
-def test_many_chunks_are_merged_on_the_way(monkeypatch):
+def test_many_chunks_give_what_one_gives():
     points = np.random.default_rng(3).uniform(0, 4, (4000, 3)).astype(np.float32)
-    monkeypatch.setattr(voxels, "PENDING_CELLS", 500)
-    grid = voxelise([PointCloud(p) for p in np.array_split(points, 40)])
-    assert int(grid.properties["count"].sum()) == 4000
-    assert (grid.cells == voxelise(points).cells).all()
+    parts = [PointCloud(p) for p in np.array_split(points, 40)]
+    grid, whole = voxelise(parts), voxelise(points)
+    assert (grid.cells == whole.cells).all()
+    for name in ("count", "offset"):
+        assert (grid.properties[name] == whole.properties[name]).all()
+
+
+@pytest.mark.parametrize("away", [0.0, 3e6])
+def test_cells_of_chunks_are_those_of_numpy(away: float):
+    rng = np.random.default_rng(4)
+    chunks = [rng.uniform(-3, 3, (200, 3)) for _ in range(30)]
+    chunks[20][:7] += away  # farther than codes reach
+    held = LatticeCells(0.25)
+    for chunk in chunks:
+        held.add(PointCloud(chunk.astype(np.float32)))
+    cells, counts, sums = held.all()
+    places = np.concatenate(chunks).astype(np.float32).astype(np.float64) / 0.25
+    expected, row, number = np.unique(np.floor(places).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+    order = np.lexsort(cells.T[::-1])
+    assert (cells[order] == expected).all() and (counts[order] == number).all()
+    parts = np.zeros((len(expected), 3), np.int64)
+    np.add.at(parts, row.ravel(), np.floor((places - np.floor(places)) * kernel.OFFSET_STEPS).astype(np.int64))
+    assert (sums[order] == parts).all()
+
+
+def test_of_more_cells_than_are_wanted_there_are_none():
+    rng = np.random.default_rng(5)
+    held = LatticeCells(0.05, most=1000)
+    for _ in range(4):
+        held.add(PointCloud(rng.uniform(0, 4, (800, 3)).astype(np.float32)))
+    assert held.within(voxelise(rng.uniform(0, 4, (800, 3)).astype(np.float32))) is None
 
 
 def test_shift_moves_the_origin_exactly():

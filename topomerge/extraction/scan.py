@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from topomerge.errors import InputError
+from topomerge.extraction.lattice_cells import LatticeCells
 from topomerge.extraction.sparsity import COARSEST_CELL, without_gaps
-from topomerge.extraction.voxels import LatticeCells, voxelise
+from topomerge.extraction.voxels import voxelise
 from topomerge.types import Array, PointCloud, VoxelGrid
 
 FINEST_CELL = 0.02  # m

@@ -9,8 +9,8 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
+from topomerge.extraction.lattice_cells import LatticeCells
 from topomerge.kernels import lookup, morton
-from topomerge.kernels import voxelise as kernel
 from topomerge.types import Array, PointCloud, VoxelGrid
 
 log = logging.getLogger(__name__)
@@ -19,8 +19,6 @@ log = logging.getLogger(__name__)
 STRAY_DISTANCE = 10.0
 STRAY_SHARE = 0.01
 STRAY_TOTAL_SHARE = 0.05  # of all cells may be strays
-PENDING_CELLS = 4_000_000  # cells of pending chunks
-_Lattice = tuple[Array, Array, Array]  # cells (n, 3), counts (n,), sums (n, 3): `kernels.voxelise.occupied`
 LARGE_VOLUME = 2e8  # cells: 200 x 200 x 5 m at 0.1 m; smaller grids cost little whatever is in them
 
 
@@ -69,65 +67,6 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
     size = (int(shape[0]), int(shape[1]), int(shape[2]))
     offset = (sums + counts[:, None] // 2) // counts[:, None]
     return VoxelGrid.from_cells(cells - base, base * edge, edge, size, {"count": counts, "offset": offset.astype(np.uint8)})
-
-
-class LatticeCells:
-    """Lattice cells of chunks that come one after the other. Pending ones are merged when they outgrow what is merged already.
-
-    Args:
-        edge: of a cell, m.
-        most: cells that are held; of a larger cloud there are none. 0: any number.
-    """
-
-    def __init__(self, edge: float, most: int = 0) -> None:
-        self.edge, self.most = edge, most
-        self.too_many = False
-        self._merged: _Lattice = (np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.int64))
-        self._pending: list[_Lattice] = []
-
-    def add(self, chunk: PointCloud) -> None:
-        """Take in the cells of a chunk."""
-        if self.too_many:
-            return
-        base, cells, counts, sums = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), self.edge)
-        self._pending.append((cells + base, counts, sums))
-        if sum(len(part[0]) for part in self._pending) > max(len(self._merged[0]), PENDING_CELLS):
-            self._merged = self.all()
-            if self.most and len(self._merged[0]) > self.most:
-                self.too_many = True
-                self._merged = tuple(part[:0] for part in self._merged)  # type: ignore[assignment]
-
-    def all(self) -> _Lattice:
-        """Cells (n, 3), counts (n,) and sums (n, 3) of the places of points within them, in `OFFSET_STEPS` parts."""
-        self._merged, self._pending = _merge([self._merged, *self._pending]), []
-        return self._merged
-
-    def within(self, grid: VoxelGrid) -> VoxelGrid | None:
-        """The cells in the box of a grid of whole multiples of them; None where they were too many."""
-        cells, counts, sums = self.all()
-        if self.too_many or (self.most and len(cells) > self.most):
-            return None
-        base = np.rint(grid.origin / self.edge).astype(np.int64)
-        size = np.array(grid.shape) * round(grid.edge / self.edge)
-        inside = ((cells >= base) & (cells < base + size)).all(axis=1)
-        offset = ((sums + counts[:, None] // 2) // np.maximum(counts, 1)[:, None]).astype(np.uint8)
-        shape = (int(size[0]), int(size[1]), int(size[2]))
-        return VoxelGrid.from_cells(cells[inside] - base, grid.origin, self.edge, shape, {"offset": offset[inside]})
-
-
-def _merge(parts: list[_Lattice]) -> _Lattice:
-    filled = [p for p in parts if len(p[0])] or parts[:1]
-    if len(filled) == 1:
-        return filled[0]
-    cells, counts, sums = (np.concatenate(arrays) for arrays in zip(*filled, strict=True))
-    base = cells.min(axis=0)
-    if ((cells.max(axis=0) - base) < morton.AXIS_LIMIT).all():
-        _, first, inverse = np.unique(morton.encode(cells - base), return_index=True, return_inverse=True)
-    else:
-        _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    total = (np.bincount(inverse.ravel(), weights, len(first)).astype(np.int64) for weights in (counts, *sums.T))
-    number, *axes = total
-    return cells[first], number, np.column_stack(axes)
 
 
 def _box(cells: Array) -> tuple[Array, Array]:

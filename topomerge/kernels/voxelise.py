@@ -117,6 +117,49 @@ def add_parts(places, rows, sums):  # type: ignore[no-untyped-def]  # pragma: no
             sums[row, 2] += place & 255
 
 
+@njit(cache=True)
+def _in_either(first, second):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    i = j = number = 0
+    while i < len(first) and j < len(second):
+        i, j = i + (first[i] <= second[j]), j + (second[j] <= first[i])
+        number += 1
+    return number + len(first) - i + len(second) - j
+
+
+@njit(cache=True)
+def _unite(codes, counts, sums, others, other_counts, other_sums, out, out_counts, out_sums):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    i = j = 0
+    for row in range(len(out)):
+        mine = j == len(others) or (i < len(codes) and codes[i] <= others[j])
+        both = mine and i < len(codes) and j < len(others) and codes[i] == others[j]
+        if mine:
+            out[row], out_counts[row] = codes[i], counts[i]
+            for k in range(3):
+                out_sums[row, k] = sums[i, k]
+            i += 1
+        if both:
+            out_counts[row] += other_counts[j]
+            for k in range(3):
+                out_sums[row, k] += other_sums[j, k]
+            j += 1
+        elif not mine:
+            out[row], out_counts[row] = others[j], other_counts[j]
+            for k in range(3):
+                out_sums[row, k] = other_sums[j, k]
+            j += 1
+
+
+Run = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]  # codes (n,) uint64, ascending; counts (n,) and sums (n, 3) int64
+
+
+def united(first: Run, second: Run) -> Run:
+    """Two runs of cells as one: of those in both, counts and sums are added."""
+    number = int(_in_either(first[0], second[0]))
+    out = np.empty(number, np.uint64), np.empty(number, np.int64), np.empty((number, 3), np.int64)
+    _unite(*first, *second, *out)
+    return out
+
+
 Occupied = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 
 
