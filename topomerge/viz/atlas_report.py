@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.atlas.tiles import tile_map, tiles
 from topomerge.fusion.explanation import chance
 from topomerge.types import Array, Sim3, TopometricMap
 from topomerge.viz.markup import Markup, element, join
@@ -29,8 +30,9 @@ def atlas_html(
     stamp: str = "",
     pages: Mapping[int, str] | None = None,
     component: int | None = None,
+    tile: int | None = None,
 ) -> str:
-    """The report as HTML, or the page of one component.
+    """The report as HTML, or the page of one component, or of one tile of it.
 
     Args:
         result: where the maps lie, and what contradicts.
@@ -40,9 +42,10 @@ def atlas_html(
         stamp: as of `report.page`.
         pages: component -> the file beside this one that shows its joined map: this one shows none then.
         component: the page of this one alone, which says nothing of the others, nor how long it took.
+        tile: of it, as of `tiles.tiles`: the page of this tile alone.
     """
     if component is not None:
-        return _component_html(result, component, joined[component], title, stamp)
+        return _component_html(result, component, joined[component], title, stamp, tile)
     sections = [_verdict(result, _counts(result) if pages else result.words().split("; ")), warnings(result.warnings)]
     data: dict[str, Any] = {}
     if pages:
@@ -56,13 +59,51 @@ def atlas_html(
     return page(title, f"Atlas of {len(result.names)} maps", sections, data, stamp)
 
 
-def _component_html(result: AtlasResult, n: int, map: TopometricMap, title: str, stamp: str) -> str:
-    """The page of one component."""
-    sections, data = _joined(result, n, map, True)
-    back = element("p", element("a", f"All of {title}", href="report.html"), class_="note")
-    sections = [back, *sections, _maps(result, [n]), _links(result, result.components[n])]
+def _component_html(result: AtlasResult, n: int, map: TopometricMap, title: str, stamp: str, tile: int | None) -> str:
+    """The page of one component: of one that is cut into tiles an overview, or the page of a tile."""
+    name, stamped, parts = f"{title}, joined map {n}", f"stamp-{n}", tiles(map)
     kind = f"{len(result.components[n])} maps of an atlas"
-    return page(f"{title}, joined map {n}", kind, sections, data, stamp, f"stamp-{n}")
+    if tile is not None:
+        back = element("p", element("a", name, href=page_file(n)), class_="note")
+        sections, data = _tile(n, map, parts, tile)
+        return page(f"{name}, tile {tile}", kind, [back, *sections], data, stamp, stamped)
+    back = element("p", element("a", f"All of {title}", href="report.html"), class_="note")
+    sections, data = _joined(result, n, map, len(parts) == 1)
+    if len(parts) > 1:
+        sections.append(_tiles_index(n, map, parts))
+    sections = [back, *sections, _maps(result, [n]), _links(result, result.components[n])]
+    return page(name, kind, sections, data, stamp, stamped)
+
+
+def page_file(component: int, tile: int | None = None) -> str:
+    """The file beside the report that shows a joined map, or a tile of it."""
+    return f"map_{component}.html" if tile is None else f"map_{component}_tile_{tile}.html"
+
+
+def _tile(n: int, map: TopometricMap, parts: Sequence[Array], tile: int) -> tuple[list[Markup], dict[str, Any]]:
+    """A tile of a joined map: its sections, and what their scripts read. Rooms have the numbers of the whole map."""
+    rooms, part = parts[tile], tile_map(map, parts[tile])
+    sheet, plans = lay_out(part)
+    view = element("div", plan_view(part, sheet, plans), scroller(rooms_table(part, only=rooms.tolist())), class_="beside")
+    sections = [section(f"Tile {tile} of {len(parts)}", view, f"tile-{tile}")]
+    home = {room: k for k, of in enumerate(parts) for room in of.tolist()}
+    ways = [(a, b) if home[a] == tile else (b, a) for a, b in part.edges["rooms"].tolist()]
+    beyond = sorted({(a, b) for a, b in ways if home[b] != tile})
+    if beyond:
+        rows = [(str(a), str(b), _linked(f"tile {home[b]}", page_file(n, home[b]))) for a, b in beyond]
+        sections.append(section("Into other tiles", _texts(("from room", "to room", "in"), rows), "beyond"))
+    return [*sections, _space(part)], {"scene-data": _scene(part, sheet.turn, rooms)}
+
+
+def _tiles_index(n: int, map: TopometricMap, parts: Sequence[Array]) -> Markup:
+    """The tiles of a joined map, which have pages of their own."""
+    rows = []
+    for k, rooms in enumerate(parts):
+        storeys = np.unique(map.rooms["storey"][rooms]).tolist()
+        area = f"{float(map.rooms['area'][rooms].sum()):.0f} m²"
+        rows.append((_linked(f"tile {k}", page_file(n, k)), str(len(rooms)), area, ", ".join(str(s) for s in storeys)))
+    words = element("p", "Each tile shows all of its cells in three dimensions.", class_="note")
+    return section("Tiles", join([words, _texts(("page", "rooms", "floor area", "storeys"), rows)]), "tiles")
 
 
 def _joined(result: AtlasResult, n: int, map: TopometricMap, in_space: bool) -> tuple[list[Markup], dict[str, Any]]:
@@ -161,8 +202,8 @@ def _seen(map: TopometricMap) -> Array:
     return np.minimum(np.bitwise_count(map.provenance), 3).astype(np.int64)
 
 
-def _scene(map: TopometricMap, turn: float) -> dict[str, Any]:
-    data = scene_data(map, turn=turn, seen=_seen(map))
+def _scene(map: TopometricMap, turn: float, only: Array | None = None) -> dict[str, Any]:
+    data = scene_data(map, turn=turn, seen=_seen(map), only=only)
     data["colours"]["map"] = [SEEN_BY_COLOURS[group[2]] for group in data["groups"]]
     return data
 

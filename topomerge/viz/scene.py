@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,12 @@ LONGEST_AXIS = 65_535  # cells along an axis that 16 bits can number
 
 
 def scene_data(
-    map: TopometricMap, key: str = "", turn: float = 0.0, most: int = MOST_DRAWN, seen: Array | None = None
+    map: TopometricMap,
+    key: str = "",
+    turn: float = 0.0,
+    most: int = MOST_DRAWN,
+    seen: Array | None = None,
+    only: Sequence[int] | Array | None = None,
 ) -> dict[str, Any]:
     """What the 3D view needs, as plain values.
 
@@ -28,6 +34,7 @@ def scene_data(
         turn: rad, by which its plan is turned against the clock: the camera stands accordingly.
         most: with more cells than this, cubes of 2, 3, … cells along an axis become one, of the room most of them have.
         seen: (n,) small ints, another label for which cells can be coloured (as of maps that saw them), or None.
+        only: rooms that are numbered and looked at; None: all.
 
     Returns:
         `edge` (m, of what is drawn), `merged` (cells along an axis that became one), `cells` (of the map), `drawn`, `origin`
@@ -35,6 +42,7 @@ def scene_data(
         `groups` [[storey, room, seen, cells]], `colours` {name: [hex for each group]},
         `rooms` [[key, storey, x, y, z]] in m, `data`.
     """
+    named = np.arange(len(map.rooms)) if only is None else np.asarray(only, np.int64)
     seen = np.zeros(len(map.grid), np.int64) if seen is None else seen.astype(np.int64)
     labels = np.stack([np.maximum(map.storey_of_cells(), 0), map.room + 1, seen], axis=1).astype(np.int64)
     low = map.grid.cells.min(axis=0) if len(map.grid) else np.zeros(3, np.int32)
@@ -55,11 +63,11 @@ def scene_data(
         "origin": [round(float(v), 4) for v in map.grid.origin + low * map.grid.edge],
         "shape": shape,
         "turn": round(turn, 6),
-        "look": _look(map, map.grid.origin + low * map.grid.edge),
+        "look": _look(map.rooms[named], map.grid.origin + low * map.grid.edge),
         "storeys": [{"name": str(i), "floor": round(float(f), 3)} for i, f in enumerate(floors)],
         "groups": groups.tolist(),
         "colours": {"room": [hex_colour(palette[room]) for room in kinds[:, 1]]},
-        "rooms": [[f"{key}{i}", int(r["storey"]), *_middle(map, r)] for i, r in enumerate(map.rooms)],
+        "rooms": [[f"{key}{i}", int(map.rooms["storey"][i]), *_middle(map.rooms[i])] for i in named.tolist()],
         "data": base64.b64encode(leb128(steps)).decode("ascii"),
     }
 
@@ -69,15 +77,15 @@ def hex_colour(colour: Array) -> str:
     return "#" + bytes(colour.tolist()).hex()
 
 
-def _look(map: TopometricMap, origin: Array) -> list[list[float]] | None:
-    """The corners of the box around all rooms, m from the scene's corner."""
-    if not len(map.rooms):
+def _look(rooms: Array, origin: Array) -> list[list[float]] | None:
+    """The corners of the box around rooms, m from the scene's corner."""
+    if not len(rooms):
         return None
-    low, high = map.rooms["lo"].min(axis=0) - origin, map.rooms["hi"].max(axis=0) - origin
+    low, high = rooms["lo"].min(axis=0) - origin, rooms["hi"].max(axis=0) - origin
     return [low.round(3).tolist(), high.round(3).tolist()]
 
 
-def _middle(map: TopometricMap, room: Any) -> list[float]:
+def _middle(room: Any) -> list[float]:
     return [round(float(v), 2) for v in room["centroid"]]
 
 

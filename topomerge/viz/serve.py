@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -11,12 +12,15 @@ from urllib.parse import quote, unquote, urlsplit
 from topomerge.errors import InputError
 
 HOME = "127.0.0.1"
+ATLAS_REPORT = "report.html"
+ATLAS_PAGES = re.compile(r"map_\d+(_tile_\d+)?\.html|report_stamp\.css")  # what the report of an atlas leads to, or looks for
 
 
 class _Handler(SimpleHTTPRequestHandler):
-    """Only the page: it needs nothing else, and what lies beside it is nobody's business."""
+    """Only the page, and of an atlas those that it leads to: what else lies beside it is nobody's business."""
 
     page: Path
+    asked: Path
 
     def send_head(self) -> Any:
         host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
@@ -30,13 +34,15 @@ class _Handler(SimpleHTTPRequestHandler):
             self.send_header("Content-Length", "0")
             self.end_headers()
             return None
-        if wanted != f"/{self.page.name}":
+        name = wanted.removeprefix("/")
+        if name != self.page.name and not (ATLAS_PAGES.fullmatch(name) and self.page.name == ATLAS_REPORT):
             self.send_error(404)
             return None
+        self.asked = self.page.with_name(name)
         return super().send_head()
 
     def translate_path(self, path: str) -> str:
-        return str(self.page)
+        return str(self.asked)
 
     def log_message(self, format: str, *args: Any) -> None:
         pass

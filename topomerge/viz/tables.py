@@ -54,8 +54,8 @@ def share_bar(share: float) -> Markup:
     return join([bar, f"{100 * full:.0f} %"])
 
 
-def rooms_table(map: TopometricMap, key: str = "") -> Markup:
-    """All rooms; rows carry `data-room` and `data-storey`."""
+def rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | None = None) -> Markup:
+    """All rooms, or some of them; rows carry `data-room` and `data-storey`."""
     names = ("room", "storey", "area m²", "height m", "seen", "entered", "confidence", "doors")
     columns = [*((name, "number") for name in names), ("leads to", "text")]
     several_storeys = len(map.storeys) > 1
@@ -63,7 +63,9 @@ def rooms_table(map: TopometricMap, key: str = "") -> Markup:
     colours = room_colours(map)
     doors = np.bincount(map.edges["rooms"].ravel(), minlength=len(map.rooms))
     rows = []
-    for i, (room, beside) in enumerate(zip(map.rooms, _neighbours(map), strict=True)):
+    neighbours = _neighbours(map)
+    for i in range(len(map.rooms)) if only is None else only:
+        room, beside = map.rooms[i], neighbours[i]
         swatch = element("span", class_="swatch glimpsed" if room["glimpsed"] else "swatch",
                          style=f"background-color:{hex_colour(colours[i])}")  # fmt: skip
         seen = share_bar(room["completeness"])

@@ -7,7 +7,8 @@
 | pairs.json | registrations made so far, by the hashes of the maps; it may be deleted |
 | map_N.tmap, merged_N.ply | the joined map of component N |
 | report.html | everything to look at; of more than four joined maps it names their pages |
-| map_N.html | the page of component N, then |
+| map_N.html | the page of component N, then, or where one of them is large |
+| map_N_tile_K.html | a part of a large joined map, with all of its cells (`tiles`) |
 | report_stamp.css | which report and pages these are: an open page of before loads itself anew |
 | watch.json | which files gave which maps (`sources`) |
 
@@ -34,7 +35,8 @@ from topomerge.fusion.atlas.memory import Memory, map_key
 from topomerge.fusion.atlas.registration_cache import PAIRS_FILE, Journal, registrations_to_json
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import AtlasSettings, Pace, Proposed, solve
-from topomerge.fusion.atlas.stored import Entry, Stored, check_folder, held_by, read_atlas
+from topomerge.fusion.atlas.stored import Entry, Stored, check_folder, files_of, held_by, read_atlas
+from topomerge.fusion.atlas.tiles import tiles
 from topomerge.fusion.atlas.workers import Workers
 from topomerge.io.listing import json_text
 from topomerge.io.maps import save_map
@@ -207,39 +209,49 @@ def _joined(atlas: AtlasResult, components: Sequence[dict[str, Any]], before: St
             continue
         component |= {"map": f"map_{n}.tmap", "ply": f"merged_{n}.ply"}
         files[n] = place / component["map"]
-        if not _copied(before, component, "made_of", ("map", "ply"), place):
+        old = _copied(before, component, "made_of", ("map", "ply"), place)
+        if old is None:
             joined = atlas.joined(n)
             save_map(joined, files[n])
             save_rooms_ply(joined, place / component["ply"])
+        count = len(tiles(joined)) if old is None else len(old.get("tiles", ()))
+        if count > 1:
+            component["tiles"] = [f"map_{n}_tile_{k}.html" for k in range(count)]
     return MapFiles(files)
 
 
 def _pages(
     atlas: AtlasResult, components: Sequence[dict[str, Any]], before: Stored, place: Path, title: str, page: Report
 ) -> dict[int, str]:
-    """Of more joined maps than one page shows, the page of each, written like the maps."""
+    """Of more joined maps than one page shows, or larger ones, the pages of each, written like the maps."""
     joined = [n for n, component in enumerate(components) if "map" in component]
-    if len(joined) <= JOINED_ON_ONE_PAGE:
+    if len(joined) <= JOINED_ON_ONE_PAGE and not any("tiles" in components[n] for n in joined):
         return {}
     for n in joined:
         components[n] |= {"page": f"map_{n}.html", "shown": shown_of(atlas, n, components[n], title)}
-        if not _copied(before, components[n], "shown", ("page",), place):
-            _write(place / components[n]["page"], page(component=n, stamp=components[n]["shown"]))
+        if _copied(before, components[n], "shown", ("page", "tiles"), place) is None:
+            stamp = components[n]["shown"]
+            _write(place / components[n]["page"], page(component=n, stamp=stamp))
+            for k, file in enumerate(components[n].get("tiles", ())):
+                _write(place / file, page(component=n, stamp=stamp, tile=k))
     return {n: components[n]["page"] for n in joined}
+
+
+def _copied(
+    before: Stored, component: Mapping[str, Any], digest: str, kinds: Sequence[str], place: Path
+) -> Mapping[str, Any] | None:
+    """Take files over from the atlas before, where it has a component with the same digest: that component."""
+    old: Mapping[str, Any]
+    for old in (before.listing or {}).get("components", []):
+        files = list(zip(files_of(old, kinds), files_of(component, kinds), strict=False))
+        if files and old.get(digest) == component[digest] and all((before.folder / was).is_file() for was, _ in files):
+            for was, now in files:
+                link_or_copy(before.folder / was, place / now)
+            return old
+    return None
 
 
 def _stamps(stamp: str, components: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
     """By what each page is told: name, stamp."""
     yield "stamp", stamp
     yield from ((f"stamp-{n}", component["shown"]) for n, component in enumerate(components) if "shown" in component)
-
-
-def _copied(before: Stored, component: Mapping[str, Any], digest: str, kinds: Sequence[str], place: Path) -> bool:
-    """Take files over from the atlas before, where it has a component with the same digest."""
-    for old in (before.listing or {}).get("components", []):
-        there = all((before.folder / old.get(kind, "?")).is_file() for kind in kinds)
-        if there and old.get(digest) == component[digest]:
-            for kind in kinds:
-                link_or_copy(before.folder / old[kind], place / component[kind])
-            return True
-    return False

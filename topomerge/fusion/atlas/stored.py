@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -57,8 +57,8 @@ class Stored:
 
     def files(self) -> list[str]:
         """All that belongs to the atlas but atlas.json."""
-        joined = [c[kind] for c in (self.listing or {}).get("components", []) for kind in ("map", "ply", "page") if kind in c]
-        return [e.file for e in self.entries] + joined
+        kinds, components = ("map", "ply", "page", "tiles"), (self.listing or {}).get("components", [])
+        return [e.file for e in self.entries] + [name for component in components for name in files_of(component, kinds)]
 
     def named(self, key: str) -> str | None:
         """The name of the map with this content, None if there is none."""
@@ -161,6 +161,12 @@ def read_finished(folder: Path) -> Stored:
 def _entry(listed: Mapping[str, Any]) -> Entry:
     frame = similarity(np.array(listed["frame"], np.float64)) if "frame" in listed else Sim3()
     return Entry(listed["name"], listed["key"], listed["source"], int(listed["rooms"]), int(listed["storeys"]), frame)
+
+
+def files_of(component: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
+    """The files of some kinds that a component of the listing names."""
+    named = [component[kind] for kind in kinds if kind in component]
+    return [name for one in named for name in ([one] if isinstance(one, str) else one)]
 
 
 def check_folder(folder: str | Path) -> Stored:
