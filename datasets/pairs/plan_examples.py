@@ -46,7 +46,7 @@ class PlanRecipe:
         split: train, validation or test: of which real plans, and in which range the seeds lie.
         scans: how many; seed: of the first one, from the beginning of the split's range on.
         folder: of the real data; empty: procedural buildings only.
-        flat: slices and grid maps, where walls are learned from.
+        flat: slices and grid maps, where walls are learned from; sparse: share of the scans that lose most of their points, there.
     """
 
     name: str = "plan_scans"
@@ -55,6 +55,7 @@ class PlanRecipe:
     seed: int = 100_000
     folder: str = ""
     flat: bool = False
+    sparse: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +89,8 @@ def check_plans(recipe: PlanRecipe) -> None:
     first, last = splits.seeds(recipe.split)
     if recipe.scans < 1:
         raise InputError(f"data.scans must be 1 or more, not {recipe.scans}")
+    if not 0 <= recipe.sparse <= 1:
+        raise InputError(f"data.sparse must be 0 to 1, not {recipe.sparse}")
     if not 0 <= recipe.seed <= last - first - recipe.scans:
         raise InputError(f"data.seed must be 0 to {last - first - recipe.scans} in split {recipe.split}, not {recipe.seed}")
 

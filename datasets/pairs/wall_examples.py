@@ -23,6 +23,8 @@ from topomerge.datasets.buildings.profiles import BUILDING_KINDS
 from topomerge.datasets.core.builder import Report, Row, Say, Sharing, make_item
 from topomerge.datasets.core.building import SURFACES, Building
 from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.pairs.degrade import taken
+from topomerge.datasets.pairs.flat import keys, squares
 from topomerge.datasets.pairs.items import digest
 from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanRecipe, build_scans
 from topomerge.datasets.pairs.plan_truth import drawn_map
@@ -62,6 +64,8 @@ COARSE_SHARE = 0.15  # of the scans that are seen in the cells of the map
 DRAWN_EVERY = 8  # seeds: one is a grid map of the plan, as robots and draughtsmen make them
 EXACT_SHARE = 0.5  # of the scans without drift
 SLICE_SHARE, POSED_SHARE = 0.6, 0.6  # of flat maps by a 2D laser, and of these with the sensor's places
+LOST_BY_CHANCE, SHARE_LEFT = 0.5, (0.03, 0.3)
+SPACING_LEFT = (0.05, 0.2)  # m
 DEEP = 0.3  # m beside a wall's middle: a strip there is of that wall
 ASKEW = 0.26  # sine of the angle between a wall and a strip along it
 SAME_FLOOR = 0.6  # m between floors of one storey
@@ -73,9 +77,10 @@ NO_WALLS = Elevations(np.zeros(0, FACE_DTYPE), np.zeros(1, np.int64), np.zeros((
 
 @dataclass(frozen=True)
 class WallItem(PlanItem):
-    """As of plans: everything that the bytes of one file depend on; and is it a slice or a grid map?"""
+    """As of plans: everything that the bytes of one file depend on; is it a slice or a grid map, does it lose most of its points?"""
 
     flat: bool = False
+    sparse: bool = False
 
     @property
     def name(self) -> str:
@@ -117,18 +122,19 @@ class WallExample:
 
 def build_walls(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
     """The files of a set, made where they are missing, in the order of the seeds."""
-    return build_scans(recipe, "walls", partial(draw_wall_item, flat=recipe.flat), make_wall_file, sharing, say)
+    return build_scans(recipe, "walls", partial(draw_wall_item, recipe=recipe), make_wall_file, sharing, say)
 
 
-def draw_wall_item(seed: int, plans: Plans, flat: bool) -> WallItem:
+def draw_wall_item(seed: int, plans: Plans, recipe: PlanRecipe) -> WallItem:
     """The item of a seed; `make_walls` draws the same numbers again."""
     rng = np.random.default_rng([seed, 7])
+    kind = recipe.flat, bool(np.random.default_rng([seed, 9]).random() < recipe.sparse)
     source = str(rng.choice(list(SOURCE_SHARES), p=list(SOURCE_SHARES.values())))
     entries = plans.get(source, ())
     if not entries:
-        return WallItem(seed, "procedural", 0, "", "", flat)
+        return WallItem(seed, "procedural", 0, "", "", *kind)
     name, plan = entries[int(rng.integers(len(entries)))]
-    return WallItem(seed, source, len(entries), name, digest((plan,)), flat)
+    return WallItem(seed, source, len(entries), name, digest((plan,)), *kind)
 
 
 def make_wall_file(item: WallItem, plan: Plan | None, folder: str) -> Row:
@@ -184,7 +190,7 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     visited = part(building, int(rng.integers(*ROOMS_VISITED)), rng)
     name, cloud, shift = _flat(building, visited, seed, rng) if item.flat else _seen(building, visited, seed, rng)
     frame = Sim3(float(rng.uniform(-np.pi, np.pi)))
-    cloud = replace(moved(cloud, frame), rooms=())
+    cloud = replace(moved(thinned(cloud, seed) if item.sparse else cloud, frame), rooms=())
     scan, _, floor, map = rooms_and_passages(cloud, MAP_CELL, PRESETS["default"], Stopwatch())
     cells = scan.grid if rng.random() < COARSE_SHARE else voxelise(cloud, FINE_CELL)
     walls = NO_WALLS if item.flat else wall_elevations(map, cells)
@@ -219,6 +225,15 @@ def _seen(building: Building, visited: Array, seed: int, rng: np.random.Generato
         return sensor.name, cloud, None
     straight = scan(building, exact_sensor(sensor), visited, np.random.default_rng(seed), budget=8)
     return sensor.name, cloud, drift_between(cloud, straight)
+
+
+def thinned(cloud: PointCloud, seed: int) -> PointCloud:
+    """A cloud that lost most of its points: by chance, or one stays in a cell of a grid, as files are made smaller."""
+    rng = np.random.default_rng([seed, 10])
+    if rng.random() < LOST_BY_CHANCE:
+        return taken(cloud, rng.random(len(cloud)) < np.exp(rng.uniform(*np.log(SHARE_LEFT))))
+    cells = keys(squares(cloud.points, float(rng.uniform(*SPACING_LEFT))))[0]
+    return taken(cloud, np.sort(np.unique(cells, return_index=True)[1]))
 
 
 def true_classes(building: Building, walls: Elevations, frame: Sim3, shift: tuple[Array, Array] | None) -> Array:

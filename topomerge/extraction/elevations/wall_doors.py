@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
 from topomerge.extraction.elevations.doorways import STOOD, door_places, doorways
-from topomerge.extraction.elevations.elevation import ALONG, BEFORE, BEHIND, Elevations
+from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.io.weight_files import read_weights_json
 from topomerge.numpy_nn import sigmoid
@@ -35,6 +35,7 @@ WALL_DOOR_FEATURES = (
     "complete",  # of the less complete of the two rooms
     "apart",  # m between where plan and wall show it
     "wide",  # 0 or 1: an opening
+    "fill",  # logarithm of the share of the walls' elements that hold points: what sparse scans show is less sure
     *PLAN_SIGNS,
 )
 SOURCES = ("both", "plan", "wall", "flat")  # what shows a door, flat: the plan of a map without walls; there is a model for each
@@ -42,6 +43,7 @@ WALL_DOOR_REACH = 1.0  # m between a door of the plan and the same one on the wa
 BEYOND = (0.1, 1.0)  # m from a wall: there the other room begins
 NEAR = 0.3  # m around a door of the plan
 SUREST = 0.0005  # probability: what walls show is not taken for surer
+LEAST_FILL = 0.01  # share of the elements
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class DoorCandidates:
 
     Args:
         edges: (n,) EDGE_DTYPE.
-        features: (n, 15) `WALL_DOOR_FEATURES`.
+        features: (n, 16) `WALL_DOOR_FEATURES`.
         source: (n,) int8, index into `SOURCES`.
     """
 
@@ -133,7 +135,8 @@ def door_candidates(
             features.append([*_seen(way), 0, 0, 1, *_size(way["width"], complete, 0)])
             source.append(SOURCES.index("wall"))
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
-    return _candidates(table, features, storeys, np.array(source, np.int8))
+    fill = float(np.log(LEAST_FILL + (walls.strips[..., :BANDS] > 0).mean()))
+    return _candidates(table, features, fill, storeys, np.array(source, np.int8))
 
 
 def _only_ways(candidates: DoorCandidates, chance: Array, rooms: int) -> Array:
@@ -153,14 +156,15 @@ def _flat_candidates(map: TopometricMap, storeys: Sequence[ClassifiedStorey], ed
     complete = map.rooms["completeness"][edges["rooms"]].min(axis=1).tolist()
     sizes = [_size(width, c, 0) for width, c in zip(edges["width"], complete, strict=True)]
     features = [[0, 0, 0, 0, float(e["confidence"]), 0, 0, *size] for e, size in zip(edges, sizes, strict=True)]
-    return _candidates(edges, features, storeys, np.full(len(edges), SOURCES.index("flat"), np.int8))
+    return _candidates(edges, features, 0.0, storeys, np.full(len(edges), SOURCES.index("flat"), np.int8))
 
 
 def _candidates(
-    edges: Array, features: Sequence[Sequence[float]], storeys: Sequence[ClassifiedStorey], source: Array
+    edges: Array, features: Sequence[Sequence[float]], fill: float, storeys: Sequence[ClassifiedStorey], source: Array
 ) -> DoorCandidates:
     """With the signs of the plan beside what was measured; where walls alone show a door the plan is not asked."""
-    measured = np.array(features, float).reshape(len(edges), len(WALL_DOOR_FEATURES) - len(PLAN_SIGNS))
+    measured = np.array(features, float).reshape(len(edges), len(WALL_DOOR_FEATURES) - len(PLAN_SIGNS) - 1)
+    measured = np.column_stack([measured, np.full(len(edges), fill)])
     signs = np.where(source[:, None] == SOURCES.index("wall"), 0.0, plan_signs(storeys, edges["centre"]))
     return DoorCandidates(edges, np.hstack([measured, signs]), source)
 
@@ -171,7 +175,7 @@ def _seen(way: Array) -> list[float]:
 
 
 def _size(width: float, complete: float, apart: float) -> tuple[float, ...]:
-    """The last four of `WALL_DOOR_FEATURES` before the signs of the plan."""
+    """The four of `WALL_DOOR_FEATURES` before the last ones, which are not of a door alone."""
     odd = abs(float(np.log(max(float(width), 0.1) / 0.9)))
     return odd, complete, apart, float(width > DOOR_MOST_WIDTH)
 
