@@ -77,7 +77,7 @@ NO_WALLS = Elevations(np.zeros(0, FACE_DTYPE), np.zeros(1, np.int64), np.zeros((
 
 @dataclass(frozen=True)
 class WallItem(PlanItem):
-    """As of plans: everything that the bytes of one file depend on; is it a slice or a grid map, does it lose most of its points?"""
+    """As of plans: all that the bytes of one file depend on; is it a slice or a grid map, does it lose most of its points?"""
 
     flat: bool = False
     sparse: bool = False
