@@ -40,6 +40,15 @@ def test_once(run: Run, scans: Path) -> None:
     assert json.loads((Path("site") / "watch.json").read_text())["format"] == 1
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no line breaks in names there")
+def test_a_name_with_a_line_break_is_printed_in_one_line(run: Run, scans: Path) -> None:
+    (scans / "1.tmap").rename(scans / "li\nne.tmap")
+    _, out, _ = run("watch", "scans", "-o", "site", "--once", *QUICK)
+    assert len(out.splitlines()) == 3 and "li ne.tmap -> li_ne: " in out
+    _, out, _ = run("atlas", "list", "site")
+    assert len(out.splitlines()) == 4 and out.splitlines()[-1].endswith("li ne.tmap")
+
+
 def test_other_options_are_another_reading(run: Run, scans: Path) -> None:
     run("watch", "scans", "-o", "site", "--once", *QUICK)
     status, out, _ = run("watch", "scans", "-o", "site", "--once", "--sensor", "tls", *QUICK)

@@ -187,3 +187,12 @@ def test_e57_library_that_dies_hangs_or_eats_memory(
     with pytest.raises(InputError, match=says) as caught:
         read_points(samples["cloud.e57"])
     assert "cloud.e57: " in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_cut_ply_tells_how_many_rows_it_holds(tmp_path: Path) -> None:
+    path = tmp_path / "cut.ply"
+    names = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex 1000\n{names}end_header\n"
+    path.write_bytes(head.encode() + bytes(12 * 30 + 5))
+    with pytest.raises(InputError, match="holds 30 of the 1,000 rows of vertex"):
+        read_points(path)

@@ -117,7 +117,7 @@ def _table(listing: Mapping[str, Any]) -> str:
     joined_in = {k: n for n, c in enumerate(listing["components"]) for k in c["maps"] if len(c["maps"]) > 1}
     for k, m in enumerate(listing["maps"]):
         place = f"map_{joined_in[k]}.tmap" if k in joined_in else "apart"
-        rows.append((str(m["name"]), str(m["rooms"]), str(m["storeys"]), place, str(m["source"])))
+        rows.append((str(m["name"]), str(m["rooms"]), str(m["storeys"]), place, " ".join(str(m["source"]).splitlines())))
     widths = [max(len(row[c]) for row in rows) for c in range(4)]
     lines = ["  ".join([*(text.ljust(w) for text, w in zip(row, widths, strict=False)), row[-1]]).rstrip() for row in rows]
     return "\n".join([str(listing["reason"]), *lines])

@@ -42,7 +42,7 @@ def watch_command(args: argparse.Namespace) -> int:
         if is_warning:
             warn([line])
         elif not args.quiet:
-            say(line)
+            say(" ".join(line.splitlines()))  # names of files may hold line breaks
             sys.stdout.flush()
 
     log = _rerun_log(args)

@@ -73,7 +73,9 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     size = path.stat().st_size
     for element in header.elements:
         if element.count * element.shortest() > size - header.start:
-            raise cut_short(path, 0, element.count, f"rows of {element.name}")
+            counted = header.order and element is header.elements[0] and element.fixed  # others begin or end nobody knows where
+            have = (size - header.start) // max(element.dtype(header.order).itemsize, 1) if counted else 0
+            raise cut_short(path, have, element.count, f"rows of {element.name}")
     before = header.elements[: header.elements.index(vertex)]
     if (face is not None and face.count) or not all(e.fixed for e in (*before, vertex)):
         yield from _read_whole(path, options)
