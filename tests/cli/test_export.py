@@ -12,6 +12,7 @@ import urllib.error
 import urllib.request
 import webbrowser
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -41,6 +42,18 @@ def run(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.
 
 def names(folder: str) -> list[str]:
     return sorted(p.name for p in Path(folder).iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no line breaks in names there")
+def test_names_with_line_breaks_are_printed_in_one_line(run: Run) -> None:
+    status, out, _ = run("export", "a.tmap", "--to", "graphml", "-o", "li\nne.graphml")
+    assert (status, out) == (0, "6 rooms, 5 doors and stairs -> li ne.graphml\n") and Path("li\nne.graphml").exists()
+    status, out, _ = run("embed", "a.tmap", "--descriptor", "engineered", "-o", "ro\nws.npz")
+    assert status == 0 and out.endswith(" -> ro ws.npz\n") and out.count("\n") == 1
+    whole = run("info", "a.tmap")[1]
+    topomerge.save_map(replace(topomerge.load_map("a.tmap"), source="sc\nan.ply"), "b.tmap")
+    status, out, _ = run("info", "b.tmap")
+    assert status == 0 and out.startswith("sc an.ply: ") and out.count("\n") == whole.count("\n")
 
 
 def test_one_format_is_a_file_or_goes_into_a_folder(run: Run) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, say, warn
+from topomerge.cli.console import check_inputs, say, say_line, warn
 from topomerge.cli.options import ATLAS_OPTIONS, CLOUD_OPTIONS, atlas_choices, count, json_option, map_from, quiet
 from topomerge.errors import InputError
 
@@ -87,9 +87,9 @@ def _report(result: AtlasResult, args: argparse.Namespace) -> int:
     """Say what came out, and return the exit status."""
     warn(result.warnings)
     if not args.quiet:
-        say(f"{result.words()} -> {args.folder}")
+        say_line(f"{result.words()} -> {args.folder}")
     elif result.alone and len(result.names) > 1:
-        say(f"topomerge: {result.words()}", sys.stderr)
+        say_line(f"topomerge: {result.words()}", sys.stderr)
     return 2 if result.status == "abstained" else 0
 
 

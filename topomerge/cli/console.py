@@ -84,6 +84,11 @@ def say(text: str, stream: TextIO | None = None) -> None:
     print(printable(text), file=stream)
 
 
+def say_line(text: str, stream: TextIO | None = None) -> None:
+    """Print one line, though names of files may hold line breaks; to stdout by default."""
+    say(" ".join(text.splitlines()), stream)
+
+
 def warn(messages: Iterable[str]) -> None:
     """Print warnings to stderr, one line each."""
     for message in messages:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_outputs, write_all
+from topomerge.cli.console import check_outputs, say_line, write_all
 from topomerge.cli.options import CLOUD_OPTIONS, CONTEXT_STEPS, DESCRIPTOR, map_from, output, quiet
 
 
@@ -26,7 +26,7 @@ def embed_command(args: argparse.Namespace) -> int:
 
     write_all([(args.output, save)])
     if not args.quiet:
-        print(f"{len(rows)} rooms, {' x '.join(map(str, rows.shape[1:]))} numbers each -> {args.output}")
+        say_line(f"{len(rows)} rooms, {' x '.join(map(str, rows.shape[1:]))} numbers each -> {args.output}")
     return 0
 
 

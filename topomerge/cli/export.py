@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, check_outputs, output_folder, warn, write_all
+from topomerge.cli.console import check_inputs, check_outputs, output_folder, say_line, warn, write_all
 from topomerge.cli.options import count, given, quiet
 from topomerge.errors import InputError
 
@@ -28,7 +28,8 @@ def export_command(args: argparse.Namespace) -> int:
         check_outputs([file for file, _ in files], [source])
         write_all(files)
     if not args.quiet:
-        print(f"{len(topomap.rooms)} rooms, {len(topomap.edges)} doors and stairs -> {' '.join(str(file) for file, _ in files)}")
+        written = " ".join(str(file) for file, _ in files)
+        say_line(f"{len(topomap.rooms)} rooms, {len(topomap.edges)} doors and stairs -> {written}")
     return 0
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import output_folder
+from topomerge.cli.console import output_folder, say_line
 from topomerge.cli.options import output, quiet
 from topomerge.errors import InputError
 
@@ -25,7 +25,7 @@ def export_embedder_command(args: argparse.Namespace) -> int:
             save_onnx(network, folder / "embedder.onnx")
     if not args.quiet:
         count = sum(p.numel() for p in network.parameters())
-        print(f"{count} weights, {network.network.size} numbers a room -> {folder}")
+        say_line(f"{count} weights, {network.network.size} numbers a room -> {folder}")
     return 0
 
 

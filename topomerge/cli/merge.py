@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import topomerge
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, check_outputs, output_folder, say, warn
+from topomerge.cli.console import check_inputs, check_outputs, output_folder, say_line, warn
 from topomerge.cli.merge_points import point_files, points_written, with_points
 from topomerge.cli.options import BELIEF_OPTIONS, CLOUD_OPTIONS, DESCRIPTOR, belief_choices, given, map_from, output, quiet
 from topomerge.errors import InputError
@@ -54,9 +54,9 @@ def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) ->
     if not args.quiet:
         joined = f"; {len(result.matches)} matches, {len(result.map.rooms)} rooms in all" if result.map else ""
         joined = "; no points are written" if args.points and not result.placements else joined
-        say(f"{result.reason}{joined} -> {folder}")
+        say_line(f"{result.reason}{joined} -> {folder}")
     elif not result.merged:
-        say(f"topomerge: {result.reason}", sys.stderr)
+        say_line(f"topomerge: {result.reason}", sys.stderr)
     return 0 if result.merged else 2
 
 

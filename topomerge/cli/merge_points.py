@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from topomerge.cli.console import Bars, say, warn
+from topomerge.cli.console import Bars, say_line, warn
 from topomerge.cli.options import given
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def _write(result: MergeResult, k: int, path: Path, args: argparse.Namespace) ->
     if done.beyond:
         warn([f"{args.inputs[k]}: {done.beyond:,} points are too far from all others for LAS and are left out"])
     if not args.quiet:
-        say(f"{done.written:,} points of {args.inputs[k]} -> {path.name}")
+        say_line(f"{done.written:,} points of {args.inputs[k]} -> {path.name}")
 
 
 def _middle(result: MergeResult, k: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_outputs, output_folder, write_all
+from topomerge.cli.console import check_outputs, output_folder, say_line, write_all
 from topomerge.cli.options import count, given, output, quiet
 
 
@@ -22,7 +22,7 @@ def simulate_command(args: argparse.Namespace) -> int:
         files = outputs(building, sessions, frame, folder)
         write_all(files)
     if not args.quiet:
-        print(f"{building.name}: {len(building.rooms)} rooms -> {' '.join(str(path) for path, _ in files)}")
+        say_line(f"{building.name}: {len(building.rooms)} rooms -> {' '.join(str(path) for path, _ in files)}")
     return 0
 
 

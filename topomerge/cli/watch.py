@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_outputs, failure_line, say, signal_behind, warn
+from topomerge.cli.console import check_outputs, failure_line, say, say_line, signal_behind, warn
 from topomerge.cli.options import (
     ATLAS_OPTIONS,
     CLOUD_OPTIONS,
@@ -42,7 +42,7 @@ def watch_command(args: argparse.Namespace) -> int:
         if is_warning:
             warn([line])
         elif not args.quiet:
-            say(" ".join(line.splitlines()))  # names of files may hold line breaks
+            say_line(line)
             sys.stdout.flush()
 
     log = _rerun_log(args)

@@ -187,9 +187,10 @@ def map_to_text(map: TopometricMap) -> str:
     counts += [_plural(len(map.windows), "window")] if len(map.windows) else []
     steps = [(f"{s:.2f}", step) for step, s in map.seconds.items()]
     steps.append((f"{sum(map.seconds.values()):.2f}", "all"))
+    source = " ".join((map.source or "map").splitlines())  # names of files may hold line breaks
     return "\n".join(
         (
-            f"{map.source or 'map'}: {', '.join(counts)}; {_plural(len(map.grid), 'cell')} of {map.grid.edge:g} m",
+            f"{source}: {', '.join(counts)}; {_plural(len(map.grid), 'cell')} of {map.grid.edge:g} m",
             "",
             *_columns(("room", "storey", "area m²", "height m", "cells", "doors", "leads to"), _room_rows(map)),
             "",
