@@ -17,7 +17,7 @@ import pytest
 from tests.training import tiny
 from topomerge.embedding.engineered import scaled
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.wall_doors import DoorCandidates, door_chance
+from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, DoorCandidates, door_chance
 from topomerge.extraction.elevations.wall_network import place_probabilities
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
@@ -95,7 +95,7 @@ def read(task: str) -> Any:
         "place_evidence": lambda: place_weights()["a.w"],
         "room_matcher": lambda: matcher_weights()["rows.w"],
         "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
-        "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(4, EDGE_DTYPE), np.ones((4, 15)), np.arange(4))),
+        "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(4, EDGE_DTYPE), np.ones((4, len(WALL_DOOR_FEATURES))), np.arange(4))),
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "room_odds": lambda: np.array(room_weights()["entered"]),
         "match_odds": lambda: odds_weights("match"),
