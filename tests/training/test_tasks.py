@@ -88,14 +88,14 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def read(task: str) -> Any:
     """What the product does with a task's file."""
-    plan = tiny.two_rooms(0).plan
+    plan, signs = tiny.two_rooms(0).plan, np.ones((4, len(WALL_DOOR_FEATURES)))
     return {
         "plan_segmentation": lambda: column_probabilities(plan),
         "door_classification": lambda: door_probability(np.zeros((3, 17))),
         "place_evidence": lambda: place_weights()["a.w"],
         "room_matcher": lambda: matcher_weights()["rows.w"],
         "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
-        "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(4, EDGE_DTYPE), np.ones((4, len(WALL_DOOR_FEATURES))), np.arange(4))),
+        "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(4, EDGE_DTYPE), signs, np.arange(4))),
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "room_odds": lambda: np.array(room_weights()["entered"]),
         "match_odds": lambda: odds_weights("match"),
