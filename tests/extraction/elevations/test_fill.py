@@ -26,3 +26,10 @@ def test_the_share_of_elements_with_points_is_heard(share: float):
 def test_a_map_without_walls_says_nothing_of_it():
     map = two_doors(0)[0]
     assert (door_candidates(map, (), None, None).features[:, FILL] == 0).all()
+
+
+def test_rooms_without_a_wall_are_as_empty_as_walls_without_points():
+    map, faces, strips, _, _ = two_doors(0)
+    walls = Elevations(faces[:0], np.zeros(1, np.int64), strips[:0].astype(np.float32))
+    candidates = door_candidates(map, (), walls, np.zeros((0, 4)))
+    assert len(candidates.edges) and candidates.features[:, FILL] == pytest.approx(np.log(LEAST_FILL))

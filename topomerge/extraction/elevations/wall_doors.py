@@ -135,7 +135,8 @@ def door_candidates(
             features.append([*_seen(way), 0, 0, 1, *_size(way["width"], complete, 0)])
             source.append(SOURCES.index("wall"))
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
-    fill = float(np.log(LEAST_FILL + (walls.strips[..., :BANDS] > 0).mean()))
+    seen = walls.strips[..., :BANDS] > 0
+    fill = float(np.log(LEAST_FILL + (seen.mean() if seen.size else 0.0)))
     return _candidates(table, features, fill, storeys, np.array(source, np.int8))
 
 
