@@ -151,6 +151,8 @@ def _one(rows: Array, out: Array) -> Array:
     for name in ("sill", "head"):
         seen = rows[name][np.isfinite(rows[name])]
         window[name] = seen.mean() if len(seen) else np.nan
+    if window["head"] <= window["sill"]:  # one face shows the sill only, the other one a head below it
+        window["sill"], window["head"] = rows[0]["sill"], rows[0]["head"]
     return window
 
 

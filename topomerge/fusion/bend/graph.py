@@ -115,14 +115,15 @@ def settle(anchors: Array, joints: Joints, measured: Measurements, prior: Array)
     held = jointed.T @ jointed + sparse.diags(1 / np.maximum(prior.ravel()[free], 1e-9) ** 2)
     rows = _measured_rows(anchors, measured)[:, free]
     roots = _roots(measured.information)
-    whitened = sparse.block_diag(list(roots), format="csr") @ rows if len(rows.indptr) > 1 else rows
+    whitened = _blocks_times(roots, rows)
+    owner = np.repeat(np.arange(len(measured.piece)), np.diff(whitened.indptr[::3]))  # the measurement of each entry
     aims = np.einsum("mij,mj->mi", roots, measured.moves)
     weights, moves = np.ones(len(aims)), np.zeros(len(free))
     relaxed = 0.0
     for k in range(CONVEX_ROUNDS):
-        scaled = whitened.multiply(np.repeat(weights, 3)[:, None]).tocsr()
-        factor = _factor(held + scaled.T @ whitened)
-        moves = factor.solve(scaled.T @ aims.ravel())
+        scaled = _with_values(whitened, whitened.data * weights[owner]).T
+        factor = _factor(held + scaled @ whitened)
+        moves = factor.solve(scaled @ aims.ravel())
         misfit = (whitened @ moves).reshape(-1, 3) - aims
         chi = (misfit**2).sum(axis=1)
         relaxed = max(2 * chi.max(initial=0) / OUTLIER, 1.0) if k == 0 else max(relaxed / 1.6, 1.0)
@@ -169,33 +170,42 @@ def _effect(place: Array, anchors: Array) -> Array:
 
 
 def _sparse(blocks: Array, rows: Array, pieces: Array, shape: tuple[int, int]) -> sparse.csr_matrix:
-    """Blocks (m, r, 4) as a sparse matrix: block k in rows r * rows[k].. and at piece pieces[k]."""
+    """Blocks (m, r, 4) as a sparse matrix: block k in rows r * rows[k].. and at piece pieces[k]; those at one place are added."""
     _, high, wide = blocks.shape
     i = (high * rows)[:, None, None] + np.arange(high)[None, :, None] + np.zeros((1, 1, wide), int)
     j = (UNKNOWNS * pieces)[:, None, None] + np.arange(wide)[None, None, :] + np.zeros((1, high, 1), int)
     return sparse.csr_matrix((blocks.ravel(), (i.ravel(), j.ravel())), shape)
 
 
+def _blocks_times(blocks: Array, rows: sparse.csr_matrix) -> sparse.csr_matrix:
+    """Blocks (m, 3, 3) along the diagonal, times a sparse matrix of 3 m rows."""
+    many = len(blocks)
+    first = 3 * np.arange(many)[:, None, None]
+    columns = first + np.arange(3)[None, None, :] + np.zeros((1, 3, 1), int)
+    starts = 3 * np.arange(3 * many + 1)
+    return sparse.csr_matrix((blocks.ravel(), columns.ravel(), starts), (3 * many, 3 * many)) @ rows
+
+
+def _with_values(matrix: sparse.csr_matrix, values: Array) -> sparse.csr_matrix:
+    """Other values at the same places."""
+    return sparse.csr_matrix((values, matrix.indices, matrix.indptr), matrix.shape)
+
+
 def _joint_rows(anchors: Array, joints: Joints) -> sparse.csr_matrix:
     """Differences of moves at the places between pieces, in standard deviations."""
     many = len(joints.pieces)
     middle = anchors[joints.pieces].mean(axis=1).reshape(-1, 2)
-    shape = (4 * many, UNKNOWNS * len(anchors))
-    out = sparse.csr_matrix(shape)
-    for side, sign in ((0, 1.0), (1, -1.0)):
-        ends = joints.pieces[:, side]
-        blocks = sign * _effect(middle, anchors[ends]) / joints.sigma[:, :, None]
-        out = out + _sparse(blocks, np.arange(many), ends, shape)
-    return out
+    ends = joints.pieces.T.ravel()
+    signs = np.repeat([1.0, -1.0], many)[:, None, None]
+    blocks = signs * _effect(np.tile(middle, (2, 1)), anchors[ends]) / np.tile(joints.sigma, (2, 1))[:, :, None]
+    return _sparse(blocks, np.tile(np.arange(many), 2), ends, (UNKNOWNS * many, UNKNOWNS * len(anchors)))
 
 
 def _measured_rows(anchors: Array, measured: Measurements) -> sparse.csr_matrix:
     """Shift and turn of the measured pieces against the others."""
-    many = len(measured.piece)
-    shape = (3 * many, UNKNOWNS * len(anchors))
-    out = _sparse(_effect(measured.places, anchors[measured.piece])[:, :3], np.arange(many), measured.piece, shape)
-    for k in range(measured.others.shape[1] if many else 0):
-        others = measured.others[:, k]
-        blocks = measured.shares[:, k, None, None] * _effect(measured.places, anchors[others])[:, :3]
-        out = out - _sparse(blocks, np.arange(many), others, shape)
-    return out
+    many, count = measured.others.shape
+    pieces = np.concatenate([measured.piece, measured.others.T.ravel()])
+    shares = np.concatenate([np.ones(many), -measured.shares.T.ravel()])
+    places = np.tile(measured.places, (1 + count, 1))
+    blocks = shares[:, None, None] * _effect(places, anchors[pieces])[:, :3]
+    return _sparse(blocks, np.tile(np.arange(many), 1 + count), pieces, (3 * many, UNKNOWNS * len(anchors)))
