@@ -24,7 +24,6 @@ from topomerge.embedding.turns import Rows
 from topomerge.evaluation.tables import write_section
 from topomerge.fusion.atlas.find import SHORTLIST, ranked, shortlist
 from topomerge.fusion.atlas.neighbours import most_alike, nearest, owners, queries, vectors, votes
-from topomerge.fusion.atlas.partners import MOST_PARTNERS
 from topomerge.statistics import interval_text
 
 FIRST = (1, 5, 10)
@@ -86,7 +85,7 @@ def searches(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]],
 
 def partners_named(pairs: Sequence[tuple[Rows, Rows]]) -> float:
     """Share of pairs of which one map names the other, in an atlas of all of them."""
-    named = list(most_alike([a for a, _ in pairs] + [b for _, b in pairs], MOST_PARTNERS))
+    named = list(most_alike([a for a, _ in pairs] + [b for _, b in pairs], FIRST[-1]))
     return float(np.mean([k + len(pairs) in named[k] or k in named[k + len(pairs)] for k in range(len(pairs))]))
 
 
@@ -97,7 +96,7 @@ def partners_text(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Ro
     draws = [rng.permutation(len(common))[:PARTNER_PAIRS] for _ in range(PARTNER_DRAWS)]
     few = np.mean([partners_named([common[k] for k in draw]) for draw in draws])
     said = (
-        f"Pairs of which one map names the other among its {MOST_PARTNERS} most alike: {few:.2f} of {PARTNER_PAIRS} pairs in an"
+        f"Pairs of which one map names the other among its {FIRST[-1]} most alike: {few:.2f} of {PARTNER_PAIRS} pairs in an"
     )
     all_of_them = f"{partners_named(common):.2f} of {len(common)} in one of {2 * len(common)}"
     return f"{said} atlas of {2 * PARTNER_PAIRS} maps ({PARTNER_DRAWS} draws), {all_of_them}."

@@ -12,7 +12,7 @@ import pytest
 import topomerge
 from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
 from topomerge.cli.main import main as cli
-from topomerge.fusion.atlas.registration_cache import read_registrations
+from topomerge.fusion.atlas.registration_cache import Journal
 from topomerge.fusion.atlas.solve import solve
 from topomerge.fusion.atlas.stored import read_atlas
 
@@ -80,7 +80,7 @@ def test_strange_registrations_are_made_anew(run: Run, folder: Path, strange: ob
     before = path.read_text()
 
     def registrations() -> object:
-        return read_registrations(folder / "house", read_atlas(folder / "house").settings)
+        return Journal(folder / "house", read_atlas(folder / "house").settings)
 
     stored = json.loads(before)
     assert len(registrations()) == len(stored["pairs"]) > 0
@@ -122,7 +122,7 @@ def test_what_is_stated_of_the_maps_is_heard_and_stays(run: Run, folder: Path) -
 
 
 def test_three_maps_are_merged(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = read_registrations(folder / "house", read_atlas(folder / "house").settings)  # of the same maps
+    made = Journal(folder / "house", read_atlas(folder / "house").settings)  # of the same maps
     monkeypatch.setattr("topomerge.fusion.merge.solve", lambda maps, settings, _: solve(maps, settings, made))
     status, out, err = run("merge", "west.tmap", "east.tmap", "stranger.tmap", "-o", "merged")
     assert status == 0 and "west.tmap, east.tmap" in out and "stranger.tmap stands apart" in out and err == ""

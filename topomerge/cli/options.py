@@ -114,7 +114,7 @@ BELIEF_OPTIONS = (
         "--risk", type=above_zero, metavar="N", help="false merges in a thousand pairs that you accept; the threshold follows"
     ),
     option(
-        "--threshold", type=share, metavar="P", help="probability from which to believe (default 0.65, links of an atlas 0.8)"
+        "--threshold", type=share, metavar="P", help="probability from which to believe (default 0.65; of an atlas 0.8 or 0.9)"
     ),
 )
 ATLAS_OPTIONS = (

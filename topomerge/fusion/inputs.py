@@ -14,7 +14,8 @@ from topomerge.types import TopometricMap
 
 MERGE_SCALES = ("fixed", "free")
 POSE_SOURCES = ("search", "rooms")
-LINK_BELIEVED = 0.8
+FEW_MAPS = 11  # of which each is registered with all others
+LINK_BELIEVED = (0.8, 0.9)  # of few maps; of more, where those that look most alike are sought out among many strangers
 UNIT_SPAN = 300.0  # m, and
 UNIT_RATIO = 30.0  # times the other map: a map that spans this is in another unit
 UNIT_RATIO_MM = 300.0  # times the other map: in millimetres rather than centimetres
@@ -39,14 +40,18 @@ def checked_threshold(threshold: float | None) -> float:
     return share
 
 
-def link_threshold(threshold: float | None) -> float:
+def link_threshold(threshold: float | None, maps: int = 2) -> float:
     """The probability from which a link of an atlas is believed: at least `LINK_BELIEVED` where none is asked for, as a wrong
     link drags all that hangs on it.
+
+    Args:
+        maps: how many the atlas holds.
 
     Raises:
         InputError: not between 0 and 1.
     """
-    return max(checked_threshold(None), LINK_BELIEVED) if threshold is None else checked_threshold(threshold)
+    believed = LINK_BELIEVED[maps > FEW_MAPS]
+    return max(checked_threshold(None), believed) if threshold is None else checked_threshold(threshold)
 
 
 def risk_threshold(risk: float) -> float:

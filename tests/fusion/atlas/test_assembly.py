@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.fusion.atlas.assembly import BACKING, HEAVIEST_WALLS, Assembler, Link, across
+from topomerge.fusion.atlas.assembly import BACKING, HEAVIEST_WALLS, Assembler, Link
+from topomerge.fusion.atlas.cycles import across
 from topomerge.fusion.atlas.pairs import Check
 from topomerge.fusion.atlas.pose_graph import residual
 from topomerge.matching.poses import PoseHypothesis
@@ -163,6 +164,27 @@ def test_two_claims_of_one_weight_leave_the_map_apart():
     assembly = built(claims, count=3)
     assert sorted(map(sorted, assembly.components)) == [[0, 1], [2]]
     assert [link.maps for link in assembly.rejected] == [(0, 2), (1, 2)]
+
+
+def test_three_maps_that_agree_come_together_though_no_pair_of_them_is_believed():
+    claims = {pair: claim(*pair, 0.7) for pair in ((0, 1), (0, 2), (1, 2))}
+    assembly = built(claims, count=3)
+    assert odds(0.7) < LIMIT < odds(0.7) + BACKING
+    assert len(assembly.components) == 1 and is_right(assembly.of(0)) and len(assembly.links) == 2
+    assert all(link.log_odds == pytest.approx(odds(0.7) + BACKING) for link in assembly.links)
+    for missing in claims:
+        two = {pair: h for pair, h in claims.items() if pair != missing}
+        assert len(built(two, count=3).components) == 3
+
+
+def test_three_maps_that_go_round_to_another_place_stay_apart():
+    claims = {(0, 1): claim(0, 1, 0.7), (0, 2): claim(0, 2, 0.7), (1, 2): claim(1, 2, 0.7, WRONG)}
+    assert len(built(claims, count=3).components) == 3
+
+
+def test_a_way_round_that_nobody_believes_adds_nothing():
+    claims = {(0, 1): claim(0, 1, 0.7), (0, 2): claim(0, 2, 0.7), (1, 2): claim(1, 2, 0.01)}
+    assert len(built(claims, count=3).components) == 3
 
 
 @pytest.mark.parametrize("pair", [(1, 2), (2, 1)])

@@ -11,7 +11,7 @@ import pytest
 from tests.fusion.atlas.atlas_scenes import office_map, truth
 from topomerge.fusion.atlas import pairs
 from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.pairs import Checks, alike, hypotheses, place, promise, speaks
+from topomerge.fusion.atlas.pairs import Checks, alike, hypotheses, place, speaks
 from topomerge.fusion.registration import Registration
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
@@ -91,16 +91,6 @@ def test_hypotheses_share_the_probability_that_one_of_them_is_right(monkeypatch)
     ranked = hypotheses(maps, 0, 1, "free", "storey")
     assert [h.transform.translation[0] for h in ranked] == [0.01, 1.0, 2.0, 3.0] and ranked[0].features == {"walls": 9.0}
     assert [h.probability for h in ranked] == pytest.approx([0.6, 0.6 * np.exp(-1), 0.4, 0.6 * np.exp(-4)])
-
-
-def test_the_promise_of_a_pair_goes_with_the_area_of_the_smaller_map():
-    rows = {0: np.array([[0.0], [9.0]]), 1: np.array([[0.5], [9.0], [4.0]]), 2: np.zeros((0, 1))}
-    areas = {0: 100.0, 1: 50.0, 2: 30.0}
-    maps: Any = SimpleNamespace(rows=rows.get, area=areas.get)
-    likeness = promise(maps, 0, 1) / 50.0
-    assert 0 < likeness < 1 and promise(maps, 1, 0) == pytest.approx(50.0 * likeness) and promise(maps, 0, 2) == 15.0
-    areas[0] = 20.0
-    assert promise(maps, 0, 1) == pytest.approx(20.0 * likeness)
 
 
 def test_fine_poses_are_made_once_and_never_of_slices(monkeypatch):

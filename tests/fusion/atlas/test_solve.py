@@ -10,10 +10,10 @@ import pytest
 import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import FRAMES, NAMES, REGISTRATIONS, office_map, stranger, truth
 from topomerge.errors import InputError
+from topomerge.fusion.atlas.coarse import coarse_log_odds
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.memory import LOADED_AT_ONCE, map_key
-from topomerge.fusion.atlas.pairs import promise
-from topomerge.fusion.atlas.partners import partners_of
+from topomerge.fusion.atlas.partners import COARSE_PARTNERS, partners_of
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.pose_difference import pose_difference
 from topomerge.matching.poses import PoseHypothesis
@@ -81,13 +81,12 @@ def poisoned(maps: list[TopometricMap], registrations: dict, i: int, j: int, wro
 
 @pytest.mark.parametrize("p", [0.93, 0.997])
 def test_a_wrong_hypothesis_in_a_cycle_is_thrown_out_and_named(maps, registrations, p, monkeypatch):
-    # Which pairs are tried goes by how alike rooms look, which any training may change: the poisoned one is tried here.
-    maps, first = maps[:4], {id(maps[0]), id(maps[3])}
+    maps, first = maps[:4], {id(maps[0]), id(maps[3])}  # the poisoned pair is tried first
 
-    def ranked(inner: Maps, i: int, j: int) -> float:
-        return 1e6 if {id(inner[i]), id(inner[j])} == first else promise(inner, i, j)
+    def ranked(inner: Maps, i: int, j: int, scale: str) -> float:
+        return 1e6 if {id(inner[i]), id(inner[j])} == first else coarse_log_odds(inner, i, j, scale)
 
-    monkeypatch.setattr("topomerge.fusion.atlas.partners.promise", ranked)
+    monkeypatch.setattr("topomerge.fusion.atlas.partners.coarse_log_odds", ranked)
     result = tm.atlas(maps, registrations=poisoned(maps, registrations, 0, 3, SHIFTED, p))
     assert result.components == ((0, 1, 2, 3),) and right(result, {k: k for k in range(4)})
     assert [link.maps for link in result.rejected] == [(0, 3)] and result.rejected[0].hypothesis.probability == p
@@ -142,11 +141,12 @@ def test_files_are_read_when_needed(maps, atlas, registrations, tmp_path):
     assert all(np.allclose(result.transforms[k].matrix, atlas.transforms[k].matrix, atol=1e-9) for k in range(4))
     inner = Maps(paths)
     assert [len(inner[k].rooms) for k in range(5)] == [len(m.rooms) for m in maps] and len(inner.memory._loaded) == LOADED_AT_ONCE
-    assert promise(inner, 0, 2) > promise(inner, 0, 4)
+    assert coarse_log_odds(inner, 0, 2) > coarse_log_odds(inner, 0, 4)
 
 
 @pytest.mark.longer
 def test_of_many_maps_only_those_that_look_alike_are_registered(maps, atlas, registrations, monkeypatch):
+    monkeypatch.setattr("topomerge.fusion.atlas.partners.FEW_MAPS", 2)
     monkeypatch.setattr("topomerge.fusion.atlas.partners.MOST_PARTNERS", 2)
     made = dict(registrations)
     result = tm.atlas(maps, registrations=made)
@@ -157,10 +157,10 @@ def test_of_many_maps_only_those_that_look_alike_are_registered(maps, atlas, reg
 
 
 class Looks:
-    """Maps of which nothing is there but looks of rooms and areas."""
+    """Maps of which nothing is there but looks of rooms, areas and how likely two lie on each other."""
 
     def __init__(self, rows: list[np.ndarray]) -> None:
-        self.all = rows
+        self.all, self.laid = rows, set[tuple[int, int]]()
 
     def __len__(self) -> int:
         return len(self.all)
@@ -171,17 +171,43 @@ class Looks:
     def area(self, k: int) -> float:
         return 100.0 + 1e-6 * k
 
+    def coarse_log_odds(self, i: int, j: int, scale: str) -> float:
+        """Of maps that are 40 apart in their numbers 3; of others the less, the farther they are apart."""
+        assert scale == "fixed" and (i, j) not in self.laid and i < j
+        self.laid.add((i, j))
+        return 3.0 if j - i == 40 else -0.1 * (j - i)
 
-def test_partners_of_many_maps_are_those_that_either_names():
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch) -> Looks:
+    """80 maps; those that are 40 apart look alike, but for the last one, which has no rooms."""
+    monkeypatch.setattr("topomerge.fusion.atlas.partners.coarse_log_odds", Looks.coarse_log_odds)
     rng = np.random.default_rng(0)
     rows = [rng.normal(size=(5, 12)) for _ in range(40)]
     rows += [of + 0.1 * rng.normal(size=of.shape) for of in rows[:39]] + [np.zeros((0, 12))]
-    partners = partners_of(Looks(rows))
+    return Looks(rows)
+
+
+def test_partners_of_many_maps_are_those_on_which_they_lie_best(looks: Looks):
+    partners, complete = partners_of(looks)
+    assert complete and len(looks.laid) <= COARSE_PARTNERS * 80
     assert all(partners[k][0] == k + 40 and partners[k + 40][0] == k for k in range(39))
     assert all(k in partners[m] for k in range(80) for m in partners[k]) and all(k not in partners[k] for k in range(80))
-    assert sum(map(len, partners)) <= 2 * 10 * 80 and partners[79] == list(range(78, 68, -1))  # the largest, of one without rooms
-    few = partners_of(Looks(rows[:11]))
-    assert all(sorted(few[k]) == [m for m in range(11) if m != k] for k in range(11))
+    assert sum(map(len, partners)) <= 2 * 7 * 80
+    assert {39, 75, 76, 77, 78} <= set(partners[79])  # on which the one without rooms lies best
+    assert partners[0][1:] == sorted(partners[0][1:])
+
+
+def test_all_of_few_maps_are_partners(looks: Looks):
+    few, complete = partners_of(Looks(looks.all[:11]))
+    assert complete and all(few[k] == sorted((m for m in range(11) if m != k), key=lambda m: abs(m - k)) for k in range(11))
+    alone, (first, second) = partners_of(Looks(looks.all[:1])), partners_of(Looks(looks.all[:2]))[0]
+    assert alone == ([[]], True) and (first, second) == ([1], [0])
+
+
+def test_without_time_the_maps_that_look_alike_are_partners(looks: Looks):
+    partners, complete = partners_of(looks, [(0, 5)], end=-np.inf)
+    assert not complete and not looks.laid and all(k + 40 in partners[k] for k in range(39)) and 5 in partners[0]
 
 
 def test_strangers_stay_strangers(maps, registrations):

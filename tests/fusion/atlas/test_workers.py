@@ -70,7 +70,7 @@ def test_who_is_killed_goes_on_and_the_order_in_which_pairs_end_changes_nothing(
     with pytest.raises(KeyboardInterrupt):
         add(folder, parts(), tm.atlas_html, failing)
     journal = folder / JOURNAL_FILE
-    assert len(journal.read_text().splitlines()) == 1 and not (folder / "atlas.json").exists()
+    assert journal.read_text().count("hypotheses") == 1 and not (folder / "atlas.json").exists()
     journal.write_text(journal.read_text() + '{"stamp": "cut sh')  # as of a process that was killed while it wrote
     add(folder, parts(), tm.atlas_html, going_on)
     assert asked[1] == asked[0] - 1 and same_atlas(alone, folder)
@@ -83,7 +83,10 @@ def test_a_journal_is_heard_with_its_settings_only(tmp_path):
     Journal(tmp_path, settings)["a", "b"] = ranked
     (again,) = Journal(tmp_path, settings)["a", "b"]
     assert (again.transform, again.probability, again.features) == (ranked[0].transform, 0.7, {"walls": 3.0})
-    assert Journal(tmp_path, settings | {"same": "storey"}) == {}
+    Journal(tmp_path, settings).coarse["a", "c"] = -2.5
+    assert dict(Journal(tmp_path, settings).coarse) == {("a", "c"): -2.5} and len(Journal(tmp_path, settings)) == 1
+    other = Journal(tmp_path, settings | {"same": "storey"})
+    assert other == {} and not other.coarse
     (tmp_path / JOURNAL_FILE).write_text("no line of it\n[]\n{}\n")
     assert Journal(tmp_path, settings) == {}
     Journal(tmp_path, settings).end()

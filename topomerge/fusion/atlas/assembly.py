@@ -1,18 +1,20 @@
 """Hypotheses of pairs -> sets of maps that lie in one frame without contradiction (method 4: agreement around cycles).
 
 Links are taken in the order of their probability, as in a maximum spanning tree, but each is heard before: every two maps that it
-would bring over each other say what they think of that, its own two if they contradict it. What contradicts better evidence is
-rejected, and named. Maps that no hypothesis joins, by others or directly, say nothing to each other: each set of maps that may
-come together is assembled by itself, and only anew when more of its pairs were registered.
+would bring over each other say what they think of that, its own two if they contradict it; and a third map that lies with neither
+yet, if by way of it they lie as the link says. What contradicts better evidence is rejected, and named. Maps that no hypothesis
+joins, by others or directly, say nothing to each other: each set of maps that may come together is assembled by itself, and only
+anew when more of its pairs were registered.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from topomerge.fusion.atlas.cycles import Hypotheses, Poses, across, same_place_odds, ways_round
 from topomerge.fusion.atlas.map_sets import sets_of_maps
 from topomerge.fusion.atlas.pairs import Check, Checks, alike
 from topomerge.fusion.atlas.pose_graph import Measured, optimise
@@ -20,15 +22,11 @@ from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
 BACKING = 1.5  # log odds that other maps may add: look-alikes of a place are alike to all maps of it
-VOICE_MOST = 3.0  # log odds that one of them adds at most
 VOICE_VETO = -2.0  # log odds of one of them, below which nothing makes up for it
-SAME_PLACE = 4.0  # log odds that an independent registration which gives the same place adds to its own
 DOUBT = 0.3  # probability: a hypothesis above it contradicts another place
 BELIEVED = 0.5  # probability
 EXCHANGE_GAIN = 0.5  # log odds by which another link must be better to take a link's place
 HEAVIEST_WALLS = 20.0  # m2 of walls in common, above which a measurement counts no more
-Hypotheses = Mapping[tuple[int, int], tuple[PoseHypothesis, ...]]
-Poses = Mapping[int, Sim3]
 
 
 @dataclass(frozen=True)
@@ -179,6 +177,8 @@ class Assembler:
                 against += said
             if said < worst:
                 loudest, worst = (one, two), said
+        for way, odds in ways_round(self.hypotheses, pair, (k for k in self.maps if k not in place)):
+            backing += same_place_odds(odds) if self.agrees(*pair, way, h.transform) else 0.0
         return Link(pair, h, h.log_odds + min(backing, self._backing(pair, h)) + against, loudest)
 
     def _voice(self, i: int, j: int, pose: Sim3) -> tuple[float, PoseHypothesis | None]:
@@ -188,7 +188,7 @@ class Assembler:
         if best is None:
             return check.log_odds, None
         if self.agrees(i, j, best.transform, pose):
-            return max(check.log_odds, float(np.clip(best.log_odds + SAME_PLACE, 0.0, VOICE_MOST))), None
+            return max(check.log_odds, same_place_odds(best.log_odds)), None
         return check.log_odds, best if best.probability > DOUBT else None
 
     def agrees(self, i: int, j: int, p: Sim3, q: Sim3) -> bool:
@@ -289,11 +289,3 @@ class Assembler:
                     pose = self.checks.fine(i, j, check.pose) if fine else check.pose
                     weight = float(np.clip(check.features["walls"], 0.5, HEAVIEST_WALLS))
                     yield Measured((i, j), pose, self.checks.place(i, j, pose), weight)
-
-
-def across(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Sim3:
-    """Where component b lies in component a, if map j of the one lies at T_ij in map i of the other; in any order."""
-    i, j = pair
-    if i not in a:
-        i, j, pose = j, i, pose.inverse()
-    return a[i] @ pose @ b[j].inverse()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -39,9 +39,14 @@ class Facts:
 
 
 class Memory:
-    """Maps by their keys, and answers to questions about them."""
+    """Maps by their keys, and answers to questions about them.
 
-    def __init__(self) -> None:
+    Args:
+        coarse: by the keys of two maps, ascending, how likely they lie on each other (`coarse.coarse_log_odds`).
+    """
+
+    def __init__(self, coarse: MutableMapping[tuple[str, str], float] | None = None) -> None:
+        self.coarse = {} if coarse is None else coarse
         self._facts: dict[Path, tuple[tuple[int, int, int], Facts]] = {}  # of files, with what tells whether they changed
         self._sources: dict[str, TopometricMap | str | Path] = {}
         self._loaded: OrderedDict[str, TopometricMap] = OrderedDict()

@@ -13,7 +13,6 @@ from topomerge.fusion.judge import Judge
 from topomerge.fusion.pose_difference import pose_difference
 from topomerge.fusion.registration import fine, register
 from topomerge.fusion.verify import plausibility
-from topomerge.matching.costs import descriptor_costs, similarities
 from topomerge.matching.match import match
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.poses import PoseHypothesis
@@ -80,16 +79,6 @@ def _room_poses(maps: Maps, i: int, j: int, scale: str) -> list[Sim3]:
         return []
     descriptors = {id(a): maps.rows(i), id(b): maps.rows(j)}
     return [h.transform for h in match(a, b, lambda m: descriptors[id(m)], scale_free=scale == "free").alternatives]
-
-
-def promise(maps: Maps, i: int, j: int) -> float:
-    """How promising it is to register two maps: floor area of the smaller one, times how alike the rooms of both look."""
-    a, b = maps.rows(i), maps.rows(j)
-    area = min(maps.area(i), maps.area(j))
-    if not len(a) or not len(b):
-        return 0.5 * area
-    likeness = similarities(descriptor_costs(a, b))
-    return area * float(likeness.max(axis=0).mean() + likeness.max(axis=1).mean()) / 2
 
 
 class Checks:

@@ -1,28 +1,70 @@
-"""Which maps of an atlas each is searched in: all others where they are few, else those that its rooms look most like."""
+"""Which maps of an atlas each is registered with: all others where they are few, else those on which it lies best, coarsely, of
+those that its rooms look most like."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 
+import numpy as np
+
+from topomerge.fusion.atlas.coarse import coarse_log_odds
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.neighbours import most_alike
-from topomerge.fusion.atlas.pairs import promise
+from topomerge.fusion.inputs import FEW_MAPS
 
-MOST_PARTNERS = 10  # maps that a map names to be searched in
+COARSE_PARTNERS = 40  # maps that a map's rooms look most like, on which it is laid coarsely
+MOST_PARTNERS = 5  # of these and of those that name it, the ones on which it lies best
+LIKELY_PARTNERS = 2  # that its rooms look most like, however it lies: drift spoils a coarse pose
 
 
-def partners_of(maps: Maps, linked: Iterable[tuple[int, int]] = ()) -> list[list[int]]:
-    """For each map those that it may be searched in, most promising first: all others where they are few, else the ten that its
-    rooms look most like, those that name it and those that it is `linked` with. A map without rooms names the largest ones."""
+def partners_of(
+    maps: Maps, linked: Iterable[tuple[int, int]] = (), scale: str = "fixed", end: float = np.inf
+) -> tuple[list[list[int]], bool]:
+    """For each map those that it may be registered with, best first, and whether all was looked at. A map without rooms names the
+    largest ones.
+
+    Args:
+        linked: pairs that may be registered however they look.
+        end: `time.perf_counter` after which nothing is laid coarsely any more; pairs that were not come last.
+    """
     count = len(maps)
-    if count <= MOST_PARTNERS + 1:
-        pairs = {(i, j) for j in range(count) for i in range(j)}
-    else:
-        by_area = sorted(range(count), key=lambda k: -maps.area(k))
-        named = enumerate(most_alike([maps.rows(k) for k in range(count)], MOST_PARTNERS))
-        pairs = {(min(k, m), max(k, m)) for k, of in named for m in of or [m for m in by_area if m != k][:MOST_PARTNERS]}
-    pairs |= {(min(pair), max(pair)) for pair in linked}
+    named = _named(maps)
+    sets = [set(of) for of in named]
+    for k, of in enumerate(named):
+        for m in of:
+            sets[m].add(k)
+    odds, complete = _laid(maps, named, scale, end)
+    chosen = {_pair(*pair) for pair in linked}
+    for k in range(count):
+        best = sorted(sets[k], key=lambda m, k=k: (-odds.get(_pair(k, m), -np.inf), m))  # type: ignore[misc]
+        chosen |= {_pair(k, m) for m in (best if count <= FEW_MAPS else best[:MOST_PARTNERS] + named[k][:LIKELY_PARTNERS])}
     partners: list[dict[int, float]] = [{} for _ in range(count)]
-    for i, j in sorted(pairs):
-        partners[i][j] = partners[j][i] = promise(maps, i, j)
-    return [[m for _, m in sorted((-likely, m) for m, likely in of.items())] for of in partners]
+    for i, j in sorted(chosen):
+        partners[i][j] = partners[j][i] = odds.get((i, j), -np.inf)
+    return [[m for _, m in sorted((-likely, m) for m, likely in of.items())] for of in partners], complete
+
+
+def _named(maps: Maps) -> list[list[int]]:
+    """For each map those that its rooms look most like, most alike first; all others where they are few."""
+    count = len(maps)
+    if count <= FEW_MAPS:
+        return [[m for m in range(count) if m != k] for k in range(count)]
+    largest = sorted(range(count), key=lambda k: -maps.area(k))
+    named = most_alike([maps.rows(k) for k in range(count)], COARSE_PARTNERS)
+    return [list(of) or [m for m in largest if m != k][:COARSE_PARTNERS] for k, of in enumerate(named)]
+
+
+def _laid(maps: Maps, named: list[list[int]], scale: str, end: float) -> tuple[dict[tuple[int, int], float], bool]:
+    """Log odds of the pairs, map by map so that few are in memory; those are all, if time allowed and there is a choice."""
+    pairs = dict.fromkeys(_pair(k, m) for k, of in enumerate(named) for m in of)
+    odds: dict[tuple[int, int], float] = {}
+    for i, j in pairs if len(maps) > 2 else ():
+        if time.perf_counter() >= end:
+            return odds, False
+        odds[i, j] = coarse_log_odds(maps, i, j, scale)
+    return odds, True
+
+
+def _pair(i: int, j: int) -> tuple[int, int]:
+    return min(i, j), max(i, j)

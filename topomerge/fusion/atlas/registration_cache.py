@@ -1,4 +1,4 @@
-"""pairs.json of an atlas: the registrations of its maps, so that none is made twice. It may be deleted.
+"""pairs.json of an atlas: the registrations of its maps, coarse ones, too, so that none is made twice. It may be deleted.
 
 While pairs are registered each is written to `.registered.jsonl` at once, so that who is killed goes on there the next time.
 """
@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +21,25 @@ from topomerge.types import Sim3
 
 PAIRS_FILE, PAIRS_FORMAT = "pairs.json", 1
 JOURNAL_FILE = ".registered.jsonl"
+UNREADABLE = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError)
 Pair = tuple[str, str]
 
 
 class Journal(dict[Pair, tuple[PoseHypothesis, ...]]):
-    """The registrations of an atlas; those that are added are written down at once.
+    """The registrations of an atlas, as its files hold them; those that are added are written down at once.
 
     Args:
         folder: of the atlas, which exists.
         settings: of the atlas.
+
+    Attributes:
+        coarse: the coarse ones, log odds of pairs; written down, too (`coarse.coarse_log_odds`).
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
-        super().__init__(read_registrations(folder, settings))
+        listing = _listing(folder, settings)
+        super().__init__(_registrations(listing))
+        self.coarse = _Coarse(self._write, _coarse(listing))
         self._file, self._stamp = folder / JOURNAL_FILE, _stamp(settings)
         if self._file.is_file():
             for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -40,45 +47,70 @@ class Journal(dict[Pair, tuple[PoseHypothesis, ...]]):
 
     def __setitem__(self, pair: Pair, hypotheses: tuple[PoseHypothesis, ...]) -> None:
         super().__setitem__(pair, hypotheses)
-        line = json.dumps({"stamp": self._stamp, **_entry(pair, hypotheses)})
-        with self._file.open("a", encoding="utf-8") as out:
-            out.write(line + "\n")
+        self._write(_entry(pair, hypotheses))
 
     def end(self) -> None:
         """All of it stands in the atlas now."""
         self._file.unlink(missing_ok=True)
 
+    def _write(self, entry: Mapping[str, Any]) -> None:
+        with self._file.open("a", encoding="utf-8") as out:
+            out.write(json.dumps({"stamp": self._stamp, **entry}) + "\n")
+
     def _take(self, line: str) -> None:
         """What a line says; nothing where it was cut, or is of other settings."""
         try:
             entry = json.loads(line)
-            if entry["stamp"] == self._stamp:
+            if entry["stamp"] == self._stamp and "coarse" in entry:
+                self.coarse.update(_coarse(entry))
+            elif entry["stamp"] == self._stamp:
                 super().__setitem__(*_read(entry))
-        except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError):
+        except UNREADABLE:
             return
 
 
-def read_registrations(folder: Path, settings: Mapping[str, Any]) -> RegistrationsByPair:
-    """The registrations of an atlas; none where the file is missing, damaged or of another version.
+class _Coarse(dict[Pair, float]):
+    """Log odds of pairs; those that are added are written down."""
 
-    Args:
-        settings: of the atlas.
-    """
+    def __init__(self, write: Callable[[Mapping[str, Any]], None], listed: Mapping[Pair, float]) -> None:
+        super().__init__(listed)
+        self._write_entry = write
+
+    def __setitem__(self, pair: Pair, log_odds: float) -> None:
+        super().__setitem__(pair, log_odds)
+        self._write_entry({"coarse": [[*pair, log_odds]]})
+
+
+def _listing(folder: Path, settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What stands in pairs.json; nothing where the file is missing, damaged or of another version or other settings."""
     try:
-        listing = json.loads((folder / PAIRS_FILE).read_text(encoding="utf-8"))
-        if listing["format"] != PAIRS_FORMAT or listing["stamp"] != _stamp(settings):
-            return {}
-        return dict(_read(entry) for entry in listing["pairs"])
-    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError):
+        listing: Mapping[str, Any] = json.loads((folder / PAIRS_FILE).read_text(encoding="utf-8"))
+        return listing if listing["format"] == PAIRS_FORMAT and listing["stamp"] == _stamp(settings) else {}
+    except (OSError, *UNREADABLE):
         return {}
 
 
-def registrations_to_json(
-    registrations: RegistrationsByPair, keys: Collection[str], settings: Mapping[str, Any]
-) -> dict[str, Any]:
-    """What `read_registrations` reads, of the maps with these keys."""
-    pairs = [_entry(pair, hypotheses) for pair, hypotheses in sorted(registrations.items()) if set(pair) <= set(keys)]
-    return {"format": PAIRS_FORMAT, "stamp": _stamp(settings), "pairs": pairs}
+def _registrations(listing: Mapping[str, Any]) -> RegistrationsByPair:
+    try:
+        return dict(_read(entry) for entry in listing.get("pairs", ()))
+    except UNREADABLE:
+        return {}
+
+
+def _coarse(listing: Mapping[str, Any]) -> dict[Pair, float]:
+    try:
+        coarse = {(str(a), str(b)): float(log_odds) for a, b, log_odds in listing.get("coarse", ())}
+    except UNREADABLE:
+        return {}
+    return {pair: log_odds for pair, log_odds in coarse.items() if math.isfinite(log_odds)}
+
+
+def registrations_to_json(registrations: Journal, keys: Collection[str], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What `Journal` reads, of the maps with these keys."""
+    of = set(keys)
+    pairs = [_entry(pair, hypotheses) for pair, hypotheses in sorted(registrations.items()) if of.issuperset(pair)]
+    coarse = [[*pair, log_odds] for pair, log_odds in sorted(registrations.coarse.items()) if of.issuperset(pair)]
+    return {"format": PAIRS_FORMAT, "stamp": _stamp(settings), "pairs": pairs, "coarse": coarse}
 
 
 def _entry(pair: Pair, hypotheses: Sequence[PoseHypothesis]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 Nothing depends on the order of the maps, and little on how many pairs there are: maps that lie in one frame already are not
 searched in each other again, they are only asked whether they agree. Maps that nothing connects stay apart, and are named.
-Of more than eleven maps each is only searched in the ten that its rooms look most like, and in those that name it.
+Of more than eleven maps each is only registered with some that its rooms look most like (`partners`).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def atlas(
     Args:
         maps: topometric maps or `.tmap` files, two or more; of files only a few are in memory at once.
         scale: "fixed", or "free" where the scales of the maps differ in unknown ways.
-        threshold: probability from which a link is believed; 0.8 if None: a wrong link drags all that hangs on it.
+        threshold: probability from which a link is believed; if None 0.8, of more than eleven maps 0.9: a wrong one does harm.
         embedder: "learned", "engineered", "shapedna", "feather", the folder of a trained one, or a callable map -> (R, D):
             matched rooms propose poses, too. None: the learned descriptors only say which pairs to try first.
         rigid: leave the maps as they are? Else all that belong together are bent together, each by as much as its sensor drifts.
@@ -119,7 +119,7 @@ def solve(
     began = time.perf_counter()
     check_scale(settings.scale)
     check_same(settings.same)
-    threshold = _log_odds(link_threshold(settings.threshold))
+    threshold = _log_odds(link_threshold(settings.threshold, len(maps)))
     memory = Memory() if memory is None else memory
     names, map_keys, warnings = _checked(maps, names, keys, settings.scale, memory)
     order = sorted(range(len(maps)), key=lambda k: map_keys[k])
@@ -187,16 +187,19 @@ class _Explorer:
         self.checks = Checks(maps, scaled)
         self.assembler = Assembler(len(maps), self.tried, self.checks, threshold, scaled)
         place = {key: k for k, key in enumerate(maps.keys)}
-        self.partners = partners_of(maps, [(place[a], place[b]) for a, b in proposed if a in place and b in place])
+        self.linked = sorted((min(place[a], place[b]), max(place[a], place[b])) for a, b in proposed if {a, b} <= set(place))
+        self.partners: list[list[int]] = []
 
     def explored(self, end: float = np.inf, workers: Workers | None = None) -> Assembly:
         """The assembly that more registrations would not change; after the end of the time that of those that were made."""
+        self.partners, looked = partners_of(self.maps, self.linked, self.scale, (time.perf_counter() + end) / 2)
+        self.tried.update({pair: self._registered(*pair) for pair in self.linked if self._is_registered(*pair)})
         while True:
             assembly = self.assembler.build()
             counts = np.bincount([k for pair in self.tried for k in pair], minlength=len(self.maps))
             pairs = set(self._next_pairs(assembly, counts, time.perf_counter() >= end))
             if not pairs:
-                self.complete = not any(self._next_pairs(assembly, counts))
+                self.complete = looked and not any(self._next_pairs(assembly, counts))
                 return assembly
             in_turn = sorted(pairs, key=lambda pair: (counts[list(pair)].min(), pair))  # what nothing is known of comes first
             if workers is not None and time.perf_counter() < end:

@@ -177,6 +177,8 @@ def change(
         files = [place / e.file if e.name in wanted.new else folder / e.file for e in stored.entries]
         names, keys = [e.name for e in stored.entries], [e.key for e in stored.entries]
         registrations = Journal(folder, stored.settings)
+        memory = Memory() if memory is None else memory
+        memory.coarse = registrations.coarse
         choices, proposed = AtlasSettings(**stored.settings), {**before.lying(), **wanted.proposed}
         atlas = solve(files, choices, registrations, names, keys, proposed, memory, Pace(wanted.seconds, answered, workers))
         atlas = atlas.in_frames({k: e.frame for k, e in enumerate(stored.entries) if e.frame != Sim3()})
