@@ -11,20 +11,24 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
 
 import numpy as np
+from topomerge.datasets.core.builder import one_thread
 from topomerge.datasets.pairs.evaluation_pair import common_area
 
-from benchmarks.merging.scale_maps import ScaleMap, scale_maps
+from benchmarks.merging.laid_coarsely import held
+from benchmarks.merging.scale_maps import SCALE_CACHE, ScaleMap, scale_maps
 from benchmarks.retrieval import FIRST
 from topomerge.embedding.embedders import embedder
 from topomerge.embedding.turns import Rows
 from topomerge.evaluation.tables import write_section
-from topomerge.fusion.atlas.find import SHORTLIST, ranked, shortlist
+from topomerge.fusion.atlas.coarse import coarse_log_odds
+from topomerge.fusion.atlas.find import LAID_COARSELY, SHORTLIST, Sighting, ranked, shortlist
+from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.neighbours import nearest, owners, queries, vectors, votes
 from topomerge.io.maps import load_map
 from topomerge.statistics import interval_text
@@ -62,9 +66,17 @@ def search(maps: Sequence[Described], compared: int) -> tuple[Array, Array]:
     Args:
         compared: maps that are compared room by room; with fewer than all by a shortlist.
     """
+    ranks, seconds = [], []
+    for k, began, sightings in _sighted(maps, compared):
+        seconds.append(time.process_time() - began)
+        ranks.append(_rank(maps, k, [int(s.name) for s in sightings]))
+    return np.array(ranks), np.array(seconds)
+
+
+def _sighted(maps: Sequence[Described], compared: int) -> Iterator[tuple[int, float, tuple[Sighting, ...]]]:
+    """Each map that shares enough, when its search began, and what it gave."""
     places = np.concatenate([vectors(m.rows) for m in maps])
     owner = owners([len(m.rows) for m in maps])
-    ranks, seconds = [], []
     for k, new in enumerate(maps):
         if new.shared < SHARED:
             continue
@@ -75,10 +87,26 @@ def search(maps: Sequence[Described], compared: int) -> tuple[Array, Array]:
             near = nearest(places, np.concatenate(asked), but=(int(mine[0]), int(mine[-1]) + 1))
             others = shortlist(votes(*near, len(asked), owner, len(maps)), compared)
         others = [n for n in others if n != k]
-        sightings = ranked([str(n) for n in others], [maps[n].rows for n in others], new.rows, compared)
+        yield k, began, ranked([str(n) for n in others], [maps[n].rows for n in others], new.rows, compared)
+
+
+def _rank(maps: Sequence[Described], k: int, order: Sequence[int]) -> int:
+    """Of the first other map of the building of map k, from 1; of none on the shortlist the last."""
+    return next((n for n, m in enumerate(order, 1) if maps[m].building == maps[k].building), len(maps))
+
+
+def laid_search(maps: Sequence[Described], held: Maps, compared: int) -> tuple[Array, Array]:
+    """As `search`, with the first of each search ordered by how well the map lies on them, as `find` does.
+
+    Args:
+        held: the maps, with what was laid coarsely before.
+    """
+    ranks, seconds = [], []
+    for k, began, sightings in _sighted(maps, compared):
+        first = [int(s.name) for s in sightings[:LAID_COARSELY]]
+        order = sorted(first, key=lambda n, k=k: -coarse_log_odds(held, k, n))  # type: ignore[misc]
         seconds.append(time.process_time() - began)
-        own = (n for n, s in enumerate(sightings, 1) if maps[int(s.name)].building == new.building)
-        ranks.append(next(own, len(maps)))  # of none on the shortlist: the last
+        ranks.append(_rank(maps, k, [*order, *(int(s.name) for s in sightings[LAID_COARSELY:])]))
     return np.array(ranks), np.array(seconds)
 
 
@@ -111,6 +139,9 @@ def main(words: Sequence[str] | None = None) -> int:
     maps = described(list(scale_maps(args.buildings)), args.descriptor)
     results = [(args.descriptor, *search(maps, len(maps)))]
     results.append((f"{args.descriptor}, shortlist of {SHORTLIST}", *search(maps, SHORTLIST)))
+    laid = f"{args.descriptor}, shortlist, {LAID_COARSELY} laid coarsely"
+    with one_thread():
+        results.append((laid, *laid_search(maps, held(list(scale_maps(args.buildings)), SCALE_CACHE), SHORTLIST)))
     command = " ".join(["python -m benchmarks.retrieval_many", *(sys.argv[1:] if words is None else words)])
     text = table(maps, results)
     print(text)

@@ -3,7 +3,8 @@
 ``python -m benchmarks.merging.scale_maps 300`` makes the maps of the first 300 buildings in ``cache/scale``, three or four of
 each (ten of three buildings), and leaves out what is there: it may be stopped at any moment and started again. A map is a walk
 through four rooms of a storey by depth camera or tablet, each with a session of its own: furniture, doors and drift differ.
-Buildings are of the test split, which sets no weight.
+Buildings are of the test split, which sets no weight; ``scale_maps 60 train`` makes some of the training split, to choose by, in
+``cache/scale_train``.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ SMALL_KINDS = ("house", "apartment", "hotel", "lab")
 WALKS = ("depth", "tablet", "depth", "tablet")  # the last one of every third building only
 ROOMS_OF_A_WALK = 4
 SEEDS_TRIED = 10
+FIRST_SEED = {"train": 500}  # from the first one of the split, whose first ones are those of benchmarks/extraction
 
 
 @dataclass(frozen=True)
@@ -49,9 +51,14 @@ def sensors_of(building: int) -> tuple[str, ...]:
     return WALKS if building % 3 == 0 else WALKS[:-1]
 
 
-def _walks(building: int) -> Atlas:
+def cache_of(split: str) -> Path:
+    """Where the maps of a split lie."""
+    return SCALE_CACHE if split == "test" else SCALE_CACHE.with_name(f"{SCALE_CACHE.name}_{split}")
+
+
+def _walks(building: int, split: str) -> Atlas:
     """The clouds of a building's maps: of the first seed whose rooms can all be reached."""
-    first = seeds("test")[0] + SEEDS_TRIED * building
+    first = seeds(split)[0] + FIRST_SEED.get(split, 0) + SEEDS_TRIED * building
     for seed in range(first, first + SEEDS_TRIED):
         try:
             made = make_building(SMALL_KINDS[building % len(SMALL_KINDS)], seed)
@@ -61,36 +68,38 @@ def _walks(building: int) -> Atlas:
     raise InputError(f"no maps of building {building} can be made")
 
 
-def make(building: int) -> None:
+def make(building: int, split: str = "test") -> None:
     """Make the maps of a building, unless they are there."""
-    about = SCALE_CACHE / f"b{building:03d}.json"
+    folder = cache_of(split)
+    about = folder / f"b{building:03d}.json"
     if about.exists():
         return
-    SCALE_CACHE.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     with one_thread():
-        walks = _walks(building)
+        walks = _walks(building, split)
         for k, cloud in enumerate(walks.maps):
-            path = SCALE_CACHE / f"b{building:03d}_m{k}.tmap"
+            path = folder / f"b{building:03d}_m{k}.tmap"
             save_map(replace(extract(cloud), source=path.stem), path)
     with replacing(about) as beside:
         beside.write_text(json.dumps({"building": walks.building, "truth": [t.matrix.tolist() for t in walks.truth]}))
 
 
-def scale_maps(buildings: int) -> Iterator[ScaleMap]:
+def scale_maps(buildings: int, split: str = "test") -> Iterator[ScaleMap]:
     """The maps of the first buildings.
 
     Raises:
         InputError: they were not made.
     """
+    folder = cache_of(split)
     for b in range(buildings):
-        about = SCALE_CACHE / f"b{b:03d}.json"
+        about = folder / f"b{b:03d}.json"
         if not about.exists():
-            raise InputError(f"{about} is missing; python -m benchmarks.merging.scale_maps {buildings} makes it")
+            raise InputError(f"{about} is missing; python -m benchmarks.merging.scale_maps {buildings} {split} makes it")
         for k, matrix in enumerate(json.loads(about.read_text())["truth"]):
-            yield ScaleMap(SCALE_CACHE / f"b{b:03d}_m{k}.tmap", b, sim3_of(np.array(matrix)))
+            yield ScaleMap(folder / f"b{b:03d}_m{k}.tmap", b, sim3_of(np.array(matrix)))
 
 
 if __name__ == "__main__":
     for number in range(int(sys.argv[1])):
-        make(number)
+        make(number, *sys.argv[2:3])
         print(number, flush=True)

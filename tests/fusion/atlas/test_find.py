@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
 from topomerge.cli.main import main as cli
 from topomerge.embedding.turns import TurnedRows
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.find import find, ranked
+from topomerge.fusion.atlas import find as finding
+from topomerge.fusion.atlas.find import find, laid, ranked
 from topomerge.fusion.atlas.room_rows import ROOMS_FILE
 from topomerge.fusion.atlas.store import add, remove
+from topomerge.fusion.atlas.stored import read_atlas
 from topomerge.io import archive
 from topomerge.viz.atlas_report import atlas_html
 
@@ -73,6 +76,16 @@ def test_a_map_of_the_atlas_finds_itself_and_rows_are_kept(house: Path) -> None:
     assert find(house, office_map(0)) == first and (house / ROOMS_FILE).read_bytes() == written
     (house / ROOMS_FILE).unlink()
     assert find(house, office_map(0)) == first
+
+
+def test_the_map_on_which_it_lies_best_comes_first(house: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the rooms look like; those on which it was not laid follow as they were."""
+    first, second = find(house, office_map(0))
+    assert first.fit is not None and second.fit is not None and first.fit > 3 > second.fit
+    turned = (replace(second, fit=None), replace(first, fit=None))
+    assert laid(read_atlas(house), office_map(0), turned) == (first, second)
+    monkeypatch.setattr(finding, "LAID_COARSELY", 1)
+    assert laid(read_atlas(house), office_map(0), turned) == (second, turned[1])
 
 
 def test_what_the_atlas_loses_is_found_no_more(house: Path) -> None:

@@ -53,6 +53,7 @@ def write_atlas(folder: Path, maps: dict[str, TurnedRows]) -> Path:
 def look(folder: Path, new: TurnedRows, number: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Sighting, ...]:
     """`find` of a map with these rows."""
     monkeypatch.setattr(finding, "checked", lambda describe, map: new)
+    monkeypatch.setattr(finding, "laid", lambda stored, map, sightings: sightings)
     return find(folder, office_map(0), number)
 
 

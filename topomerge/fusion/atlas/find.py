@@ -1,8 +1,10 @@
-"""Which maps and rooms of an atlas does a new map show? The rows of all rooms are compared; nothing is registered.
+"""Which maps and rooms of an atlas does a new map show? The rows of all rooms are compared, and it is laid coarsely on the maps
+that show most of them; nothing is registered.
 
 Each room of the new map has one vote. It goes to the rooms of the atlas that look most like it, shared by how alike they are; a
 map is turned by the one quarter turn, and moved by the one way, at which all of it is most alike. A map's share is that of the
 votes that its rooms got: it says where to look first, not whether the place is there at all. That is what `merge` is for.
+The first `LAID_COARSELY` are ordered by how well their walls fit: rooms of small maps look like those of many others.
 
 Of an atlas of more than `SHORTLIST` maps only so many are compared that closely: those for which the nearest neighbours of the
 new map's rooms speak, by exact search or an index (`rooms_index`).
@@ -11,7 +13,7 @@ new map's rooms speak, by exact search or an index (`rooms_index`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,8 @@ from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.turns import Rows, TurnedRows, moved_alike, way_between
 from topomerge.errors import InputError
+from topomerge.fusion.atlas.coarse import coarse_log_odds
+from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.neighbours import VOTE_SHARPNESS, nearest, owners, queries, votes
 from topomerge.fusion.atlas.room_rows import RoomRows, embedder_signature
 from topomerge.fusion.atlas.rooms_index import rooms_index
@@ -28,6 +32,7 @@ from topomerge.matching.match import checked
 from topomerge.types import Array, TopometricMap
 
 SHORTLIST = 50  # maps that are compared room by room
+LAID_COARSELY = 10  # maps with the largest shares, that the new one is laid on
 ELSEWHERE = 0.1  # of a room's vote counts for a room that does not lie where those of most rooms do
 
 
@@ -40,11 +45,14 @@ class Sighting:
         share: of the votes of the new map's rooms; over all maps that were compared they sum to 1.
         rooms: (room of the new map, room of this one, cosine of their rows), most alike first: rooms that are each other's most
             alike one in the other map.
+        fit: log odds that the best rigid pose of both maps is right, seen by itself (`coarse.coarse_log_odds`); None where none
+            was looked for.
     """
 
     name: str
     share: float
     rooms: tuple[tuple[int, int, float], ...]
+    fit: float | None = None
 
 
 def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sighting, ...]:
@@ -71,7 +79,18 @@ def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sight
     maps = list(range(len(stored.entries)))
     if len(maps) > max(SHORTLIST, number):
         maps = shortlist(_scores(stored, rows, signature, new), max(SHORTLIST, number))
-    return ranked([stored.entries[k].name for k in maps], rows.of(maps), new, number)
+    sightings = ranked([stored.entries[k].name for k in maps], rows.of(maps), new, max(number, LAID_COARSELY))
+    return laid(stored, map, sightings)[:number]
+
+
+def laid(stored: Stored, map: TopometricMap, sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
+    """The first of the sightings with how well the map fits there, in that order, then the others as they were."""
+    files = {e.name: stored.folder / e.file for e in stored.entries}
+    first = sightings[:LAID_COARSELY]
+    both = Maps([map, *(files[s.name] for s in first)])
+    scale = str(stored.settings.get("scale") or "fixed")
+    fitted = [replace(s, fit=coarse_log_odds(both, 0, k, scale)) for k, s in enumerate(first, 1)]
+    return *sorted(fitted, key=lambda s: -(s.fit or 0.0)), *sightings[LAID_COARSELY:]
 
 
 def _scores(stored: Stored, rows: RoomRows, signature: str, new: Rows) -> Array:
