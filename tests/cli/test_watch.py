@@ -40,6 +40,13 @@ def test_once(run: Run, scans: Path) -> None:
     assert json.loads((Path("site") / "watch.json").read_text())["format"] == 1
 
 
+def test_a_link_to_nothing_is_told_of_once(run: Run, scans: Path) -> None:
+    (scans / "gone.ply").symlink_to(scans / "other.ply")
+    status, out, err = run("watch", "scans", "-o", "site", "--once", *QUICK)
+    assert status == 0 and "2 added" in out and err.count("\n") == 1
+    assert "gone.ply: is a link to what is not there; it is skipped until it is" in err
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no line breaks in names there")
 def test_a_name_with_a_line_break_is_printed_in_one_line(run: Run, scans: Path) -> None:
     (scans / "1.tmap").rename(scans / "li\nne.tmap")

@@ -94,6 +94,7 @@ class Watch:
         held = check_folder(self.atlas)
         self._complete = held.complete and not (self.warm and held.entries)
         self._since: dict[str, tuple[str, float]] = {}
+        self._broken: set[Path] = set()  # links that were told of
 
     def look(self) -> bool:
         """Put what is new or changed, and written, into the atlas; is there anything that is just being written?
@@ -128,6 +129,9 @@ class Watch:
         described = {p.stem for p in there if p.suffix.lower() in (".yaml", ".yml")}  # their pictures are no maps of their own
         kinds = {*suffixes(), ".tmap"}
         own = [p for p in there if not (p.suffix.lower() in PICTURES and p.stem in described)]
+        for p in sorted({p for p in own if p.is_symlink() and not p.exists()} - self._broken):
+            self.tell(f"{p}: is a link to what is not there; it is skipped until it is", True)
+            self._broken.add(p)
         return [p for p in own if (p.is_dir() and p != self.atlas.resolve()) or (p.is_file() and p.suffix.lower() in kinds)]
 
     def _batches(self, paths: list[str]) -> Iterator[list[_Looked]]:
