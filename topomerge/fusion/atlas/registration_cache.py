@@ -26,7 +26,8 @@ Pair = tuple[str, str]
 
 
 class Journal(dict[Pair, tuple[PoseHypothesis, ...]]):
-    """The registrations of an atlas, as its files hold them; those that are added are written down at once.
+    """The registrations of an atlas, as its files hold them. Those that are added are written to `JOURNAL_FILE` at once, which goes
+    when the atlas is written.
 
     Args:
         folder: of the atlas, which exists.
@@ -48,10 +49,6 @@ class Journal(dict[Pair, tuple[PoseHypothesis, ...]]):
     def __setitem__(self, pair: Pair, hypotheses: tuple[PoseHypothesis, ...]) -> None:
         super().__setitem__(pair, hypotheses)
         self._write(_entry(pair, hypotheses))
-
-    def end(self) -> None:
-        """All of it stands in the atlas now."""
-        self._file.unlink(missing_ok=True)
 
     def _write(self, entry: Mapping[str, Any]) -> None:
         with self._file.open("a", encoding="utf-8") as out:

@@ -32,7 +32,7 @@ from topomerge.fusion.atlas.atlas_json import atlas_to_json, component_to_json, 
 from topomerge.fusion.atlas.folder import changing, link_or_copy
 from topomerge.fusion.atlas.maps import MapFiles, Maps
 from topomerge.fusion.atlas.memory import Memory, map_key
-from topomerge.fusion.atlas.registration_cache import PAIRS_FILE, Journal, registrations_to_json
+from topomerge.fusion.atlas.registration_cache import JOURNAL_FILE, PAIRS_FILE, Journal, registrations_to_json
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import AtlasSettings, Pace, Proposed, solve
 from topomerge.fusion.atlas.stored import Entry, Stored, check_folder, files_of, held_by, read_atlas
@@ -194,8 +194,7 @@ def change(
         texts = {PAIRS_FILE: pairs, "report.html": page, STAMP_FILE: css, "atlas.json": json_text(listing)}
         for name, text in (texts | dict(wanted.files)).items():
             _write(place / name, text)
-        gone += sorted(set(before.files()) - set(replace(stored, listing=listing).files()))
-    registrations.end()
+        gone += [JOURNAL_FILE, *sorted(set(before.files()) - set(replace(stored, listing=listing).files()))]
     return replace(atlas, maps=Maps([folder / e.file for e in stored.entries]))
 
 
