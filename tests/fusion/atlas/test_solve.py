@@ -210,6 +210,13 @@ def test_without_time_the_maps_that_look_alike_are_partners(looks: Looks):
     assert not complete and not looks.laid and all(k + 40 in partners[k] for k in range(39)) and 5 in partners[0]
 
 
+def test_with_little_time_maps_are_laid_on_those_that_look_most_like_them(looks: Looks, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("topomerge.fusion.atlas.partners.time.perf_counter", lambda: float(len(looks.laid)))
+    partners, complete = partners_of(looks, end=40.0)
+    assert not complete and {(k, k + 40) for k in range(39)} <= looks.laid and len(looks.laid) == 40
+    assert all(partners[k][0] == k + 40 for k in range(39))
+
+
 def test_strangers_stay_strangers(maps, registrations):
     result = tm.atlas([maps[0], maps[4]], registrations=registrations)
     assert result.status == "abstained" and result.components == ((0,), (1,)) and "nothing could be connected" in result.words()

@@ -56,10 +56,14 @@ def _named(maps: Maps) -> list[list[int]]:
 
 
 def _laid(maps: Maps, named: list[list[int]], scale: str, end: float) -> tuple[dict[tuple[int, int], float], bool]:
-    """Log odds of the pairs, map by map so that few are in memory; those are all, if time allowed and there is a choice."""
-    pairs = dict.fromkeys(_pair(k, m) for k, of in enumerate(named) for m in of)
+    """Log odds of the pairs; those are all, if time allowed and there is a choice. Map by map, so that few are in memory; those
+    that look most alike first, if time may end."""
+    ranks: dict[tuple[int, int], int] = {}
+    for k, of in enumerate(named):
+        for rank, m in enumerate(of):
+            ranks[_pair(k, m)] = min(rank, ranks.get(_pair(k, m), rank))
     odds: dict[tuple[int, int], float] = {}
-    for i, j in pairs if len(maps) > 2 else ():
+    for i, j in sorted(ranks, key=lambda pair: ranks[pair] if np.isfinite(end) else 0) if len(maps) > 2 else ():
         if time.perf_counter() >= end:
             return odds, False
         odds[i, j] = coarse_log_odds(maps, i, j, scale)

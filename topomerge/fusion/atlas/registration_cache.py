@@ -26,8 +26,8 @@ Pair = tuple[str, str]
 
 
 class Journal(dict[Pair, tuple[PoseHypothesis, ...]]):
-    """The registrations of an atlas, as its files hold them. Those that are added are written to `JOURNAL_FILE` at once, which goes
-    when the atlas is written.
+    """The registrations of an atlas, as its files hold them. Those that are added stand in `JOURNAL_FILE` at once, until the
+    atlas itself is written.
 
     Args:
         folder: of the atlas, which exists.
