@@ -196,3 +196,6 @@ def test_a_cut_ply_tells_how_many_rows_it_holds(tmp_path: Path) -> None:
     path.write_bytes(head.encode() + bytes(12 * 30 + 5))
     with pytest.raises(InputError, match="holds 30 of the 1,000 rows of vertex"):
         read_points(path)
+    path.write_text(head.replace("binary_little_endian", "ascii") + 7 * "1 2 3\n")
+    with pytest.raises(InputError, match="holds 7 of the 1,000 rows of vertex"):
+        read_points(path)

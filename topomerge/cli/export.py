@@ -29,7 +29,8 @@ def export_command(args: argparse.Namespace) -> int:
         write_all(files)
     if not args.quiet:
         written = " ".join(str(file) for file, _ in files)
-        say_line(f"{len(topomap.rooms)} rooms, {len(topomap.edges)} doors and stairs -> {written}")
+        rooms = f"{len(topomap.rooms)} room{'s' if len(topomap.rooms) != 1 else ''}"
+        say_line(f"{rooms}, {len(topomap.edges)} doors and stairs -> {written}")
     return 0
 
 

@@ -73,8 +73,12 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     size = path.stat().st_size
     for element in header.elements:
         if element.count * element.shortest() > size - header.start:
-            counted = header.order and element is header.elements[0] and element.fixed  # others begin or end nobody knows where
-            have = (size - header.start) // max(element.dtype(header.order).itemsize, 1) if counted else 0
+            have = 0  # of others than the first one nobody knows where they begin or end
+            if element is header.elements[0] and not header.order:
+                with path.open("rb") as stream:
+                    have = sum(1 for _ in stream) - header.lines
+            elif element is header.elements[0] and element.fixed:
+                have = (size - header.start) // max(element.dtype(header.order).itemsize, 1)
             raise cut_short(path, have, element.count, f"rows of {element.name}")
     before = header.elements[: header.elements.index(vertex)]
     if (face is not None and face.count) or not all(e.fixed for e in (*before, vertex)):
