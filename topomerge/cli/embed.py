@@ -26,7 +26,8 @@ def embed_command(args: argparse.Namespace) -> int:
 
     write_all([(args.output, save)])
     if not args.quiet:
-        say_line(f"{len(rows)} room{'s' if len(rows) != 1 else ''}, {' x '.join(map(str, rows.shape[1:]))} numbers each -> {args.output}")
+        rooms = f"{len(rows)} room{'s' if len(rows) != 1 else ''}"
+        say_line(f"{rooms}, {' x '.join(map(str, rows.shape[1:]))} numbers each -> {args.output}")
     return 0
 
 
