@@ -42,4 +42,4 @@ def across(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Sim3:
 def _best(hypotheses: Hypotheses, i: int, j: int) -> tuple[Sim3, float] | None:
     """The most probable T_ij with its log odds, of maps in any order; None where none was looked for or there is none."""
     best = next(iter(hypotheses.get((min(i, j), max(i, j)), ())), None)
-    return best and (best.transform if i < j else best.transform.inverse(), best.log_odds)
+    return None if best is None else (best.transform if i < j else best.transform.inverse(), best.log_odds)
