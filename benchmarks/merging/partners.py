@@ -67,7 +67,7 @@ def study(maps: Sequence[ScaleMap], folder: Path) -> str:
     began = time.process_time()
     best = partners_of(atlas)[0]
     laid, seconds = len(atlas.memory.coarse) - before, time.process_time() - began
-    words = f"of the {COARSE_PARTNERS}, the {MOST_PARTNERS[1]} on which it lies best; and the {LIKELY_PARTNERS} most alike"
+    words = f"of the {COARSE_PARTNERS}, the {MOST_PARTNERS} on which it lies best; and the {LIKELY_PARTNERS} most alike"
     chosen[words] = {(min(k, m), max(k, m)) for k, of in enumerate(best) for m in of}
     true, possible = sorted(share), joinable(len(maps), share)
     groups = np.array([maps[i].building for i, _ in true])

@@ -147,7 +147,7 @@ def test_files_are_read_when_needed(maps, atlas, registrations, tmp_path):
 @pytest.mark.longer
 def test_of_many_maps_only_those_that_look_alike_are_registered(maps, atlas, registrations, monkeypatch):
     monkeypatch.setattr("topomerge.fusion.atlas.partners.FEW_MAPS", 2)
-    monkeypatch.setattr("topomerge.fusion.atlas.partners.MOST_PARTNERS", (2, 2))
+    monkeypatch.setattr("topomerge.fusion.atlas.partners.MOST_PARTNERS", 2)
     made = dict(registrations)
     result = tm.atlas(maps, registrations=made)
     assert result.components == atlas.components and right(result, {k: k for k in range(4)})
@@ -201,8 +201,6 @@ def test_partners_of_many_maps_are_those_on_which_they_lie_best(looks: Looks):
 def test_all_of_few_maps_are_partners(looks: Looks):
     few, complete = partners_of(Looks(looks.all[:11]))
     assert complete and all(few[k] == sorted((m for m in range(11) if m != k), key=lambda m: abs(m - k)) for k in range(11))
-    many = partners_of(Looks(looks.all[:20]))[0]
-    assert all(10 <= len(of) <= 19 for of in many) and many[0][:10] == list(range(1, 11))
     alone, (first, second) = partners_of(Looks(looks.all[:1])), partners_of(Looks(looks.all[:2]))[0]
     assert alone == ([[]], True) and (first, second) == ([1], [0])
 

@@ -14,7 +14,7 @@ from topomerge.fusion.atlas.neighbours import most_alike
 from topomerge.fusion.inputs import FEW_MAPS
 
 COARSE_PARTNERS = 40  # maps that a map's rooms look most like, on which it is laid coarsely
-MOST_PARTNERS = (10, 5)  # of these and of those that name it the best ones: where all are laid on all, and of more maps
+MOST_PARTNERS = 5  # of these and of those that name it, the ones on which it lies best
 LIKELY_PARTNERS = 2  # that its rooms look most like, however it lies: drift spoils a coarse pose
 
 
@@ -34,12 +34,11 @@ def partners_of(
     for k, of in enumerate(named):
         for m in of:
             sets[m].add(k)
-    most = count if count <= FEW_MAPS else MOST_PARTNERS[count > COARSE_PARTNERS + 1]
     odds, complete = _laid(maps, named, scale, end)
     chosen = {_pair(*pair) for pair in linked}
     for k in range(count):
         best = sorted(sets[k], key=lambda m, k=k: (-odds.get(_pair(k, m), -np.inf), m))  # type: ignore[misc]
-        chosen |= {_pair(k, m) for m in best[:most] + named[k][:LIKELY_PARTNERS]}
+        chosen |= {_pair(k, m) for m in (best if count <= FEW_MAPS else best[:MOST_PARTNERS] + named[k][:LIKELY_PARTNERS])}
     partners: list[dict[int, float]] = [{} for _ in range(count)]
     for i, j in sorted(chosen):
         partners[i][j] = partners[j][i] = odds.get((i, j), -np.inf)
