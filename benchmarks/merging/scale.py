@@ -3,7 +3,7 @@
 ``python -m benchmarks.merging.scale 10`` (or 100, 1000) puts the first maps that `benchmarks/merging/scale_maps.py` made into an
 atlas in ``cache/scale/atlas_10``, in a process of its own, and prints a Markdown row; what was measured is in
 ``cache/scale/results.jsonl``. It may be stopped at any moment: the registrations that were made stand in the atlas, their seconds
-beside it, and the same command goes on with them.
+beside it, and the same command goes on with them; the seconds of laying maps coarsely are those of the last run.
 
 ``--drawn`` makes no registrations: pairs of one building lie where the truth says, strangers anywhere, each with the
 probabilities that the registrations of the atlas of 100 gave such pairs. ``--at-once`` assembles all maps at once, not by sets.
@@ -30,8 +30,8 @@ import numpy as np
 
 from benchmarks.merging.atlas import RIGHT
 from benchmarks.merging.scale_maps import SCALE_CACHE, ScaleMap, scale_maps
+from topomerge.fusion.atlas import partners, store
 from topomerge.fusion.atlas import solve as solver
-from topomerge.fusion.atlas import store
 from topomerge.fusion.atlas.assembly import Assembler
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.result import AtlasResult
@@ -46,6 +46,7 @@ DRAWN_FROM = 100  # maps of the atlas whose registrations the drawn ones are lik
 SCALE_COLUMNS = (
     *("maps", "buildings", "registrations", "pairs a map", "right links", "wrong links", "placed right", "of", "wrong", "alone"),
     *(
+        "s laying",
         "s registering",
         "s assembling",
         "s settling",
@@ -179,6 +180,7 @@ def measure(count: int, drawn: bool, at_once: bool) -> dict[str, Any]:
         Assembler.build = Assembler._assembled  # type: ignore[method-assign]
     spent = Spent()
     for owner, name, label in (
+        (partners, "coarse_log_odds", "laying"),
         *((solver, "hypotheses", "registering"), (Assembler, "build", "assembling"), (solver, "_result", "settling")),
         (store, "solve", "solving"),
     ):
@@ -191,6 +193,7 @@ def measure(count: int, drawn: bool, at_once: bool) -> dict[str, Any]:
     pages = sorted(p.stat().st_size / 1e6 for p in folder.glob("*.html"))
     s = spent.seconds
     return judged(maps, result) | {
+        "s laying": round(s["laying"], 1),
         "s registering": round(all_registering, 1),
         "s assembling": round(s["assembling"], 1),
         "s settling": round(s["settling"], 1),
@@ -216,7 +219,7 @@ def main(count: int, drawn: bool, at_once: bool) -> None:
     print("| " + " | ".join(("registrations", *SCALE_COLUMNS)) + " |\n" + "|---" * (len(SCALE_COLUMNS) + 1) + "|")
     for row in map(json.loads, RESULTS.read_text().splitlines()):
         how = ("drawn" if row["drawn"] else "made") + (", assembled at once" if row["at once"] else "")
-        print("| " + " | ".join(str(v) for v in (how, *(row[c] for c in SCALE_COLUMNS))) + " |")
+        print("| " + " | ".join(str(v) for v in (how, *(row.get(c, "") for c in SCALE_COLUMNS))) + " |")
 
 
 if __name__ == "__main__":
