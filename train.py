@@ -35,6 +35,7 @@ def main(config: DictConfig) -> float:
         job = HydraConfig.get()
         if job.mode == RunMode.MULTIRUN:  # each run of a sweep gets a folder of its own
             settings.runs, settings.name = str(job.sweep.dir), str(job.sweep.subdir)
+            settings.resume = settings.resume and (settings.folder / "last").exists()  # the others have not begun
         return train(settings, say)[f"val/{settings.watch}"]
     except InputError as error:
         sys.exit(f"train: {error}")

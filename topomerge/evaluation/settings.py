@@ -44,7 +44,7 @@ class Evaluation:
     """Settings of an evaluation.
 
     Args:
-        run: trained embedders: runs, or what was exported of them.
+        run: trained embedders: runs, what was exported of them, or folders of runs (a sweep's), of which each is taken.
         name: folder below `folder`; empty: from the data and the runs.
         cache: of the pairs and of descriptors.
         limit: only the first so many pairs; 0: all.
@@ -132,6 +132,8 @@ def check(settings: Evaluation) -> None:
     for run in settings.run:
         if not Path(run).exists():
             raise InputError(f"run={run}: no such folder or file; name a run that was trained")
+        if not runs_in(run):
+            raise InputError(f"run={run}: no run, and no folder of runs; name a run that was trained")
     names = [v.name for v in variants(settings)]
     if again := next((name for name in names if names.count(name) > 1), ""):
         raise InputError(f"run: two are called {again!r}; rename a folder, or set titles=true")
@@ -146,9 +148,17 @@ def variants(settings: Evaluation) -> Iterator[Variant]:
                 methods = tuple(m for m in methods if m != "consistent" or k in settings.slow_k)
                 title = name if not k else f"{name} k={k} {how}"
                 yield Variant(title, name, k, how, methods)
-    for run in settings.run:
+    for run in (each for run in settings.run for each in runs_in(run)):
         name = run_title(run) if settings.titles else run_name(run)
         yield Variant(name, name, methods=tuple(settings.methods), run=run)
+
+
+def runs_in(run: str) -> list[str]:
+    """The run itself, or those in a folder of runs that have a trained embedder, by name."""
+    path = Path(run)
+    if path.is_file() or any(path.glob("*.safetensors")) or any(path.glob("best/*.safetensors")):
+        return [run]
+    return [str(best.parent.parent) for best in sorted(path.glob("*/best/*.safetensors"))]
 
 
 def run_name(run: str) -> str:
