@@ -148,7 +148,7 @@ def variants(settings: Evaluation) -> Iterator[Variant]:
                 methods = tuple(m for m in methods if m != "consistent" or k in settings.slow_k)
                 title = name if not k else f"{name} k={k} {how}"
                 yield Variant(title, name, k, how, methods)
-    for run in (each for run in settings.run for each in runs_in(run)):
+    for run in (each for folder in settings.run for each in runs_in(folder)):
         name = run_title(run) if settings.titles else run_name(run)
         yield Variant(name, name, methods=tuple(settings.methods), run=run)
 

@@ -9,18 +9,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import NAMES, office_map
 from topomerge.errors import InputError
-from topomerge.fusion.atlas import workers
+from topomerge.fusion.atlas import memory, workers
 from topomerge.fusion.atlas.registration_cache import JOURNAL_FILE, Journal
 from topomerge.fusion.atlas.store import add
-from topomerge.fusion.atlas.workers import Numbered, PairTask, register_pair
+from topomerge.fusion.atlas.workers import CoarseTask, lay_coarsely, register_pair
+from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import TopometricMap
 
@@ -47,24 +49,26 @@ def same_atlas(one: Path, other: Path) -> bool:
     return all((one / name).read_bytes() == (other / name).read_bytes() for name in ("pairs.json", "merged_0.ply"))
 
 
-def backwards(tasks: Sequence[PairTask]) -> Iterator[Numbered]:
+def backwards(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
     """A worker of this process that ends with the first task."""
     for k in reversed(range(len(tasks))):
-        yield k, register_pair(tasks[k])
+        yield k, work(tasks[k])
 
 
 @pytest.mark.longer
 def test_who_is_killed_goes_on_and_the_order_in_which_pairs_end_changes_nothing(alone, tmp_path):
-    asked: list[int] = []
+    asked: dict[str, list[int]] = {"lay_coarsely": [], "register_pair": []}
 
-    def failing(tasks: Sequence[PairTask]) -> Iterator[Numbered]:
-        asked.append(len(tasks))
-        yield 0, register_pair(tasks[0])
-        raise KeyboardInterrupt
+    def failing(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        asked[work.__name__].append(len(tasks))
+        yield 0, work(tasks[0])
+        if work is register_pair:
+            raise KeyboardInterrupt
+        yield from ((k, work(tasks[k])) for k in range(1, len(tasks)))
 
-    def going_on(tasks: Sequence[PairTask]) -> Iterator[Numbered]:
-        asked.append(len(tasks))
-        return backwards(tasks)
+    def going_on(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        asked[work.__name__].append(len(tasks))
+        return backwards(work, tasks)
 
     folder = tmp_path / "house"
     with pytest.raises(KeyboardInterrupt):
@@ -73,7 +77,9 @@ def test_who_is_killed_goes_on_and_the_order_in_which_pairs_end_changes_nothing(
     assert journal.read_text().count("hypotheses") == 1 and not (folder / "atlas.json").exists()
     journal.write_text(journal.read_text() + '{"stamp": "cut sh')  # as of a process that was killed while it wrote
     add(folder, parts(), tm.atlas_html, going_on)
-    assert asked[1] == asked[0] - 1 and same_atlas(alone, folder)
+    first, second = asked["register_pair"][:2]
+    assert second == first - 1 and same_atlas(alone, folder)
+    assert asked["lay_coarsely"] == [2]  # the first map on two, the second on one; then it is written down
     assert not journal.exists()
 
 
@@ -89,6 +95,21 @@ def test_a_journal_is_heard_with_its_settings_only(tmp_path):
     assert other == {} and not other.coarse
     (tmp_path / JOURNAL_FILE).write_text("no line of it\n[]\n{}\n")
     assert Journal(tmp_path, settings) == {}
+
+
+def test_a_worker_loads_a_map_of_many_pairs_once_and_forgets_what_was_laid_at_another_scale(alone, monkeypatch):
+    loaded: list[Path] = []
+    monkeypatch.setattr(memory, "load_map", lambda path: loaded.append(path) or load_map(path))
+    workers._memory.cache_clear()
+    listing = listing_of(alone)
+    maps = [(alone / m["file"], m["key"]) for m in listing["maps"]]
+    for others in ((1, 2), (2,)):
+        of = [maps[k] for k in (0, *others)]
+        odds = lay_coarsely(CoarseTask(tuple(file for file, _ in of), tuple(key for _, key in of), "fixed"))
+    assert len(loaded) == 3
+    free = lay_coarsely(CoarseTask((maps[0][0], maps[2][0]), (maps[0][1], maps[2][1]), "free"))
+    assert len(loaded) == 3 and free != odds
+    workers._memory.cache_clear()
 
 
 @pytest.mark.slow
@@ -127,9 +148,9 @@ def test_a_cluster_gives_the_same_atlas_though_a_worker_is_killed(alone, tmp_pat
                 client.wait_for_workers(2, timeout=60)
             real = workers.cluster(address)
 
-            def killing(tasks: Sequence[PairTask]) -> Iterator[Numbered]:
-                for count, numbered in enumerate(real(tasks)):
-                    if count == 0:
+            def killing(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+                for count, numbered in enumerate(real(work, tasks)):
+                    if count == 0 and work is register_pair:
                         first.send_signal(signal.SIGKILL)
                     yield numbered
 

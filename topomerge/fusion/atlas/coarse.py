@@ -15,13 +15,17 @@ from topomerge.fusion.verify import rank
 NO_POSE = -30.0  # log odds where nothing can be laid on each other
 
 
+def coarse_key(maps: Maps, i: int, j: int) -> tuple[str, str]:
+    """Under which `Memory.coarse` holds two maps."""
+    return min(maps.keys[i], maps.keys[j]), max(maps.keys[i], maps.keys[j])
+
+
 def coarse_log_odds(maps: Maps, i: int, j: int, scale: str = "fixed") -> float:
     """Log odds that the best rigid pose of two maps is right, seen by itself; what is in `Memory.coarse` is not made again.
 
     Drift lowers them: of a real floor some right pairs have -7, as strangers of few rooms have.
     """
-    pair = min(maps.keys[i], maps.keys[j]), max(maps.keys[i], maps.keys[j])
-    coarse = maps.memory.coarse
+    pair, coarse = coarse_key(maps, i, j), maps.memory.coarse
     if pair not in coarse:
         first, second = sorted((maps.prepared(i), maps.prepared(j)), key=lambda m: m.order)
         hypotheses = (search_scaled if scale == "free" else search)(first.storeys, second.storeys)

@@ -56,15 +56,12 @@ class Memory:
         self._before: dict[tuple[Hashable, ...], Any] = {}  # … between that and the time before
 
     def keep(self, sources: Mapping[str, TopometricMap | str | Path]) -> None:
-        """These maps are asked about from now on; what was not asked for since the last time is dropped.
+        """These maps are asked about from now on; answers that were not asked for since the last time are dropped.
 
         Args:
             sources: key -> map or `.tmap` file.
         """
         self._sources = dict(sources)
-        self._loaded = OrderedDict((k, m) for k, m in self._loaded.items() if k in sources)
-        self._prepared = OrderedDict((k, p) for k, p in self._prepared.items() if k in sources)
-        self._surfaces = OrderedDict((k, s) for k, s in self._surfaces.items() if k in sources)
         self._before, self._answers = self._answers, {}
 
     def facts(self, source: TopometricMap | str | Path) -> Facts:

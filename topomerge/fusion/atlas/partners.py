@@ -8,9 +8,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from topomerge.fusion.atlas.coarse import coarse_log_odds
+from topomerge.fusion.atlas.coarse import coarse_key, coarse_log_odds
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.neighbours import most_alike
+from topomerge.fusion.atlas.workers import CoarseTask, Workers, lay_coarsely
 from topomerge.fusion.inputs import FEW_MAPS
 
 COARSE_PARTNERS = 40  # maps that a map's rooms look most like, on which it is laid coarsely
@@ -19,7 +20,11 @@ LIKELY_PARTNERS = 2  # that its rooms look most like, however it lies: drift spo
 
 
 def partners_of(
-    maps: Maps, linked: Iterable[tuple[int, int]] = (), scale: str = "fixed", end: float = np.inf
+    maps: Maps,
+    linked: Iterable[tuple[int, int]] = (),
+    scale: str = "fixed",
+    end: float = np.inf,
+    workers: Workers | None = None,
 ) -> tuple[list[list[int]], bool]:
     """For each map those that it may be registered with, best first, and whether all was looked at. A map without rooms names the
     largest ones.
@@ -27,6 +32,7 @@ def partners_of(
     Args:
         linked: pairs that may be registered however they look.
         end: `time.perf_counter` after which nothing is laid coarsely any more; pairs that were not come last.
+        workers: lay maps that are files; None: this process does.
     """
     count = len(maps)
     named = _named(maps)
@@ -34,6 +40,8 @@ def partners_of(
     for k, of in enumerate(named):
         for m in of:
             sets[m].add(k)
+    if workers is not None and count > 2:
+        _lay_all(maps, named, scale, workers)
     odds, complete = _laid(maps, named, scale, end)
     chosen = {_pair(*pair) for pair in linked}
     for k in range(count):
@@ -68,6 +76,20 @@ def _laid(maps: Maps, named: list[list[int]], scale: str, end: float) -> tuple[d
             return odds, False
         odds[i, j] = coarse_log_odds(maps, i, j, scale)
     return odds, True
+
+
+def _lay_all(maps: Maps, named: list[list[int]], scale: str, workers: Workers) -> None:
+    """Let workers lay maps that are files on each other, where that was not done before: each on all later ones at once."""
+    files = [maps.file(k) for k in range(len(maps))]
+    later: dict[int, list[int]] = {}
+    for i, j in sorted({_pair(k, m) for k, of in enumerate(named) for m in of}):
+        if files[i] and files[j] and coarse_key(maps, i, j) not in maps.memory.coarse:
+            later.setdefault(i, [i]).append(j)
+    laid = list(later.values())
+    tasks = [CoarseTask(tuple(filter(None, (files[k] for k in of))), tuple(maps.keys[k] for k in of), scale) for of in laid]
+    for number, odds in workers(lay_coarsely, tasks) if tasks else ():
+        for k, log_odds in zip(laid[number][1:], odds, strict=True):
+            maps.memory.coarse[coarse_key(maps, laid[number][0], k)] = log_odds
 
 
 def _pair(i: int, j: int) -> tuple[int, int]:

@@ -23,7 +23,7 @@ from topomerge.fusion.atlas.pairs import Checks, hypotheses
 from topomerge.fusion.atlas.partners import partners_of
 from topomerge.fusion.atlas.pose_graph import residual
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.workers import PairTask, Workers
+from topomerge.fusion.atlas.workers import PairTask, Workers, register_pair
 from topomerge.fusion.bend.bend import NEITHER_BENDS
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.inputs import check_cells, check_scale, check_units, link_threshold, without_rooms
@@ -192,7 +192,7 @@ class _Explorer:
 
     def explored(self, end: float = np.inf, workers: Workers | None = None) -> Assembly:
         """The assembly that more registrations would not change; after the end of the time that of those that were made."""
-        self.partners, looked = partners_of(self.maps, self.linked, self.scale, (time.perf_counter() + end) / 2)
+        self.partners, looked = partners_of(self.maps, self.linked, self.scale, (time.perf_counter() + end) / 2, workers)
         self.tried.update({pair: self._registered(*pair) for pair in self.linked if self._is_registered(*pair)})
         while True:
             assembly = self.assembler.build()
@@ -234,9 +234,9 @@ class _Explorer:
             files, keys = (self.maps.file(i), self.maps.file(j)), (self.maps.keys[i], self.maps.keys[j])
             if not self._is_registered(i, j) and files[0] is not None and files[1] is not None:
                 proposed = (self.proposed[keys],) if keys in self.proposed else ()
-                tasks.append(PairTask((files[0], files[1]), self.embedder, self.scale, self.same, proposed))
+                tasks.append(PairTask((files[0], files[1]), keys, self.embedder, self.scale, self.same, proposed))
                 todo.append(keys)
-        for number, ranked in workers(tasks) if tasks else ():
+        for number, ranked in workers(register_pair, tasks) if tasks else ():
             self.registrations[todo[number]] = ranked
 
     def _registered(self, i: int, j: int) -> tuple[PoseHypothesis, ...]:
