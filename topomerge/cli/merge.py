@@ -26,7 +26,8 @@ MERGE_OUTPUTS = ("merge.json", "report.html", "merged.ply", "map.tmap")
 def merge_command(args: argparse.Namespace) -> int:
     """`topomerge merge`: bring two maps or more together. Status 2: the merge is not believed."""
     if len(args.inputs) < 2:
-        raise InputError(f"{args.inputs[0]}: merge takes two maps or more, 1 given; give another one")
+        instead = "a folder is one map; name the files in it" if Path(args.inputs[0]).is_dir() else "give another one"
+        raise InputError(f"{args.inputs[0]}: merge takes two maps or more, 1 given; {instead}")
     check_inputs(args.inputs)
     with output_folder(args.output) as folder:
         files = point_files(args.inputs, folder) if args.points else {}

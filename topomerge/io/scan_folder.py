@@ -169,7 +169,7 @@ def _with_viewpoints(path: Path, scans: list[Path], options: ReadOptions) -> Ite
             if pose is None:
                 raise InputError(
                     f"{path}: has no trajectory (such as poses.txt or traj_lidar.txt); give one with --poses, in the format of "
-                    f"KITTI or TUM"
+                    f"KITTI or TUM; or name the files, if each is a map of its own"
                 )
             yield PosedScan(piece.points, pose, piece.colors, True, number / len(scans))
 
