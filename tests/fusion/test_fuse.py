@@ -12,8 +12,9 @@ import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import office_map, truth
 from tests.scenes import two_rooms
 from topomerge.errors import InputError
-from topomerge.fusion.fuse import fuse, rooms_in_common
-from topomerge.fusion.resampling import resampled
+from topomerge.extraction.cell_means import cell_middles
+from topomerge.fusion.fuse import _JoinedCells, fuse, rooms_in_common
+from topomerge.fusion.resampling import Laying, laid_means, resampled
 from topomerge.fusion.storey_levels import extruded
 from topomerge.types import Sim3, TopometricMap, VoxelGrid
 
@@ -126,3 +127,56 @@ def test_a_slice_fills_no_room_with_what_stands_in_it(halves):
     assert ((joined.provenance & 2) > 0).sum() > 0.5 * len(flat.grid) and (joined.provenance == 2).sum() < 0.02 * len(joined.grid)
     first = fuse([flat, halves[0]], [(0, Sim3()), (1, lower.inverse())])
     assert len(first.rooms) == len(joined.rooms) and np.bitwise_or.reduce(first.provenance) == 0b11
+
+
+def scanned_rooms(seed: int, spread: float = 0.0) -> TopometricMap:
+    """Two rooms from points anywhere on their surfaces, not from the middles of cells."""
+    rng = np.random.default_rng(seed)
+    points = two_rooms().points()
+    points = points[rng.permutation(len(points))[: len(points) // 2]]
+    return tm.extract((points + rng.normal(0, spread, points.shape)).astype(np.float32), name=f"scan {seed}")
+
+
+def off_the_wall(map: TopometricMap) -> np.ndarray:
+    """m of the cells of the wall at y = 0.017 from it."""
+    at = cell_middles(map.grid) - (0, 0.017, 0)
+    near = (np.abs(at[:, 1]) < 0.12) & (at[:, 0] > 0.3) & (at[:, 0] < 6.7) & (at[:, 2] > 0.4) & (at[:, 2] < 2.0)
+    return np.abs(at[near, 1])
+
+
+def test_a_joined_wall_is_where_the_points_of_both_maps_are():
+    a, frame = scanned_rooms(0), Sim3(0.4, (1.03, -2.02, 0.0))
+    points = cell_middles(scanned_rooms(1).grid)
+    b = tm.extract(frame.inverse().apply(points).astype(np.float32), name="turned")
+    joined = fused(a, b, frame)
+    assert joined.grid.properties["offset"].shape == (len(joined.grid), 3)
+    assert np.median(off_the_wall(joined)) < 0.006 and np.quantile(off_the_wall(joined), 0.9) < 0.03
+    plain = [replace(m, grid=VoxelGrid(m.grid.cells, m.grid.origin, m.grid.edge, m.grid.shape)) for m in (a, b)]
+    assert "offset" not in fused(*plain, frame).grid.properties
+
+
+def test_the_map_with_more_points_says_where_a_wall_is():
+    cells = np.stack([np.arange(10), np.zeros(10), np.zeros(10)], axis=1).astype(np.int64)
+    grid = VoxelGrid.from_cells(cells, edge=0.1)
+    few, many = (
+        grid.with_properties(count=np.full(10, n), offset=np.tile(np.array([128, at, 128], np.uint8), (10, 1)))
+        for n, at in ((1, 250), (99, 50))
+    )
+    joined = _JoinedCells(np.zeros(3), 0.1)
+    for one in (few, many):
+        laid, rows = resampled(one, Sim3(), np.zeros(3), 0.1)
+        joined._add(laid, np.ones(10, np.uint32), *laid_means(one, Laying(Sim3()), rows, laid, np.zeros(3), 0.1))
+    assert np.allclose(joined.means_in_metres()[:, 1], 0.1 * 52.5 / 256, atol=4e-4) and len(joined.codes) == 10
+
+
+def test_a_cell_that_is_only_filled_says_little():
+    """The wall stands at y = 0.09 of its cells; laid half a cell on, those beside them are filled, too."""
+    grid = VoxelGrid.from_cells(np.array([[4, 0, 0]]), edge=0.1).with_properties(offset=np.array([[128, 230, 128]], np.uint8))
+    laying = Laying(Sim3(np.pi / 4))
+    cells, rows = resampled(grid, laying, np.zeros(3), 0.1)
+    means, points = laid_means(grid, laying, rows, cells, np.zeros(3), 0.1)
+    true = laying.apply(cell_middles(grid))[0]
+    inside = (np.floor(true / 0.1).astype(int) == cells).all(axis=1)
+    assert len(cells) > 1 and inside.sum() == 1 and points[inside] == 1 and (points[~inside] < 0.05).all()
+    assert np.allclose((cells[inside] + means[inside]) * 0.1, true)
+    assert ((means >= 0) & (means <= 1)).all()

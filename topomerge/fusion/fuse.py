@@ -17,6 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
+from topomerge.extraction.cell_means import with_means
 from topomerge.extraction.convolution import convolve, moore
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
@@ -24,9 +25,10 @@ from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.joined_doors import joined_rooms, laid_floor, with_doors
 from topomerge.fusion.joined_windows import laid_windows, with_joined_windows
-from topomerge.fusion.resampling import Laying, decoded, encoded, resampled
+from topomerge.fusion.resampling import Laying, decoded, encoded, laid_means, resampled
 from topomerge.fusion.single_walls import copies
 from topomerge.fusion.storey_levels import extruded
+from topomerge.kernels.voxelise import OFFSET_STEPS
 from topomerge.matching.consistency import matches_under
 from topomerge.matching.room_plans import room_plans
 from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
@@ -103,8 +105,8 @@ def _edge(parts: Sequence[_Part]) -> float:
 
 
 class _JoinedCells:
-    """What is joined so far: cells by their Morton codes, ascending, and which maps saw them; codes of the free ones, which are
-    twice as long.
+    """What is joined so far: cells by their Morton codes, ascending, which maps saw them, and where in them their points lie on
+    average (0..1), as how many points say; codes of the free cells, which are twice as long.
 
     Args:
         origin: (3,) m, corner of cell (0, 0, 0).
@@ -115,29 +117,42 @@ class _JoinedCells:
         self.origin, self.edge = origin, edge
         self.codes = self.free_codes = np.zeros(0, np.uint64)
         self.provenance = np.zeros(0, np.uint32)
+        self.means, self.points = np.zeros((0, 3)), np.zeros(0)
 
     def add_map(self, map: TopometricMap, laying: Laying, first_bit: int, assumed: bool) -> None:
         """Add a map; of one whose heights were assumed only what no other saw."""
         provenance = np.ones(len(map.grid), np.uint32) if map.provenance is None else map.provenance.astype(np.uint32)
         cells, rows = resampled(map.grid, laying, self.origin, self.edge)
         provenance = provenance[rows] << np.uint32(first_bit)
+        means, points = laid_means(map.grid, laying, rows, cells, self.origin, self.edge)
         if assumed and len(cells):
             added = self._contains(cells) | ~self._surveyed(cells)
-            cells, provenance = cells[added], provenance[added]
+            cells, provenance, means, points = cells[added], provenance[added], means[added], points[added]
         free_cells = None if map.free is None else resampled(map.free, laying, self.origin, 2 * self.edge)[0]
         if free_cells is not None and len(self.free_codes) and len(cells):
             occupied = decoded(self.codes)
             copy_of = copies((occupied, decoded(self.free_codes)), (cells, free_cells), self.edge)
             cells = np.where(copy_of[:, None] >= 0, occupied[copy_of], cells)
-        self._add(cells, provenance)
+            points = np.where(copy_of >= 0, 0.0, points)  # they lie beside the wall
+        self._add(cells, provenance, means, points)
         if free_cells is not None:
             self.free_codes = np.union1d(self.free_codes, encoded(free_cells))
 
-    def _add(self, cells: Array, provenance: Array) -> None:
+    def _add(self, cells: Array, provenance: Array, means: Array, points: Array) -> None:
         self.codes, row = np.unique(np.concatenate([self.codes, encoded(cells)]), return_inverse=True)
         joined = np.zeros(len(self.codes), np.uint32)
         np.bitwise_or.at(joined, row, np.concatenate([self.provenance, provenance]))
         self.provenance = joined
+        means, points = np.concatenate([self.means, means]), np.concatenate([self.points, points])
+        self.points = np.bincount(row, points, len(joined))
+        total = np.column_stack([np.bincount(row, points * means[:, k], len(joined)) for k in range(3)])
+        self.means = np.where(self.points[:, None] > 0, total / np.maximum(self.points, 1e-9)[:, None], 0.5)
+
+    def means_in_metres(self) -> Array:
+        """(n, 3) where the points of each cell lie on average, never on its border: rounding may take that for the next cell."""
+        steps = np.minimum(self.means * OFFSET_STEPS, OFFSET_STEPS - 1).astype(np.int64)
+        middles: Array = self.origin + (decoded(self.codes) + (steps + 0.5) / OFFSET_STEPS) * self.edge
+        return middles
 
     def _contains(self, cells: Array) -> Array:
         """(n,) bool: is a cell there already?"""
@@ -183,7 +198,9 @@ def _extracted(joined: _JoinedCells, neighbours: float, name: str) -> Topometric
     # Floors that the extraction assumes under slices are cells that no map saw.
     rows = grid.rows(grid.locate(map.grid.centroids()))
     seen_by = np.where(rows >= 0, provenance[rows], 0).astype(np.uint32)
-    return replace(map, provenance=seen_by, free=map.free if free is None else free)
+    # Not before: doors that are read off the means of two maps are worse than those of the plan and of the maps (docs/adr/0014).
+    middles = map.grid if not joined.points.any() else with_means(map.grid, joined.means_in_metres(), joined.points)
+    return replace(map, grid=middles, provenance=seen_by, free=map.free if free is None else free)
 
 
 def _usual_neighbours(grid: VoxelGrid) -> float:

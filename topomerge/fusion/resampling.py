@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from topomerge.extraction.cell_means import cell_middles
 from topomerge.fusion.bend.deformation import BETWEEN_STOREYS, Deformation
 from topomerge.kernels import morton
 from topomerge.kernels.resample import filled
@@ -19,6 +20,7 @@ RESAMPLED_AT_ONCE = 200_000  # cells
 SLACK = 0.02  # of a bent cell, by which neighbours overlap: each is taken as linear by itself
 TELLABLE = 0.2  # of a cell, by which bending must move a place of a map
 JACOBIAN_STEP = 0.02  # m
+FILLED_WEIGHT = 0.01  # of the points of a cell where they only fill a neighbour of the cell that they lie in
 CODE_OFFSET = 1 << 20  # cells are counted from there, as Morton codes hold no negative ones
 
 
@@ -116,6 +118,23 @@ def _filled(grid: VoxelGrid, chosen: slice, laying: Laying, origin: Array, edge:
     slack = SLACK if len(local) else 0.0
     cells, rows = filled(grid.cells[chosen], holding, matrix, local, slack, int(wide + 0.5), int(ratio / 2 + 0.5))
     return np.concatenate([cells, holding]), np.concatenate([rows, np.arange(len(holding))]) + chosen.start
+
+
+def laid_means(grid: VoxelGrid, laying: Laying, rows: Array, cells: Array, origin: Array, edge: float) -> tuple[Array, Array]:
+    """(n, 3) 0..1 where in the cells of a lattice the points of moved cells lie on average, and (n,) how many points say so.
+
+    The mean of a moved cell that fills a neighbour, too, lies outside of that: there its nearest place in the cell is taken, and
+    counts little. Of cells whose points are not known nothing is said.
+
+    Args:
+        rows: (n,) of the grid's cells that fill the cells (n, 3) of the lattice, as of `resampled`.
+    """
+    if "offset" not in grid.properties:
+        return np.full((len(cells), 3), 0.5), np.zeros(len(cells))
+    within = (laying.apply(cell_middles(grid))[rows] - origin) / edge - cells
+    inside = np.clip(within, 0, 1)
+    points = np.asarray(grid.properties.get("count", np.ones(len(grid))), np.float64)[rows]
+    return inside, points * np.where((inside == within).all(axis=1), 1.0, FILLED_WEIGHT)
 
 
 def encoded(cells: Array) -> Array:
