@@ -9,7 +9,7 @@ from tests.extraction.elevations.doors import SHUT_DOOR, extracted, niche, three
 from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.doorways import OPEN, SHUT, doorways
+from topomerge.extraction.elevations.doorways import OPEN, SHUT, doorways, read_both_ways
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
 from topomerge.extraction.elevations.wall_network import read_network
@@ -106,6 +106,12 @@ def test_a_model_each_for_what_shows_a_door():
     zeros = [0.0] * len(WALL_DOOR_FEATURES)
     models = {"both": [0.0, 2.0, *zeros[1:]], "plan": [-1.0, *zeros], "wall": [1.0, *zeros], "flat": [2.0, *zeros]}
     assert door_chance(candidates, models) == pytest.approx(1 / (1 + np.exp([-2.0, 1.0, -1.0, -2.0])))
+
+
+def test_a_mirrored_wall_has_the_same_doors_mirrored():
+    strip = two_doors(0)[2] / np.float32(255)
+    there = read_both_ways(strip)
+    assert np.abs(there - read_both_ways(strip[::-1])[::-1]).max() < 1e-6 and np.ptp(there[:, OPEN] + there[:, SHUT]) > 0.3
 
 
 def test_damaged_weights_are_refused(tmp_path):

@@ -96,6 +96,14 @@ def test_turned_and_shifted(two_rooms: StoreyPlan, turn: int) -> None:
     assert same[4:-4, 4:-4].mean() > 0.97
 
 
+@pytest.mark.parametrize("turn", [1, 2, 3])
+def test_a_turned_plan_has_turned_probabilities(two_rooms: StoreyPlan, turn: int) -> None:
+    """Exactly, where its sides fit the network's coarsest level: all four sides are looked at from."""
+    wall = np.pad(two_rooms.wall, ((3, 3), (1, 1)))  # 112 x 48
+    turned = np.rot90(column_probabilities(drawn(np.rot90(wall, turn))), -turn)
+    assert np.abs(turned - column_probabilities(drawn(wall))).max() < 1e-5
+
+
 def test_evidence(two_rooms: StoreyPlan) -> None:
     x = evidence(two_rooms)
     assert x.shape == (106, 46, EVIDENCE_CHANNELS) and x.dtype == np.float32 and np.isfinite(x).all()

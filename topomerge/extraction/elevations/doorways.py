@@ -36,9 +36,19 @@ DOORWAY_DTYPE = np.dtype(
 
 
 def place_classes(walls: Elevations) -> Array:
-    """(n / 2, 4) float32 probability of each of `WALL_CLASSES` in each place along all strips."""
-    parts = [place_probabilities(walls.strips[low:high]) for low, high in strip_bounds(walls)]
+    """(n / 2, 4) float32 probability of each of `WALL_CLASSES` in each place along all strips, each read from both its ends."""
+    parts = [read_both_ways(walls.strips[low:high]) for low, high in strip_bounds(walls)]
     return np.concatenate([np.zeros((0, len(WALL_CLASSES)), np.float32), *parts])
+
+
+def read_both_ways(strip: Array) -> Array:
+    """(n / 2, 4) float32 probability of each of `WALL_CLASSES`: a mirrored wall has the same doors, so two readings are averaged.
+
+    Args:
+        strip: (n, 32, 14), n even.
+    """
+    mean: Array = (place_probabilities(strip) + place_probabilities(strip[::-1])[::-1]) / np.float32(2)
+    return mean
 
 
 def door_places(walls: Elevations, classes: Array) -> Array:
