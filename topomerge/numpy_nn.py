@@ -14,8 +14,7 @@ from topomerge.types import Array
 
 LEAKY_SLOPE = 0.2  # of the leaky rectifier below 0 (Velickovic et al. 2018)
 LAYER_NORM_EPSILON = 1e-5  # added to the variance, as torch does
-CONVOLVED_ROWS = 64  # rows of an image at a time; all at once would take nine times its memory
-CONVOLVED_PIXELS = 1 << 14  # of several images at a time
+CONVOLVED_PIXELS = 1 << 11  # at a time: their windows, nine times as large, stay in the processor's cache
 
 
 def linear(x: Array, weight: Array, bias: Array | None = None) -> Array:
@@ -72,7 +71,7 @@ def convolution(x: Array, weight: Array, bias: Array, stride: int = 1) -> Array:
     n, nx, ny = len(images), images.shape[1] // stride, images.shape[2] // stride
     images = np.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     out = np.empty((n, nx, ny, weight.shape[1]), np.float32)
-    rows = min(CONVOLVED_ROWS, max(nx, 1))
+    rows = min(max(CONVOLVED_PIXELS // max(ny, 1), 1), max(nx, 1))
     step = max(CONVOLVED_PIXELS // max(rows * ny, 1), 1)
     for i in range(0, n, step):
         for row in range(0, nx, rows):
