@@ -51,7 +51,7 @@ def test_a_perceptron_is_rectified_between_its_layers_only(torch):
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-@pytest.mark.parametrize("rows", [16, 2 * numpy_nn.CONVOLVED_ROWS + 32])  # the larger one takes several rounds
+@pytest.mark.parametrize("rows", [16, numpy_nn.CONVOLVED_PIXELS])  # the larger one takes several rounds
 def test_a_convolution(torch, stride, rows):
     x, weight, bias = normal(rows, 8, 3).astype(np.float32), normal(27, 4).astype(np.float32), normal(4).astype(np.float32)
     kernel = torch.from_numpy(weight.reshape(3, 3, 3, 4).transpose(3, 2, 0, 1).copy())
