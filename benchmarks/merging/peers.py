@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from benchmarks.merging import peer_methods
 from benchmarks.merging.peer_calls import CALL_SECONDS, GuardedWork
 from benchmarks.merging.peer_pairs import PEER_SPLITS, PeerPair, described, peer_pairs, scaled
 from benchmarks.merging.register import SCALELESS, upright, where_from
+from topomerge.errors import InputError
 from topomerge.extraction.cell_means import cell_middles
 from topomerge.training.belief_hypotheses import error
 from topomerge.types import Array, PointCloud, VoxelGrid
@@ -43,6 +45,7 @@ PEER_CALLS: tuple[PeerCall, ...] = (  # each in a process of its own
     (GuardedWork(partial(peer_methods.kiss, voxel=0.3)), ("kiss03", "kiss03q")),
     (GuardedWork(peer_methods.open3d), ("fpfh", "fgr")),
 )
+PACKAGES = {"kiss_matcher": "kiss-matcher==1.0.2", "open3d": "open3d-cpu==0.19.*"}  # modules of the peers
 PeerCall = tuple[GuardedWork, tuple[str, ...]]
 Outcome = dict[str, Any]  # status (empty: answered), err, err_icp, scores, seconds, refinement_seconds
 
@@ -149,8 +152,24 @@ def done_of(target: Path) -> set[str]:
     return {json.loads(line)["name"] for line in target.read_text().splitlines()} if target.exists() else set()
 
 
+def check_peers() -> None:
+    """Refuse to measure where a peer is not installed: each of its answers would count as a miss.
+
+    Raises:
+        InputError: names the packages to install.
+    """
+    missing = [package for module, package in PACKAGES.items() if find_spec(module) is None]
+    if missing:
+        raise InputError(f"{', '.join(missing)}: not installed, so nothing can be compared; pip install {' '.join(missing)}")
+
+
 def run(seconds: float, what: str = "test") -> None:
-    """Measure what is missing, until the seconds of processor, simulation included, are used up."""
+    """Measure what is missing, until the seconds of processor, simulation included, are used up.
+
+    Raises:
+        InputError: a peer is not installed.
+    """
+    check_peers()
     os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})  # KISS-Matcher takes all cores otherwise
     os.environ["OMP_NUM_THREADS"] = "1"  # in the processes of the peers: two threads on one core wait for each other
     target = target_of(what)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from topomerge.errors import InputError
 from topomerge.types import Sim3, VoxelGrid
 
 
@@ -298,3 +299,11 @@ def test_ours_is_measured_anew_and_what_peers_answered_stays(module, monkeypatch
     after = [json.loads(line) for line in target.read_text().splitlines()]
     assert after[0]["methods"] == {"ours": {"err": [0.1, 0.0, 0.0]}, "kiss02": {"err": [9.0, 0.0, 1.0]}}
     assert after[1] == lines[1] and list(tmp_path.iterdir()) == [target]
+
+
+def test_without_a_peer_nothing_is_measured(module, monkeypatch) -> None:
+    """An answer of a peer that is not there would count as a miss of its."""
+    peers = module("peers")
+    monkeypatch.setitem(peers.PACKAGES, "no_such_module", "no-such-package==1.0")
+    with pytest.raises(InputError, match=r"no-such-package==1.0: not installed.*pip install"):
+        peers.check_peers()
