@@ -37,8 +37,8 @@ EMBED = Command(
     "describe each room of a map by numbers",
     "topomerge embed a.tmap --descriptor shapedna --k 1 -o a.npy",
     (
-        option("input", metavar="A", help="a .tmap, or a cloud, which is extracted first"),
-        output("A.npy", "NumPy array, a row for each room, or one for each quarter turn of it"),
+        option("input", metavar="A", help="a .tmap, or a cloud, from which a map is extracted first"),
+        output("A.npy", "NumPy array with a row for each room, or one for each of its quarter turns"),
         DESCRIPTOR,
         CONTEXT_STEPS,
         *CLOUD_OPTIONS,

@@ -82,7 +82,7 @@ def _add(commands: Any, command: Command) -> None:
     )
     for flags, settings in command.arguments:
         parser.add_argument(*flags, **settings)
-    parser.add_argument("-v", "--verbose", action="count", default=0, help="tell more; twice: with tracebacks")
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="print more; twice: also tracebacks")
     parser.set_defaults(run=command.run, paths=command.paths)
 
 

@@ -40,8 +40,8 @@ MATCH = Command(
     "find the rooms that two maps have in common",
     "topomerge match a.tmap b.tmap --json",
     (
-        option("a", metavar="A", help="a .tmap, or a cloud, which is extracted first"),
-        option("b", metavar="B", help="the other one"),
+        option("a", metavar="A", help="a .tmap, or a cloud, from which a map is extracted first"),
+        option("b", metavar="B", help="the other map, likewise"),
         json_option(),
         option(
             "--report",
@@ -53,7 +53,8 @@ MATCH = Command(
             "--method",
             choices=("consistent", "attention", "growing", "assignment", "thesis"),
             default="consistent",
-            help="sets of matches that one transform explains (default), or simpler ways",
+            help="consistent (default): sets of matches that one transform explains; attention: a network that sees both maps; "
+            "the others are simpler",
         ),
         option("--scale", dest="scale_of_b", choices=("free", "known"), default="known", help="free: the scale of b is unknown"),
         DESCRIPTOR,

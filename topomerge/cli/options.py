@@ -94,49 +94,50 @@ def json_option(help: str = "print JSON instead of tables") -> Argument:
 UP = option(
     "--up",
     choices=("z", "y", "x", "-z", "-y", "-x"),
-    help="axis of the input that points up (default z, for glTF y); -y: it points down",
+    help="axis of the input that points up (default z, for glTF y); with a minus sign: down",
 )
 UNIT = option("--unit", choices=("m", "cm", "mm", "ft", "in"), help="unit of the input (default m)")
 DESCRIPTOR = option(
     "--descriptor",
     default="learned",
     metavar="NAME",
-    help="learned (default: the embedder that ships), engineered, shapedna, feather, or the folder of a trained embedder",
+    help="learned (default; the embedder that ships), engineered, shapedna, feather, or the folder of a trained embedder",
 )
 BELIEF_OPTIONS = (
     option(
         "--known",
         dest="same",
         choices=("nothing", "building", "storey"),
-        help="what you know of the maps: all of one building, or of one storey (default nothing); the rest need not be ruled out",
+        help="what you already know: all maps are of one building, or of one storey (default nothing)",
     ),
+    option("--risk", type=above_zero, metavar="N", help="accept so many false merges in a thousand pairs; sets the threshold"),
     option(
-        "--risk", type=above_zero, metavar="N", help="false merges in a thousand pairs that you accept; the threshold follows"
-    ),
-    option(
-        "--threshold", type=share, metavar="P", help="probability from which to believe (default 0.65; of an atlas 0.8 or 0.9)"
+        "--threshold",
+        type=share,
+        metavar="P",
+        help="merge from this probability on (default 0.65; in an atlas 0.8, or 0.9 above eleven maps)",
     ),
 )
 ATLAS_OPTIONS = (
-    option("--scale", choices=("fixed", "free"), help="free: the scales of the maps differ (default fixed)"),
+    option("--scale", choices=("fixed", "free"), help="free: the maps may differ in scale (default fixed)"),
     *BELIEF_OPTIONS,
     option(
         "--descriptor",
         dest="embedder",
         choices=("learned", "engineered", "shapedna", "feather"),
-        help="let matched rooms propose places, too; takes twice as long (default: geometry only)",
+        help="also try the poses that matched rooms propose; takes twice as long (default: walls only)",
     ),
 )
 SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of fusion/bend/drift.json
 CONTEXT_STEPS = option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)")
 CLOUD_OPTIONS = (
-    option("--voxel-size", type=above_zero, metavar="E", help="edge length of a cell where a cloud is given, m (default 0.1)"),
+    option("--voxel-size", type=above_zero, metavar="E", help="edge length of the cells of a cloud, m (default 0.1)"),
     UP,
     UNIT,
     option(
         "--sensor",
         choices=SENSORS,
-        help="what measured the clouds, by which merge knows how much a map may bend (default: unknown, like a phone)",
+        help="sensor of the clouds: sets how much drift merge may bend away (default: unknown, as much as for a phone)",
     ),
 )
 

@@ -33,13 +33,15 @@ SIMULATE = Command(
     "topomerge simulate --building office --seed 7 --sensors tls,depth --overlap 0.4 -o pair/",
     (
         option("--building", required=True, metavar="KIND", default=None, help="office, hotel, house, school, ..."),
-        option("--seed", type=count, metavar="N", help="another number, another building (default 7)"),
+        option("--seed", type=count, metavar="N", help="each number makes another building (default 7)"),
         option("--storeys", type=count, metavar="N", help="1 to 8 (default 1)"),
         option("--sensors", metavar="A,B", help="tls lidar depth mono laser2d tablet; one gives one cloud (default tls,depth)"),
         option("--overlap", type=float, metavar="S", help="share of the rooms that both maps visit (default 0.4)"),
-        option("--rooms", type=count, metavar="N", help="of each map, at most (default 15; all, of a single cloud)"),
+        option("--rooms", type=count, metavar="N", help="rooms of each map, at most (default 15; a single cloud has all)"),
         option("--scale", choices=("free", "known"), default="known", help="free: the scale of b is unknown"),
-        option("--hard", choices=("other-building", "other-storey", "twin-wing"), help="b is of a place that looks like a's"),
+        option(
+            "--hard", choices=("other-building", "other-storey", "twin-wing"), help="b shows a place that looks like that of a"
+        ),
         output("DIR", "folder for a.ply, b.ply, truth.json, plan.png"),
         quiet(),
     ),

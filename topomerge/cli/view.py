@@ -92,9 +92,9 @@ VIEW = Command(
     "show a report in the browser",
     "topomerge view merged/",
     (
-        option("input", metavar="PATH", help="folder of a merge or an atlas, a .tmap (its report is made) or an .html"),
-        option("-o", "--output", metavar="A.html", default=None, help="of a .tmap: keep the report here"),
-        option("--no-open", dest="open", action="store_false", default=True, help="only print where it is"),
+        option("input", metavar="PATH", help="folder of a merge or an atlas, a .tmap (a report is made of it) or an .html"),
+        option("-o", "--output", metavar="A.html", default=None, help="keep the report of a .tmap here"),
+        option("--no-open", dest="open", action="store_false", default=True, help="only print where the report is"),
         option(
             "--serve",
             nargs="?",
@@ -102,7 +102,7 @@ VIEW = Command(
             default=None,
             type=_port,
             metavar="PORT",
-            help="serve it to this machine only, until Ctrl-C (default: any free port)",
+            help="serve it on this machine until Ctrl-C (default: any free port)",
         ),
     ),
     paths=("input", "output"),

@@ -116,23 +116,22 @@ WATCH = Command(
     "put scans and maps that appear in a folder into an atlas",
     "topomerge watch scans/ -o site/",
     (
-        option("folder", metavar="DIR", help="that is watched: each file or folder of scans right in it is one map"),
+        option("folder", metavar="DIR", help="folder to watch: each file, or folder of scans, directly in it is one map"),
         output("ATLAS", "the atlas; a new folder becomes one"),
-        option("--once", action="store_true", default=False, help="end when all that is there is in the atlas"),
+        option("--once", action="store_true", default=False, help="stop when everything in the folder is in the atlas"),
         option("--every", type=above_zero, default=EVERY, metavar="S", help="seconds between two looks (default 2)"),
         option(
             "--settle",
             type=above_zero,
             default=SETTLE,
             metavar="S",
-            help="seconds without a change, after which a file is taken as written (default 2)",
+            help="a file is complete after so many seconds without a change (default 2)",
         ),
         option(
             "--replace",
             choices=("longer", "never"),
             default="longer",
-            help="longer (default): a file that was changed takes the place of its map before if it has most rooms of that one; "
-            "never: both stay",
+            help="longer (default): a changed file replaces its earlier map if it has most of that map's rooms; never: both stay",
         ),
         *ATLAS_OPTIONS,
         *CLOUD_OPTIONS,
