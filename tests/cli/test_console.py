@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import pytest
 
 from topomerge.cli import console
+from topomerge.errors import InputError
 
 
 class Terminal:
@@ -47,6 +49,13 @@ def test_bars_only_when_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_bars_without_a_terminal() -> None:
     with console.Bars(delay=0.0) as bars:
         assert bars.task("read") is None
+
+
+def test_links_in_a_circle_are_no_fault_of_ours(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").symlink_to("a.ply")
+    with pytest.raises(InputError, match="no such file"):
+        console.check_inputs([str(tmp_path / "a.ply")])
+    console.check_outputs([tmp_path / "b.tmap"], [tmp_path / "a.ply"])
 
 
 def test_a_failure_is_one_line_whatever_the_file_is_called() -> None:

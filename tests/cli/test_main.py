@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 import subprocess
 import sys
@@ -79,6 +80,13 @@ def test_module_and_version() -> None:
 def test_help_has_an_example(run: Run, command: str) -> None:
     status, out, _ = run(command, "--help")
     assert status == 0 and f"example:\n  topomerge {command} " in out and "exit status" in out
+
+
+def test_a_stream_that_the_caller_closed_is_no_failure(tmp_path: Path) -> None:
+    command = f"{shlex.quote(sys.executable)} -m topomerge"
+    for words, status in (("completion bash >&-", 0), ("info nowhere.tmap 2>&-", 1)):
+        done = subprocess.run(["sh", "-c", f"{command} {words}"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        assert (done.returncode, done.stdout, done.stderr) == (status, "", "")
 
 
 def test_presets_are_those_of_extract() -> None:
@@ -199,6 +207,7 @@ def test_a_fault_of_ours_asks_for_a_report(run: Run, stages: dict[str, Any], mon
         (["-o", "."], "is a folder"),
         (["-o", "a.tmap", "--json", "a.tmap"], "two outputs"),
         (["-o", "scan.ply"], "is the input"),
+        (["-o", "rooms.ply"], "rooms.ply: -o names the map; end its name with .tmap"),
         (["-o", "a.tmap", "--figure", "a.docx"], "unknown kind of figure"),
         (["-o", "a.tmap", "--ply", "absent/a.ply"], "absent/a.ply: can't be written"),
     ],

@@ -33,6 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "copy.tmap").write_bytes((place / "b.tmap").read_bytes())
     (place / "broken.tmap").write_bytes((place / "b.tmap").read_bytes()[:-2000])
     (place / "text.ply").write_text("no points\n")
+    (place / "plan.png").write_text("a picture by its name\n")
     np.save(place / "mm.npy", np.load(place / "a.npy")[::40] * 1000)
     return place
 
@@ -100,6 +101,7 @@ def test_force_writes_all_and_keeps_the_status(run: Run, folder: Path) -> None:
         (("b.tmap", "broken.tmap"), "topomerge: broken.tmap: "),
         (("b.tmap", "text.ply"), "topomerge: text.ply: "),
         (("b.tmap", "mm.npy"), "topomerge: mm.npy: "),
+        (("b.tmap", "plan.png"), "(--resolution: of `topomerge extract`, whose .tmap can be given here)"),
         (("b.tmap", "c.tmap", "--threshold", "2"), "from 0 to 1"),
         (("b.tmap", "c.tmap", "--scale", "2"), "invalid choice"),
     ],

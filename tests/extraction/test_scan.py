@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -41,6 +44,20 @@ def test_sparse_points_get_larger_cells() -> None:
     scan = read_scan(POINTS[::4] * 2, 0.1, least_neighbours=3.5)
     assert scan.grid.edge > 0.1 and "sparse" in scan.warnings[0]
     assert read_scan(POINTS[::4] * 2, 0.1).grid.edge == 0.1
+
+
+@pytest.mark.parametrize("source", ["scan.ply", Path("scan.ply")])
+def test_a_path_must_be_read_first(source: Any) -> None:
+    with pytest.raises(InputError, match=r"^scan\.ply: extract takes points, not the name of a file; read it with read_points"):
+        read_scan(source, 0.1)
+
+
+def test_points_are_numbers() -> None:
+    with pytest.raises(InputError, match="not a sequence of list"):
+        read_scan(POINTS.tolist(), 0.1)
+    for points in (np.full((2, 3), "a"), np.zeros((2, 3), object), POINTS.tolist()):
+        with pytest.raises(ValueError, match="must be an .* array of numbers"):
+            PointCloud(points)
 
 
 def test_what_looked_wrong_is_told_with_the_error() -> None:

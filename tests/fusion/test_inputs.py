@@ -10,8 +10,9 @@ import pytest
 from tests.scenes_map import building
 from topomerge.errors import InputError
 from topomerge.fusion.inputs import check_different, check_pair, check_units, checked_threshold, pair_warnings
+from topomerge.fusion.merge import merge
 from topomerge.fusion.verify import model
-from topomerge.types import TopometricMap
+from topomerge.types import PointCloud, TopometricMap
 
 
 def scaled(map: TopometricMap, times: float, name: str = "large.ply") -> TopometricMap:
@@ -55,6 +56,13 @@ def test_one_map_is_not_merged_with_itself():
     moved = replace(map, grid=replace(map.grid, origin=map.grid.origin + (1.0, 0.0, 0.0)))
     for other in (moved, scaled(map, 2.0), building(2)):
         check_different(map, other)
+
+
+def test_what_is_no_map_is_named():
+    with pytest.raises(InputError, match=r"^a\.tmap: merge takes maps; read a \.tmap with load_map"):
+        merge(["a.tmap", "b.tmap"])
+    with pytest.raises(InputError, match="^PointCloud: merge takes maps"):
+        merge([building(1), PointCloud(np.zeros((1, 3)))])
 
 
 def test_storeys_twice_as_high_are_told_of_with_the_unit_in_mind():

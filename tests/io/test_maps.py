@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -229,6 +230,8 @@ def test_warnings_are_limited_in_number_and_length(scene: TopometricMap, tmp_pat
 def test_not_a_map(tmp_path: Path) -> None:
     refused(tmp_path / "absent.tmap", "no such file")
     refused(tmp_path, "folder")
+    os.mkfifo(tmp_path / "pipe.tmap")
+    refused(tmp_path / "pipe.tmap", "no regular file")
     for name, content in {"empty": b"", "text": b"ply\nformat ascii 1.0\n", "zip": b"PK\x05\x06" + bytes(18)}.items():
         (tmp_path / name).write_bytes(content)
         refused(tmp_path / name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -125,6 +126,11 @@ class _Probe(Exception):
     """Ends a trial of writing."""
 
 
+def _place(path: str | Path) -> Path:
+    """Where a path leads, through all links; one that leads round in a circle, at which `Path.resolve` fails, to itself."""
+    return Path(os.path.realpath(path))
+
+
 def check_inputs(paths: Sequence[str]) -> None:
     """Find out before the work starts whether its files are there, each of them once.
 
@@ -133,7 +139,7 @@ def check_inputs(paths: Sequence[str]) -> None:
     """
     seen: set[Path] = set()
     for path in paths:
-        place = Path(path).resolve()
+        place = _place(path)
         if not place.exists():
             raise InputError(f"{path}: no such file; check the path")
         if place in seen:
@@ -172,11 +178,11 @@ def check_outputs(outputs: Sequence[str | Path], inputs: Sequence[str | Path] = 
     """
     from topomerge.io.atomic import replacing  # here, because topomerge.io imports NumPy
 
-    taken = {Path(path).resolve(): "is the input: it would be overwritten; give another name" for path in inputs}
+    taken = {_place(path): "is the input: it would be overwritten; give another name" for path in inputs}
     for path in map(Path, outputs):
         if path.is_dir():
             raise InputError(f"{path}: is a folder; give the name of a file in it")
-        place = path.resolve()
+        place = _place(path)
         if place in taken:
             raise InputError(f"{path}: {taken[place]}")
         taken[place] = "is named for two outputs; give each its own name"
@@ -204,4 +210,4 @@ def write_all(outputs: Sequence[tuple[str | Path, Callable[[Path], None]]]) -> N
                 raise InputError(f"{path}: can't be written ({error.strerror or error}); give another place") from error
         if len(outputs) > 1:  # a kill between two renames must not leave one file of this run beside one of an earlier run
             for path, _ in outputs:
-                Path(path).resolve().unlink(missing_ok=True)
+                _place(path).unlink(missing_ok=True)

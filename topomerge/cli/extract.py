@@ -12,6 +12,7 @@ from topomerge.cli.console import Bars, check_outputs, say, warn, write_all
 from topomerge.cli.options import UNIT, UP, above_zero, given, output, quiet
 from topomerge.errors import InputError
 
+OTHER_OUTPUTS = "--json, --ply, --figure, --report"
 FIGURE_FORMATS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 
@@ -19,6 +20,8 @@ def extract_command(args: argparse.Namespace) -> int:
     """`topomerge extract`: find the rooms, doors and storeys of a cloud; write the map and whatever else was asked for."""
     outputs = _outputs(args)
     check_outputs([path for path, _ in outputs], [args.input, *given(args, "poses").values()])
+    if Path(args.output).suffix.lower() != ".tmap":  # no other command would take it for a map
+        raise InputError(f"{args.output}: -o names the map; end its name with .tmap (for other files there are {OTHER_OUTPUTS})")
     with Bars(enabled=not args.quiet) as bars:
         from topomerge.extraction.extract import extract
         from topomerge.io.points import read_chunks

@@ -111,6 +111,14 @@ def _joined(words: Sequence[str]) -> list[str]:
     return joined
 
 
+def _open_closed_streams() -> None:
+    """Give a stream that the caller closed (`>&-`) a place to go: else what is printed fails, or goes to the other stream."""
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+
+
 def _run(args: argparse.Namespace) -> int:
     debug = args.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
     logging.basicConfig(format="topomerge: %(message)s")
@@ -148,6 +156,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if argv is None:
         leave_on_signals()
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without m² must not end the work

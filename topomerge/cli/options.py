@@ -142,6 +142,10 @@ CLOUD_OPTIONS = (
 )
 
 
+# Advice of the readers that only `extract` can take: --scale and --poses of `merge` are others.
+EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
+
+
 def map_from(path: str, args: argparse.Namespace) -> TopometricMap:
     """The map in a .tmap, or the one that is extracted from anything else with the `CLOUD_OPTIONS` that were given.
 
@@ -162,6 +166,9 @@ def map_from(path: str, args: argparse.Namespace) -> TopometricMap:
                 topomap = extract(chunks, **given(args, "voxel_size"), name=path, progress=bars.task("extract"))
             topomap = replace(topomap, parameters={**topomap.parameters, **given(args, "sensor")})
     except InputError as error:
-        raise InputError(str(error) if path in str(error) else f"{path}: {error}") from error
+        text = str(error) if path in str(error) else f"{path}: {error}"
+        if advised := [name for name in EXTRACT_ADVICE if name in text]:
+            text += f" ({', '.join(advised)}: of `topomerge extract`, whose .tmap can be given here)"
+        raise InputError(text) from error
     warn(topomap.warnings)
     return topomap

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -66,8 +67,11 @@ def read_scan(
         least_neighbours: that the median cell has, of 26; the cells are doubled until it has them. 0: never.
 
     Raises:
-        InputError: no finite point, an absurd extent, or cells of a size that shows no rooms and doors.
+        InputError: no finite point, an absurd extent, cells of a size that shows no rooms and doors, or a path or a list in
+            place of points.
     """
+    if isinstance(source, str | Path):
+        raise InputError(f"{source}: extract takes points, not the name of a file; read it with read_points or read_chunks")
     edge = source.edge if isinstance(source, VoxelGrid) else voxel_size
     if not (isinstance(edge, int | float) and FINEST_CELL <= edge <= COARSEST_CELL):
         raise InputError(f"voxel size must be between {FINEST_CELL} and {COARSEST_CELL} m to find rooms and doors, not {edge}")
@@ -111,6 +115,9 @@ class _Chunks:
 
     def __iter__(self) -> Iterator[PointCloud]:
         for chunk in self.chunks:
+            if not isinstance(chunk, PointCloud):
+                kind = type(chunk).__name__
+                raise InputError(f"extract takes a cloud, chunks of one or an (N, 3) array of points, not a sequence of {kind}")
             self.source = chunk.source
             self.free = chunk.free or self.free
             self.warnings += [w for w in chunk.warnings if w not in self.warnings]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,14 @@ UNIT_SPAN = 300.0  # m, and
 UNIT_RATIO = 30.0  # times the other map: a map that spans this is in another unit
 UNIT_RATIO_MM = 300.0  # times the other map: in millimetres rather than centimetres
 TALL_RATIO = 2.2  # times the height of the other's storeys: another unit, or a hall
+
+
+def check_maps(maps: Sequence[object]) -> None:
+    """Raise InputError for what is no map, as a path or a cloud."""
+    for map in maps:
+        if not isinstance(map, TopometricMap):
+            name = str(map) if isinstance(map, str | Path) else type(map).__name__
+            raise InputError(f"{name}: merge takes maps; read a .tmap with load_map, make a map of points with extract")
 
 
 def check_scale(scale: str) -> None:

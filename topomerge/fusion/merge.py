@@ -21,7 +21,7 @@ from topomerge.fusion.bend.bend import NEITHER_BENDS
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import fuse, rooms_in_common
-from topomerge.fusion.inputs import check_pair, check_poses, check_scale, checked_threshold, pair_warnings
+from topomerge.fusion.inputs import check_maps, check_pair, check_poses, check_scale, checked_threshold, pair_warnings
 from topomerge.fusion.posterior import check_same
 from topomerge.fusion.prepared import registration_order
 from topomerge.fusion.registration import Registration, register
@@ -61,14 +61,16 @@ def merge(
         same: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
 
     Raises:
-        InputError: fewer than two maps, one map twice, a map without cells, maps in different units, another word for the scale,
-            the poses or what the maps are of, or poses of rooms without Open3D (`pip install
-    topomerge[open3d]`)."""
+        InputError: fewer than two maps, something that is no map, one map twice, a map without cells, maps in different units,
+            another word for the scale, the poses or what the maps are of, or poses of rooms without Open3D (`pip install
+            topomerge[open3d]`).
+    """
     check_poses(poses, len(maps), scale)
     if poses == "rooms":
         check_open3d()
     if len(maps) < 2:
         raise InputError(f"merge takes two maps or more, {len(maps)} given; give another one")
+    check_maps(maps)
     check_scale(scale)
     check_same(same)
     settings = _Settings(scale, force, threshold, embedder, poses, rigid, same)

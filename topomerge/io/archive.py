@@ -75,6 +75,8 @@ def _archive_of(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder, not a {kind}; name a file")
+    if path.exists() and not path.is_file():  # to open a pipe would wait for ever
+        raise InputError(f"{path}: is no regular file (a pipe or a device), not a {kind}; name a file")
     try:
         with path.open("rb") as file:
             start = file.read(4)

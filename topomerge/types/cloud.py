@@ -40,7 +40,7 @@ class PointCloud:
         warnings: what looked wrong while it was read.
 
     Raises:
-        ValueError: arrays of other shapes.
+        ValueError: arrays of other shapes, or points that are no array of numbers.
     """
 
     points: Array
@@ -55,6 +55,8 @@ class PointCloud:
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        numbers = isinstance(self.points, np.ndarray) and self.points.dtype.kind in "biuf"
+        require(numbers, f"points must be an (N, 3) array of numbers, not {getattr(self.points, 'dtype', type(self.points))}")
         require(self.points.ndim == 2 and self.points.shape[1] == 3, f"points must be (N, 3), not {self.points.shape}")
         for name in ("colors", "labels", "pose_of"):
             values = getattr(self, name)
