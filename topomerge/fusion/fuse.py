@@ -117,7 +117,8 @@ class _JoinedCells:
         self.origin, self.edge = origin, edge
         self.codes = self.free_codes = np.zeros(0, np.uint64)
         self.provenance = np.zeros(0, np.uint32)
-        self.means, self.points = np.zeros((0, 3)), np.zeros(0)
+        self.means: Array = np.zeros((0, 3))
+        self.points: Array = np.zeros(0)
 
     def add_map(self, map: TopometricMap, laying: Laying, first_bit: int, assumed: bool) -> None:
         """Add a map; of one whose heights were assumed only what no other saw."""

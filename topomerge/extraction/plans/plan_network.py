@@ -58,7 +58,7 @@ def column_probabilities(plan: StoreyPlan, network: dict[str, Array] | None = No
     x = np.pad(x, ((margin, -nx % margin + margin), (margin, -ny % margin + margin), (0, 0)))
     w = weights() if network is None else network
     turned = (softmax(forward(np.ascontiguousarray(np.rot90(x, k)), w)) for k in range(4))
-    mean = sum(np.rot90(probability, -k) for k, probability in enumerate(turned)) / np.float32(4)
+    mean: Array = np.mean([np.rot90(probability, -k) for k, probability in enumerate(turned)], axis=0)
     return np.ascontiguousarray(mean[margin : margin + nx, margin : margin + ny])
 
 
