@@ -284,7 +284,7 @@ def test_three_maps_are_merged_by_an_atlas(tmp_path, remembered):
     result.save(tmp_path / "merged")
     assert sorted(p.name for p in (tmp_path / "merged").iterdir()) == ["map.tmap", "merge.json", "merged.ply", "report.html"]
     page = (tmp_path / "merged" / "report.html").read_text(encoding="utf-8")
-    assert "All maps belong together" in page and "south" in page and "data-scene=" in page
+    assert "All maps are connected" in page and "south" in page and "data-scene=" in page
 
 
 @pytest.mark.longer
