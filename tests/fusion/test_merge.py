@@ -224,7 +224,7 @@ def test_the_report_says_it_all(merged, refused):
     text = merge_html(merged)
     for words in (
         "Merged · probability",
-        "walls on walls",
+        "matching walls",
         "Why it is believed",
         "data-blend",
         'data-room="a0"',
