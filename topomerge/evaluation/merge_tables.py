@@ -34,7 +34,7 @@ def merging(merges: Sequence[Row], key: str, settings: Evaluation) -> Table:
             rows.append([name, group, str(pairs), str(able), *cells, _wrong(these), f"{took:.1f}"])
     metrics = (METRIC_NAMES[m] for m in MERGING)
     head = ["merged with", key or "pairs", "pairs", "mergeable", *metrics, "merged wrongly", "s per pair"]
-    title = "Merges of pairs that overlap; right: within 0.5 m and 5°, unless the column says otherwise"
+    title = "Merges: shares of the overlapping pairs; right: within 0.5 m and 5°, unless the column says otherwise"
     return Table(title + (f", by {BY[key][0].lower()}{BY[key][1:]}" if key else ""), head, rows, 2)
 
 
