@@ -95,9 +95,7 @@ def partners_text(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Ro
     rng = np.random.default_rng(0)
     draws = [rng.permutation(len(common))[:PARTNER_PAIRS] for _ in range(PARTNER_DRAWS)]
     few = np.mean([partners_named([common[k] for k in draw]) for draw in draws])
-    said = (
-        f"Pairs of which one map names the other among its {FIRST[-1]} most alike: {few:.2f} of {PARTNER_PAIRS} pairs in an"
-    )
+    said = f"Pairs in which one map is among the {FIRST[-1]} most similar of the other: {few:.2f} of {PARTNER_PAIRS} pairs in an"
     all_of_them = f"{partners_named(common):.2f} of {len(common)} in one of {2 * len(common)}"
     return f"{said} atlas of {2 * PARTNER_PAIRS} maps ({PARTNER_DRAWS} draws), {all_of_them}."
 
@@ -107,10 +105,10 @@ def table(results: Sequence[tuple[str, Sequence[Search]]], maps: int, buildings:
     groups = np.array([r.building for r in results[0][1]])
     chance = [1 - (1 - 1 / buildings) ** n for n in FIRST]
     lines = [
-        f"{len(groups)} maps of {len(set(groups))} physical buildings looked for among {maps} maps of {buildings} with "
-        f"{rooms} rooms; in brackets 95 % intervals over buildings.",
+        f"Queries: {len(groups)} maps of {len(set(groups))} physical buildings; atlas: {maps} maps of {buildings} buildings with "
+        f"{rooms} rooms. In brackets 95 % intervals over buildings.",
         "",
-        "| embedder | building first | among 5 | among 10 | the same map first | rooms named right | s a search |",
+        "| embedder | building first | among 5 | among 10 | same first map | rooms matched right | s per query |",
         "|---|---|---|---|---|---|---|",
     ]
     for name, of in results:

@@ -114,11 +114,11 @@ def table(maps: Sequence[Described], results: Sequence[tuple[str, Array, Array]]
     """Named results as Markdown."""
     groups = np.array([m.building for m in maps if m.shared >= SHARED])
     lines = [
-        f"{len(groups)} maps of {len(set(groups.tolist()))} buildings that show {SHARED:g} m² of what another one shows, "
-        f"each looked for among {len(maps) - 1} others of {len({m.building for m in maps})} buildings "
-        f"({sum(len(m.rows) for m in maps)} rooms in all); in brackets 95 % intervals over buildings.",
+        f"Queries: {len(groups)} maps of {len(set(groups.tolist()))} buildings that share {SHARED:g} m² or more with another "
+        f"map; atlas: the other {len(maps) - 1} maps of {len({m.building for m in maps})} buildings "
+        f"({sum(len(m.rows) for m in maps)} rooms in all). In brackets 95 % intervals over buildings.",
         "",
-        "| embedder | building first | among 5 | among 10 | s a search |",
+        "| embedder | building first | among 5 | among 10 | s per query |",
         "|---|---|---|---|---|",
     ]
     for name, ranks, seconds in results:
@@ -139,7 +139,7 @@ def main(words: Sequence[str] | None = None) -> int:
     maps = described(list(scale_maps(args.buildings)), args.descriptor)
     results = [(args.descriptor, *search(maps, len(maps)))]
     results.append((f"{args.descriptor}, shortlist of {SHORTLIST}", *search(maps, SHORTLIST)))
-    laid = f"{args.descriptor}, shortlist, {LAID_COARSELY} laid coarsely"
+    laid = f"{args.descriptor}, shortlist, {LAID_COARSELY} aligned coarsely"
     with one_thread():
         results.append((laid, *laid_search(maps, held(list(scale_maps(args.buildings)), SCALE_CACHE), SHORTLIST)))
     command = " ".join(["python -m benchmarks.retrieval_many", *(sys.argv[1:] if words is None else words)])

@@ -78,7 +78,7 @@ def measure(folder: Path) -> dict[str, Any]:
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Markdown."""
-    head = "| maps | sets | s of a core | slowest | peak MiB | pairs registered | of | placed right | wrong | median error m |"
+    head = "| maps | sets | s on one core | slowest | peak MiB | pairs registered | of | placed right | wrong | median error m |"
     lines = [head, "|" + "---|" * head.count(" |")]
     for size in SIZES:
         some = [r for r in rows if r["maps"] == size]

@@ -32,11 +32,11 @@ Row = dict[str, Any]
 Judged = tuple[Row, float, int]  # of a pair: its row, the probability of its best pose, its label
 BENDING = ("margin", "ahead", "alone", "strain", "doubted")
 PARTS = {  # what is left out
-    "all of it": (),
+    "all evidence": (),
     "without places": PLACE_VECTOR,
     "without repetition": ("repeats",),
     "without the lead between bent maps": BENDING,
-    "whole-map amounts alone": (*PLACE_VECTOR, *BENDING, "repeats"),
+    "whole-map features only": (*PLACE_VECTOR, *BENDING, "repeats"),
 }
 SHARES = (0.25, 0.5, 1.0)  # of the simulated pairs
 THRESHOLDS = (0.5, 0.6, 0.65, 0.7, 0.8, 0.9)
@@ -110,8 +110,8 @@ def figures(judged: Sequence[Judged], floor: Sequence[Judged], threshold: float)
 
 
 BELIEF_HEADS = (
-    "≥ 80 m²", "40–80 m²", "development floor", "… wrong", "other buildings", "other storeys", "twin wings", "look-alikes",
-    "false in 1,000",
+    "≥ 80 m²", "40–80 m²", "development floor", "floor, pose wrong", "other buildings", "other storeys", "twin wings",
+    "look-alikes", "false merges per 1,000",
 )  # fmt: skip
 
 
@@ -119,16 +119,16 @@ def tables(rows: Sequence[Row], floor: Sequence[Row], settings: MergeBelief) -> 
     """The lines of the page."""
     usual, lines = merge_belief.belief_vector, []
     whole, of_floor = left_out(rows, floor, settings)
-    lines += ["### By threshold", "", *head("believed from")]
+    lines += ["### By threshold", "", *head("threshold")]
     lines += [line(f"{t:g}", figures(whole, of_floor, t)) for t in THRESHOLDS]
     threshold = float(merge_belief.model()["threshold"])
-    lines += ["", f"### What each part brings (believed from {threshold:g})", "", *head("evidence")]
+    lines += ["", f"### Contribution of each part of the evidence (threshold {threshold:g})", "", *head("evidence")]
     for name, silent in PARTS.items():
         merge_belief.belief_vector = silenced(silent)
         lines.append(line(name, figures(*left_out(without(rows, silent), without(floor, silent), settings), threshold)))
     merge_belief.belief_vector = usual
-    lines.append(line("without the floor in the fit", figures(*without_floor(rows, floor, settings), threshold)))
-    lines += ["", f"### Number of pairs (believed from {threshold:g})", "", *head("simulated pairs")]
+    lines.append(line("without the development floor in the fit", figures(*without_floor(rows, floor, settings), threshold)))
+    lines += ["", f"### Number of training pairs (threshold {threshold:g})", "", *head("simulated pairs")]
     order = np.random.default_rng(0).permutation(len(rows))
     for share in SHARES:
         some = [rows[k] for k in sorted(order[: round(share * len(rows))])]

@@ -24,7 +24,7 @@ PRIOR = {
 MADE_ALIKE = {"modules": "repeated modules", "shifted-row": "repeated modules", "mirror": "own mirror image"}
 PRIOR_ROUNDS = 20_000
 NEGATIVE_HEADS = (
-    "kind", "pairs", "believed", "physical buildings", "with a false merge: exact 95 %", "of the pairs, nobody can tell",
+    "kind", "pairs", "believed", "physical buildings", "with a false merge (exact 95 %)", "indistinguishable pairs",
     "of these, believed", "highest probabilities",
 )  # fmt: skip
 
@@ -98,7 +98,7 @@ def false_merges(rows: Sequence[Row]) -> str:
     out.append(tally("**all**", rows))
     alike = [r for r in rows if not tellable(r)]
     if alike:
-        out.append(tally("**nobody can tell apart** (of all; right: to abstain)", alike))
+        out.append(tally("**indistinguishable** (of all; right: to abstain)", alike))
     for name in sorted({name for r in rows for name in properties(r)}):
         out.append(tally(f"of all, with {name}", [r for r in rows if name in properties(r)]))
     return table(NEGATIVE_HEADS, out)
@@ -131,6 +131,6 @@ def headline(rows: Sequence[Row]) -> str:
     missing = [kind for kind in PRIOR if not any(r["negative"] == kind for r in rows)]
     rate, low, high = (100 * v for v in rate_at(rows))
     apart, least, most = (100 * v for v in rate_at([r for r in rows if tellable(r)]))
-    text = f"**{rate:.1f} % [{low:.1f}, {high:.1f}] of the pairs that must not merge are believed**, every pair in, at this "
-    text += f"prior of kinds: {shares}. Without the pairs that nobody can tell apart {apart:.1f} % [{least:.1f}, {most:.1f}]."
-    return text + (f" Not measured, so that the other shares are raised: {', '.join(missing)}." if missing else "")
+    text = f"**{rate:.1f} % [{low:.1f}, {high:.1f}] of the pairs that must not merge are believed**, over all pairs, at this "
+    text += f"prior of kinds: {shares}. Without the indistinguishable pairs it is {apart:.1f} % [{least:.1f}, {most:.1f}]."
+    return text + (f" Not measured, so the other shares are scaled up: {', '.join(missing)}." if missing else "")

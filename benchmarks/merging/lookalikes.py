@@ -75,7 +75,9 @@ def table(rows: Iterable[Row]) -> str:
     """Markdown: false merges by kind, of pairs that somebody could tell apart and of those that nobody could; and pairs with
     rooms in common: merged right."""
     rows = list(rows)
-    lines = ["| kind | tellable | believed wrongly | nobody can tell | believed wrongly | rooms in common | merged right |"]
+    lines = [
+        "| kind | distinguishable | believed wrongly | indistinguishable | believed wrongly | rooms in common | merged right |"
+    ]
     lines.append("|---|---|---|---|---|---|---|")
     for kind in (*LOOKALIKES, "unknown scale", "empty", "all"):
         of = [r for r in rows if kind in (r["lookalike"], "all") or (kind == "empty" and r["furniture"] == "empty")]

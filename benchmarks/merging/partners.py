@@ -63,19 +63,19 @@ def study(maps: Sequence[ScaleMap], folder: Path) -> str:
     chosen = {}
     for number in BY_LOOKS:
         named = most_alike(rows, number)
-        chosen[f"the {number} that look most like it"] = {(min(k, m), max(k, m)) for k, of in enumerate(named) for m in of}
+        chosen[f"the {number} most similar maps"] = {(min(k, m), max(k, m)) for k, of in enumerate(named) for m in of}
     began = time.process_time()
     best = partners_of(atlas)[0]
     laid, seconds = len(atlas.memory.coarse) - before, time.process_time() - began
-    words = f"of the {COARSE_PARTNERS}, the {MOST_PARTNERS} on which it lies best; and the {LIKELY_PARTNERS} most alike"
+    words = f"of these {COARSE_PARTNERS}, the {MOST_PARTNERS} that align best coarsely, and the {LIKELY_PARTNERS} most similar"
     chosen[words] = {(min(k, m), max(k, m)) for k, of in enumerate(best) for m in of}
     true, possible = sorted(share), joinable(len(maps), share)
     groups = np.array([maps[i].building for i, _ in true])
     lines = [
-        f"{len(maps)} maps of {len({m.building for m in maps})} buildings; {len(share)} pairs share {SHARED:g} m² or more, by "
-        f"which {possible} maps could be joined to others. In brackets 95 % intervals over buildings.",
+        f"{len(maps)} maps of {len({m.building for m in maps})} buildings; {len(share)} pairs share {SHARED:g} m² or more, "
+        f"through which {possible} maps can be joined to others. In brackets 95 % intervals over buildings.",
         "",
-        "| a map is registered with | pairs a map | of those that share a place | maps that these could join |",
+        "| a map is registered with | pairs per map | share of the pairs with a common place | maps that can be joined |",
         "|---|---|---|---|",
     ]
     for name, pairs in chosen.items():
@@ -84,7 +84,10 @@ def study(maps: Sequence[ScaleMap], folder: Path) -> str:
         lines.append(f"| {name} | {2 * len(pairs) / len(maps):.1f} | {recall} | {joined} of {possible} |")
     if laid:
         each = 1000 * seconds / laid, 1000 * described / len(maps)
-        lines += ["", f"{each[0]:.0f} ms of a core a pair that is laid coarsely, {each[1]:.0f} a map for the rows of its rooms."]
+        lines += [
+            "",
+            f"On one core: {each[0]:.0f} ms per coarse alignment of a pair, {each[1]:.0f} ms per map for room descriptors.",
+        ]
     return "\n".join(lines)
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from benchmarks.merging.tables import Row, good, table
 from topomerge.statistics import NEAR_ZERO, Calibration, calibration
 
-ORIGINS = ("procedural buildings", "simulated scans of real plans", "real maps", "look-alikes, made to deceive")
+ORIGINS = ("procedural buildings", "simulated scans of real plans", "real maps", "look-alikes, generated")
 PER_BIN = 8  # pairs
+MEANS = "believed: mean probability, share right"
 REAL_MAPS = ("carmen", "halmstad", "strands", "utexas", "ipad", "libpointmatcher", "octomap")
 
 
@@ -28,7 +29,7 @@ def origin(row: Row) -> str:
 
 
 def calibrated(rows: Sequence[Row]) -> Calibration:
-    """`calibration` of what was told of pairs, in ten bins, or fewer where a bin of those above the mass near zero would have
+    """`calibration` of the probabilities of pairs, in ten bins, or fewer where a bin of those above the mass near zero would have
     fewer than `PER_BIN`."""
     above = sum(r["probability"] >= NEAR_ZERO for r in rows)
     return calibration([r["probability"] for r in rows], [good(r) for r in rows], min(max(above // PER_BIN, 1), 10))
@@ -43,7 +44,7 @@ def errors(groups: dict[str, Sequence[Row]]) -> str:
             means = [float(np.mean([f(r) for r in believed])) for f in (_probability, good)] if believed else []
             above = [_error(whole.above), int(whole.above.count.sum())] if whole.above else ["–", 0]
             out.append([name, len(rows), _error(whole), *above[::-1], len(believed), ", ".join(f"{m:.2f}" for m in means) or "–"])
-    heads = ("pairs of", "pairs", "error (by chance)", "of 0.1 and above", "error (by chance)", "believed", "mean told, right")
+    heads = ("pairs of", "pairs", "error (by chance)", "pairs of 0.1 or more", "error (by chance)", "believed", MEANS)
     return table(heads, out)
 
 
@@ -60,7 +61,7 @@ def reliability(rows: Sequence[Row]) -> str:
     out: list[Sequence[object]] = []
     for name in ORIGINS:
         whole = calibrated([r for r in rows if origin(r) == name])
-        for title, c in ((f"{name}, all", whole), (f"{name}, 0.1 and above", whole.above)):
+        for title, c in ((f"{name}, all", whole), (f"{name}, 0.1 or more", whole.above)):
             bins = zip(c.count.tolist(), c.probability.tolist(), c.right.tolist(), strict=True) if c else ()
             out += [[title, n, f"{p:.2f}", f"{y:.2f}"] for n, p, y in bins]
-    return table(("pairs of", "pairs", "mean told", "right"), out)
+    return table(("pairs of", "pairs", "mean probability", "share right"), out)

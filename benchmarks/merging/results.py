@@ -60,14 +60,14 @@ def merged(mine: Sequence[Row], drawn: Sequence[Row]) -> list[str]:
     wrong = [r for r in (*whole, *positives(drawn)) if r["believed"] and not good(r)]
     storeys = sum(bool(r.get("wrong_storey")) and modality(r) != "3D–3D" for r in (*whole, *positives(drawn)))
     return [
-        by(whole, lambda r: f"{modality(r)}, {kind_of(r)}", groups, "m² in common"),
-        f"Believed at a wrong pose: {len(wrong)} of {len(whole) + len(positives(drawn))}, floor plans among them. Slices and "
-        f"floor plans that were laid on the wrong storey, which is wrong: {storeys}.",
-        "Sharing 80 m² or more, by source:",
+        by(whole, lambda r: f"{modality(r)}, {kind_of(r)}", groups, "shared area, m²"),
+        f"Believed at a wrong pose: {len(wrong)} of {len(whole) + len(positives(drawn))}, floor plans included. Slices and floor "
+        f"plans placed on the wrong storey (counted as wrong): {storeys}.",
+        "Pairs that share 80 m² or more, by source:",
         by(large, _source_and_modality, sorted(set(map(_source_and_modality, large))), "pairs of"),
-        "and by sensors:",
+        "The same pairs by sensors:",
         by(large, lambda r: "-".join(sorted(r["sensors"])), sensors, "sensors"),
-        "Maps against the floor plan of their own building (a third of the plans without a scale):",
+        "Maps and the floor plan of their own building (a third of the plans have no scale):",
         by(positives(drawn), _plan_of, plans, "floor plan and"),
     ]
 
@@ -90,24 +90,24 @@ def real(rows: Sequence[Row]) -> str:
 
 
 def changed(mine: Sequence[Row], every: Sequence[Row], not_to_merge: Sequence[Row]) -> str:
-    """What was told before, what is told now, and why they differ."""
+    """The figures before, the figures now, and why they differ."""
     large = [r for r in positives(mine) if kind_of(r) in LARGE]
     hit = {physical_of(r) for r in not_to_merge if false_merge(r)}
     places = {physical_of(r) for r in not_to_merge}
     low, high = (100 * v for v in exact_interval(len(hit), len(places)))
     whole = calibrated(every)
-    above = f"{whole.above.error:.3f} of those of 0.1 and above" if whole.above else "none above 0.1"
+    above = f"{whole.above.error:.3f} over those of 0.1 or more" if whole.above else "none of 0.1 or more"
     separable = [r for r in not_to_merge if tellable(r)]
     now = {
         "right": f"{share(large, good)} of {len(large)} pairs",
         "believed": share(large, lambda r: good(r) and r["believed"]),
         "pairs": f"{sum(map(false_merge, not_to_merge))} of {len(not_to_merge)}",
         "buildings": f"{len(hit)} of {len(places)}: {low:.1f} to {high:.1f} %",
-        "told": f"{sum(map(false_merge, separable))} of {len(separable)}, beside the line with every pair in",
+        "told": f"{sum(map(false_merge, separable))} of {len(separable)}, beside the figure over all pairs",
         "prior": f"{100 * rate_at(not_to_merge)[0]:.1f} %",
         "calibration": f"{whole.error:.3f} over {len(every)}; {above}",
     }
-    return table(("what", "told before", "now", "why"), [[what, old, now[key], why] for key, what, old, why in text.CHANGES])
+    return table(("what", "before", "now", "why"), [[what, old, now[key], why] for key, what, old, why in text.CHANGES])
 
 
 def misnamed(not_to_merge: Sequence[Row]) -> str:
@@ -115,8 +115,8 @@ def misnamed(not_to_merge: Sequence[Row]) -> str:
     drawn = [r for r in not_to_merge if r["kind"] == "other-building"]
     same = [r for r in drawn if r["negative"] == "other storey"]
     plans = sum(r["building"] == r["other"] for r in same)
-    return f"Of {len(drawn)} pairs that were drawn as two buildings {plans} are of one plan furnished twice, and " + (
-        f"{len(same) - plans} of two storeys of one school: they are counted as other storeys."
+    return f"Of {len(drawn)} pairs that were drawn as two buildings, {plans} show one plan furnished twice and " + (
+        f"{len(same) - plans} two storeys of one school; these count as other storeys."
     )
 
 
@@ -131,18 +131,18 @@ def section() -> str:
     not_to_merge = negatives(every)
     large = [r for r in positives(mine) if kind_of(r) in LARGE]
     groups = {name: [r for r in every if origin(r) == name] for name in ORIGINS}
-    groups |= {"all": every, "all but what nobody can tell apart": [r for r in every if tellable(r)]}
+    groups |= {"all": every, "all but indistinguishable pairs": [r for r in every if tellable(r)]}
     parts = [
         headline(not_to_merge),
-        f"Of {len(large)} simulated pairs that share 80 m² {share(large, good)} % lie right (0.5 m, 5°), "
-        f"{share(large, lambda r: good(r, (0.1, 1.0)))} % within 0.1 m and 1°, "
-        f"{share(large, lambda r: good(r) and r['believed'])} % right and believed.",
+        f"Of {len(large)} simulated pairs that share 80 m² or more, {share(large, good)} % are placed right (0.5 m, 5°), "
+        f"{share(large, lambda r: good(r, (0.1, 1.0)))} % within 0.1 m and 1°, and "
+        f"{share(large, lambda r: good(r) and r['believed'])} % are right and believed.",
         text.COMMANDS, f"{pairs_made(mine)}. {text.ABOUT}", *merged(mine, drawn),
         "## Pairs that must not merge", text.MUST_NOT, false_merges(not_to_merge), misnamed(not_to_merge),
-        "Of real maps alone:", text.STRANGE, false_merges([r for r in not_to_merge if origin(r) == ORIGINS[2]]),
+        "Real maps only:", text.STRANGE, false_merges([r for r in not_to_merge if origin(r) == ORIGINS[2]]),
         "## Is what it tells so?", text.CALIBRATION, errors(groups), reliability(every),
         "## Real pairs", text.REAL, real(real_pairs),
-        "## What changed against the figures told before", changed(mine, every, not_to_merge), text.LOOKED_AT,
+        "## Changes from earlier figures", changed(mine, every, not_to_merge), text.LOOKED_AT,
     ]  # fmt: skip
     return "\n\n".join(parts)
 

@@ -12,66 +12,67 @@ COMMANDS = (
     "benchmarks.merging.lookalikes test; python -m benchmarks.merging.results docs/results/merging.md`"
 )
 ABOUT = (
-    "In 0.1 m cells, every sixth with much moved furniture, every eighth with glass walls. Right: within 0.5 m and 5° in "
-    "the middle of what both maps saw; of slices and floor plans horizontally, and on the right storey (within 1.4 m in "
+    "Cells of 0.1 m; every sixth pair with much moved furniture, every eighth with glass walls. Right: within 0.5 m and 5° in "
+    "the middle of what both maps saw; for slices and floor plans horizontally, and on the right storey (within 1.4 m in "
     f"height). Believed: probability {THRESHOLD} or more. Intervals are over physical buildings: in brackets 95 % by "
-    "bootstrap; of fewer than eight the range of the buildings. Storeys, stacks and wings of one building are one "
-    "(`datasets/core/physical.py`). Seconds of processor, median, on a machine with other jobs (speed: docs/benchmarks.md)."
+    "bootstrap; with fewer than eight buildings their range. Storeys, stacks and wings of one building count as one "
+    "(`datasets/core/physical.py`). Seconds: median of processor time, on a machine with other jobs (speed: docs/benchmarks.md)."
 )
 MUST_NOT = (
-    "Through registration and its verdict, on cells alone; every pair is in. Believed: at a pose that is not right. The "
-    "interval is exact (Clopper–Pearson) and over physical buildings: how many have a false merge or more. *Stranger*: two "
-    "buildings, and floor plans of another one. *No room in common*: parts of one building that share nothing. *Other "
-    "storey*: of one building, of one plan or of its own; also maps of two plans of one school, and the same plan furnished "
-    "anew. *Twin wing*: nearly the same plan a second time. *Repeated modules*: rows of equal rooms or modules, parts of "
-    "which lie some rooms apart. *Own mirror image*: a part of a building and its reflection. *Other look-alikes*: "
-    "corridors of one hotel, rooms of one size. *Nobody can tell*: twin wings of which no room that both maps show differs "
-    "by 0.3 m, floor plans of another storey with the same walls where the map was taken, and look-alikes whose walls, "
-    "fixtures and furniture agree (`datasets/pairs/lookalike_rule.py`): the right answer is to abstain, and each that was "
-    "believed counts as false. The prior of the kinds is an assumption (`PRIOR` in `benchmarks/merging/false_merges.py`); "
-    "at it, each kind counts by the mean over its buildings, with Jeffreys' interval."
+    "All pairs went through registration and its verdict, from cells only, and all are counted. Believed: at a pose that is "
+    "not right. The exact interval (Clopper–Pearson) is of the share of physical buildings with a false merge. *Stranger*: two "
+    "buildings, or a floor plan of another one. *No room in common*: parts of one building that share nothing. *Other "
+    "storey*: of one building, with the same plan or its own; also two plans of one school, and the same plan with other "
+    "furniture. *Twin wing*: nearly the same plan a second time. *Repeated modules*: parts of rows of equal rooms or modules, "
+    "some rooms apart. *Own mirror image*: a part of a building and its reflection. *Other look-alikes*: corridors of one "
+    "hotel, rooms of one size. *Indistinguishable*: pairs that nobody can tell apart, that is twin wings in which no room "
+    "that both maps show differs by 0.3 m, floor plans of another storey with the same walls where the map was taken, and "
+    "look-alikes whose walls, fixtures and furniture agree (`datasets/pairs/lookalike_rule.py`): it is right to abstain, and "
+    "each one believed counts as false. The prior of the kinds is an assumption (`PRIOR` in "
+    "`benchmarks/merging/false_merges.py`); for it, each kind counts by the mean over its buildings, with Jeffreys' interval."
 )
 STRANGE = (
     "The maps of the real pairs, each with maps of other places: apartments (Halmstad), offices and corridors (CARMEN, "
-    "STRANDS), and four storeys of one building (UTexas: grids and drawings). With Halmstad's maps the scale is free."
+    "STRANDS), and four storeys of one building (UTexas: grids and drawings). The scale of Halmstad's maps is free."
 )
 CALIBRATION = (
-    "All pairs, those that must not merge and what nobody can tell apart among them; bins of equal mass. Error: expected "
-    "calibration error; in brackets, what a forecast whose probabilities are all true would show by chance with as many "
-    "pairs. Most pairs must not merge and are told to be below 0.1, which makes any error small: so it is told without "
-    "them, too."
+    "All pairs, including those that must not merge and the indistinguishable ones; bins of equal mass. Error: expected "
+    "calibration error (ECE); in brackets, the error that perfectly calibrated probabilities would show by chance with as "
+    "many pairs. Most pairs must not merge and get a probability below 0.1, which makes any error small; therefore the error "
+    "without them is given, too."
 )
 REAL_HEADS = (
     "pairs", "number", "physical buildings", "right", "within 0.1 m, 1°", "right and believed", "wrong and believed",
-    "scale off by", "s", "not right",
+    "scale error", "s", "wrong",
 )  # fmt: skip
 REAL = (
-    "Halmstad's scale is free (`--scale free`); the literature's figure for its maps to layouts is 80.4 % success, its best "
-    "alternative 31.9 % (four environments; two of them are here)."
+    "Halmstad's scale is free (`--scale free`). The literature reports 80.4 % success for aligning these maps with layouts, and "
+    "31.9 % for the best alternative (four environments; two of them are used here)."
 )
 CHANGES = (  # key, what, before, why
     (
-        "right", "share 80 m²: right %", "98 [95, 100] of 95 pairs",
-        "the documented command gives pairs of real schools and flats, too; the pairs told before were 182 of as many buildings, "
-        "as it gives without the real plans. A slice on the wrong storey is wrong",
+        "right", "pairs that share 80 m²: right %", "98 [95, 100] of 95 pairs",
+        "the documented command also gives pairs of real schools and flats; the earlier 182 pairs of as many buildings are those "
+        "that it gives without the real plans. A slice on the wrong storey counts as wrong",
     ),
     ("believed", "the same: right and believed %", "75 [66, 83]", "the same"),
-    ("pairs", "must not merge, believed", "22 of 587", "other pairs; look-alikes and real maps are in"),
+    ("pairs", "must not merge, believed", "22 of 587", "other pairs; look-alikes and real maps are included"),
     (
         "buildings", "buildings with a false merge", "15 of 146: 5.9 to 16.4 %",
-        "storeys of one school are one building; two of its plans are another storey and no strangers",
+        "storeys of one school count as one building; two of its plans are other storeys, not strangers",
     ),
-    ("told", "… that anybody could tell apart", "2 of 558", "no headline any more: what nobody can tell apart counts"),
-    ("prior", "at a stated prior of kinds", "–", "how many pairs of a kind a set has is up to who makes it"),
+    ("told", "… without indistinguishable pairs", "2 of 558", "no longer the headline: indistinguishable pairs count"),
+    ("prior", "at a stated prior of kinds", "–", "the number of pairs of each kind depends on who makes the set"),
     (
-        "calibration", "calibration error", "0.027 over 734, without what nobody can tell apart",
-        "every pair is in; bins of equal mass, not of equal width; without the mass near zero, too",
+        "calibration", "calibration error", "0.027 over 734, without indistinguishable pairs",
+        "all pairs count; bins of equal mass, not of equal width; also without the mass near zero",
     ),
 )  # fmt: skip
 LOOKED_AT = (
-    "**What was looked at.** Features, models and the threshold were chosen by left-out training pairs, and nothing is fitted "
-    "to test or real pairs. But they were looked at: earlier versions were run on the test pairs; poses beyond a map's outer "
-    "walls are drawn back since a free scale ran away on real pairs; amounts are weighed as of 200 m² at most since large "
-    "floors were refused; floor plans came among the training pairs when Halmstad's had been run (2 of 8 believed then); "
-    "a kind of training scan was added after one real failure; simulated ranges were moved towards those of real sensors."
+    "**Use of test data.** Features, models and the threshold were chosen on left-out training pairs, and nothing is fitted "
+    "to test or real pairs. But results on them were seen and led to changes: earlier versions were run on the test pairs; "
+    "poses beyond a map's outer walls are pulled back, because a free scale diverged on real pairs; areas count as 200 m² at "
+    "most, because large floors were refused; floor plans were added to the training pairs after Halmstad's had been run (2 of "
+    "8 believed then); a kind of training scan was added after one real failure; simulated ranges were moved towards those of "
+    "real sensors."
 )

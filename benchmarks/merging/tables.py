@@ -20,7 +20,7 @@ METHOD_TITLES = {
     "ours": "topomerge", "learned": "topomerge, rooms matched by learning", "kiss02": "KISS-Matcher 0.2 m",
     "kiss03": "KISS-Matcher 0.3 m", "fpfh": "FPFH + RANSAC", "fgr": "FGR",
 }  # fmt: skip
-HEADS = ("pairs", "right", "right %", "within 0.1 m, 1° %", "right and believed %", "believed, wrong", "s")
+HEADS = ("pairs", "right", "right %", "within 0.1 m, 1° %", "right and believed %", "believed but wrong", "s")
 
 
 def rows_of(name: str) -> list[Row]:

@@ -33,7 +33,7 @@ from topomerge.types import Sim3
 FIRST_SEED, TRIED = 800_960, 12  # of validation buildings; of each pair
 MOVING = ("lidar", "depth", "tablet", "laser2d")
 FINE = (0.1, 1.0)  # m, degrees
-RAY_WAYS = {"rays": "true rays", "views": "carved from views of its own"}
+RAY_WAYS = {"rays": "true rays", "views": "carved from virtual views"}
 Row = dict[str, Any]
 
 
@@ -98,8 +98,8 @@ def run(count: int, target: Path) -> list[Row]:
 
 def section(rows: list[Row], command: str) -> str:
     """The table as Markdown."""
-    heads = ("free space", "maps", "rooms", "free, m³", "pairs", "right", "fine", "right and believed")
-    heads += ("median probability of right ones", "that must not merge", "believed")
+    heads = ("free space", "maps", "rooms", "free, m³", "pairs", "right", "within 0.1 m, 1°", "right and believed")
+    heads += ("median probability if right", "pairs that must not merge", "believed")
     lines = [f"`{command}`", "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     for way, words in RAY_WAYS.items():
         of = [r for r in rows if r["way"] == way]

@@ -28,8 +28,9 @@ VECTOR, ALIKE, ASKED = 256, 20, 120  # numbers of a vector, rooms of one look, v
 LOOK_NOISE, SEEN_NOISE = 0.6, 0.4  # length of what is added to a look, and to a room that is seen again
 MADE_AT_ONCE = 50_000
 SEARCH_COLUMNS = (
-    "| rooms | exact, ms a query | index, ms a query | exact / index | room itself first: exact, index | of the 10 nearest "
-    "| memory, MB: exact, index | file, MB | made, s | read, s |\n|---|---|---|---|---|---|---|---|---|---|"
+    "| rooms | exact, ms per query | index, ms per query | exact / index | room itself first: exact, index "
+    "| recall of the 10 nearest | memory, MB: exact, index | file, MB | build, s | load, s |\n"
+    "|---|---|---|---|---|---|---|---|---|---|"
 )
 
 

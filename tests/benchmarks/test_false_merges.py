@@ -65,7 +65,7 @@ def test_what_nobody_can_tell_is_in_and_told(counts) -> None:
     assert [counts.tellable(r) for r in rows] == [False, False, True, True]
     assert counts.tally("all", rows)[1:3] == [4, 1] and counts.tally("all", rows)[5:7] == [2, 1]
     lines = counts.false_merges(rows).splitlines()
-    assert lines[-1].startswith("| **nobody can tell apart**") and "| 2 | 1 |" in lines[-1]
+    assert lines[-1].startswith("| **indistinguishable**") and "| 2 | 1 |" in lines[-1]
     assert counts.rate_at(rows)[0] > 0
 
 
@@ -107,7 +107,7 @@ def test_probabilities_below_the_truth_show_above_a_tenth_only(reliable) -> None
     assert cells[0] == "real maps" and cells[1] == "200" and cells[2].startswith("0.017 (")
     assert cells[3] == "20" and cells[4].startswith("0.170 (") and cells[5:] == ["20", "0.83, 1.00"]
     lines = reliable.reliability(rows).splitlines()
-    assert "| real maps, 0.1 and above | 20 | 0.83 | 1.00 |" in lines
+    assert "| real maps, 0.1 or more | 20 | 0.83 | 1.00 |" in lines
 
 
 def test_shares_of_few_buildings_show_their_range() -> None:

@@ -36,11 +36,11 @@ ROWS = [
 
 def test_sites_in_numbers_of_pairs() -> None:
     table = sites(ROWS)
-    assert table.head[:4] == ["site", "the maps of a pair are", "captures", "pairs"]
+    assert table.head[:4] == ["site", "the two maps are", "captures", "pairs"]
     assert [list(row) for row in table.rows] == [
         ["flat", "two captures", "3", "2", "2", "1", "1", "2", "0", "0"],
         ["hall", "two captures", "2", "1", "0", "0", "0", "0", "1", "0"],
-        ["hall", "parts or copies of one", "1", "1", "1", "1", "1", "0", "0", "1"],
+        ["hall", "parts or copies of one capture", "1", "1", "1", "1", "1", "0", "0", "1"],
     ]
 
 
@@ -49,11 +49,13 @@ def test_independence_over_sites() -> None:
     cells = {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}
     independent = cells["two captures"]
     assert (independent["pairs"], independent["sites"]) == ("3", "2")
-    assert independent["merged right"] == "0.67, 0.00–1.00 (2 buildings)" and independent["merged, mean of the sites"] == "0.50"
-    assert (independent["sites with a merge"], independent["with all merged"]) == ("1 of 2", "1 of 2")
-    assert independent["merged wrong"] == "1; 1 of 2 buildings [1.3, 98.7] %"
-    assert independent["of the rooms"] == "0.50"  # 2 + 1 + 0 of 6
-    assert cells["parts or copies of one"]["merged right"] == "0.00" and cells["all"]["pairs"] == "4"
+    assert (
+        independent["merged right"] == "0.67, 0.00–1.00 (2 buildings)" and independent["merged right, mean over sites"] == "0.50"
+    )
+    assert (independent["sites with a merge"], independent["sites with all merged"]) == ("1 of 2", "1 of 2")
+    assert independent["merged wrongly"] == "1; 1 of 2 buildings [1.3, 98.7] %"
+    assert independent["rooms within 0.1 m"] == "0.50"  # 2 + 1 + 0 of 6
+    assert cells["parts or copies of one capture"]["merged right"] == "0.00" and cells["all"]["pairs"] == "4"
 
 
 def test_what_decides() -> None:

@@ -34,13 +34,13 @@ def test_the_sentence_says_verdict_evidence_and_rival():
     evidence = "20 m2 of walls agree, 151 m2 of free floor seen by both; 6.2 % of the walls stand on free floor of the other map"
     assert believed == f"merged: probability 0.91 reaches 0.90; {evidence}"
     assert (
-        refused == f"not merged: probability 0.60 is below 0.90; {evidence}; it may as well be another place in these maps (0.24)"
+        refused == f"not merged: probability 0.60 is below 0.90; {evidence}; it could also be another place in these maps (0.24)"
     )
     assert "another place" not in why(registration(0.89), 0.9)  # nothing stands out
     little = why(registration(0.5, walls=0.4), 0.9)
-    assert little.endswith("both maps show too little of one place for any verdict")
+    assert little.endswith("the maps share too little area for a verdict")
     assert why(registration(0.9), 0.9, force=True) == f"merged: probability 0.90 reaches 0.90; {evidence}"
-    assert why(registration(0.5), 0.9, force=True).endswith("joined all the same, as was asked for (--force)")
+    assert why(registration(0.5), 0.9, force=True).endswith("joined anyway (--force)")
     assert why(Registration(None, 0.0, False, reason="no walls"), 0.9) == "not merged: no walls"
 
 
@@ -57,7 +57,7 @@ def test_the_page_on_own_scans_names_what_a_refusal_says():
 
 def test_the_alternatives_in_words_most_probable_first():
     rows = posterior_rows(registration(0.6))
-    assert rows[0] == ("this place", "0.60") and rows[1] == ("another place in these maps", "0.24") and len(rows) == 6
+    assert rows[0] == ("the same place", "0.60") and rows[1] == ("another place in these maps", "0.24") and len(rows) == 6
     assert posterior_rows(Registration(None, 0.0, False)) == []
 
 
@@ -74,27 +74,27 @@ def test_nothing_is_certain():
 
 def test_the_evidence_row_by_row():
     rows = {what: (much, says) for what, much, says in evidence_rows(registration(0.9))}
-    assert rows["walls on walls"][0] == "20.4 m²" and rows["walls on walls"][1].startswith("83 %")
-    assert rows["free floor in common"][0] == "151 m²" and rows["walls on free floor"][0] == "1.3 m²"
-    assert rows["walls on free floor"][1] == "6 % of the walls that meet anything, 11 % of one map's; speaks against"
+    assert rows["matching walls"][0] == "20.4 m²" and rows["matching walls"][1].startswith("83 %")
+    assert rows["shared free floor"][0] == "151 m²" and rows["walls on free floor"][0] == "1.3 m²"
+    assert rows["walls on free floor"][1] == "6 % of the walls compared, 11 % in the worse map; evidence against"
     assert rows["walls back to back"][0] == "5 %" and rows["furniture"][0] == "8.0 m²" and rows["floors"][0] == "0.04 m"
     assert rows["furniture"][1].startswith("60 %") and rows["furniture"][1].endswith("15 %")
     assert rows["ceilings"][0] == "0.07 m" and "30 m²" in rows["ceilings"][1] and rows["surfaces"][0] == "2.1 cm"
     assert (
-        rows["walls one way"][0] == "71 %"
+        rows["walls in one direction"][0] == "71 %"
         and rows["squares of 3 m"][0] == "22"
         and rows["high walls on free floor"][0] == "0.5 m²"
     )
-    assert rows["parts that fit better elsewhere"][0] == "2 %" and "10 %" in rows["squares of 3 m"][1]
+    assert rows["local misfit"][0] == "2 %" and "10 %" in rows["squares of 3 m"][1]
     assert rows["under the ceiling"][0] == "3" and rows["under the ceiling"][1].startswith("of 4 pieces")
-    assert rows["next best place"][0] == f"{np.exp(1.0):.0f} times as probable"
+    assert rows["lead over the next pose"][0] == f"{np.exp(1.0):.0f} times as probable"
 
 
 def test_what_was_not_seen_has_no_row():
     few = registration(0.9, ceiling_area=0.0, rmse=float("nan"), tall_conflict=0.0, hanging=0.0, margin=0.1)
     rows = {what: much for what, much, _ in evidence_rows(few)}
     assert not {"ceilings", "surfaces", "high walls on free floor", "under the ceiling"} & set(rows)
-    assert rows["next best place"] == "about as probable" and evidence_rows(Registration(None, 0.0, False)) == []
+    assert rows["lead over the next pose"] == "about as probable" and evidence_rows(Registration(None, 0.0, False)) == []
 
 
 def test_a_hypothesis_beside_the_best_one():

@@ -224,7 +224,7 @@ def test_the_report_says_it_all(merged, refused):
     text = merge_html(merged)
     for words in (
         "Merged · probability",
-        "walls on walls",
+        "matching walls",
         "Why it is believed",
         "data-blend",
         'data-room="a0"',
@@ -284,7 +284,7 @@ def test_three_maps_are_merged_by_an_atlas(tmp_path, remembered):
     result.save(tmp_path / "merged")
     assert sorted(p.name for p in (tmp_path / "merged").iterdir()) == ["map.tmap", "merge.json", "merged.ply", "report.html"]
     page = (tmp_path / "merged" / "report.html").read_text(encoding="utf-8")
-    assert "All maps belong together" in page and "south" in page and "data-scene=" in page
+    assert "All maps are connected" in page and "south" in page and "data-scene=" in page
 
 
 @pytest.mark.longer

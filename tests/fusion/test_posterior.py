@@ -67,9 +67,9 @@ def test_the_threshold_follows_from_the_risk():
 
 def test_a_sure_place_on_an_unsure_storey_is_told_so():
     each = {"here": 0.55, "elsewhere": 0.01, "storey": 0.41, "wing": 0.01, "building": 0.01, "outside": 0.01}
-    assert in_words(each, 0.8) == "the place is sure (0.96), the storey is not (0.55 this one)"
+    assert in_words(each, 0.8) == "the position is certain (0.96), the storey is not (0.55 for this one)"
     twin = {**each, "storey": 0.01, "wing": 0.41}
-    assert in_words(twin, 0.8).startswith("it may as well be a twin") and "0.41" in in_words(twin, 0.8)
+    assert in_words(twin, 0.8).startswith("it could also be a wing") and "0.41" in in_words(twin, 0.8)
     assert in_words({**each, "here": 0.9, "storey": 0.06}, 0.8) == ""
     assert in_words(dict.fromkeys(POSTERIOR, 0.1), 0.8) == ""  # nothing stands out
 

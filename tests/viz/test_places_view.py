@@ -55,7 +55,7 @@ def test_a_room_says_the_mean_of_its_places_and_nothing_without_any():
 
 
 def test_log_odds_in_words():
-    assert said(0.3) == "says little" and said(2.0) == "7 times as likely the same place"
+    assert said(0.3) == "little evidence" and said(2.0) == "7 times as likely the same place"
     assert said(-20.0) == "55 times as likely another place"  # one place never says more
 
 
@@ -70,4 +70,4 @@ def test_pictures_are_north_up_and_the_same_every_time():
 def test_the_section_holds_each_room_with_its_pictures(map):
     section = places_section(map, laid_alike(map, map, None)[0], places([(2.0, 3.0), (9.0, 7.0), (300.0, 0.0)], [3.0, -3.0, 1.0]))
     assert section.count("<img") == 6 and section.count("<details") == 3 and "another place" in section
-    assert section.index("beside rooms") < len(section) and 'id="places"' in section
+    assert section.index("outside rooms") < len(section) and 'id="places"' in section

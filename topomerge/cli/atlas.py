@@ -75,9 +75,9 @@ def _find(args: argparse.Namespace) -> int:
     if args.json:
         sys.stdout.write(json.dumps([asdict(s) for s in sightings], indent=1, ensure_ascii=False) + "\n")
         return 0
-    rows = [("map", "fit", "share", "rooms (of the new map = of the atlas' map)")]
+    rows = [("map", "fit", "share", "rooms (new map = atlas map)")]
     for s in sightings:
-        rooms = ", ".join(f"{i} = {j}" for i, j, _ in s.rooms[:ROOMS_SHOWN]) or "none alike"
+        rooms = ", ".join(f"{i} = {j}" for i, j, _ in s.rooms[:ROOMS_SHOWN]) or "none similar"
         rows.append((s.name, "" if s.fit is None else f"{s.fit:+.1f}", f"{s.share:.2f}", rooms))
     widths = [max(len(row[c]) for row in rows) for c in range(3)]
     say("\n".join("  ".join((*(f"{word:<{wide}}" for word, wide in zip(row, widths, strict=False)), row[3])) for row in rows))

@@ -192,8 +192,8 @@ def _about(ranks: list[Row], merges: list[Row], settings: Evaluation, command: s
 
 
 HOW_TO_READ = (
-    ". In brackets 95 % intervals: whole physical buildings drawn again; of fewer than eight buildings their range instead, as "
-    "0.71, 0.62–0.91 (4 buildings); of wrong merges the exact interval of the share of buildings that have one. A match is right "
-    "when both rooms are the same true room; what should be found are true rooms that both maps have. Twin: a near-identical "
-    "other room in the other map."
+    ". In brackets: 95 % intervals by bootstrap over physical buildings; with fewer than eight buildings their range, as 0.71, "
+    "0.62–0.91 (4 buildings); for wrong merges the exact interval of the share of buildings with one. A match is right if both "
+    "rooms are the same true room; recall counts the true rooms that both maps have. Twin: another, near-identical room in the "
+    "other map."
 )

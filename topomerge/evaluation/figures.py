@@ -80,7 +80,7 @@ def _reliability(ranks: Sequence[Row], matches: Sequence[Row], merges: Sequence[
                         ax.annotate(
                             str(n), (x, r), fontsize=7, color=line.get_color(), xytext=(3, -9), textcoords="offset points"
                         )
-        ax.set(title=title, xlabel="probability told", ylabel="share right", xlim=(0, 1), ylim=(0, 1.02))
+        ax.set(title=title, xlabel="predicted probability", ylabel="share right", xlim=(0, 1), ylim=(0, 1.02))
         _legend(ax)
     return figure
 

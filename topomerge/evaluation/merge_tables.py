@@ -16,7 +16,8 @@ from topomerge.statistics import Calibration, calibration
 ORIGINS = ("procedural", "real plans", "real maps")  # of the places that maps are of
 SAME_POSE = (0.05, 0.5)  # m, degrees: poses that differ by less are one; the truth of real pairs is no finer
 Predictions = Callable[[Sequence[Row]], tuple[list[float], list[bool]]]  # probabilities of rows, and what came true
-INDEPENDENCE = {True: "two captures", False: "parts or copies of one"}
+LARGEST = ("largest difference of poses, m", "largest difference of probabilities")
+INDEPENDENCE = {True: "two captures", False: "parts or copies of one capture"}
 
 
 def merging(merges: Sequence[Row], key: str, settings: Evaluation) -> Table:
@@ -31,8 +32,9 @@ def merging(merges: Sequence[Row], key: str, settings: Evaluation) -> Table:
             cells = [cell(value(these, m, settings.rounds), m in ("every room", "merged")) for m in MERGING]
             took = np.median([r["seconds"] for r in these] or [0.0])
             rows.append([name, group, str(pairs), str(able), *cells, _wrong(these), f"{took:.1f}"])
-    head = ["merged by", key or "pairs", "pairs", "mergeable", *(METRIC_NAMES[m] for m in MERGING), "merged wrong", "s a pair"]
-    title = "Merges: of the pairs that have something in common, within 0.5 m and 5° but where another measure is named"
+    metrics = (METRIC_NAMES[m] for m in MERGING)
+    head = ["merged with", key or "pairs", "pairs", "mergeable", *metrics, "merged wrongly", "s per pair"]
+    title = "Merges: shares of the overlapping pairs; right: within 0.5 m and 5°, unless the column says otherwise"
     return Table(title + (f", by {BY[key][0].lower()}{BY[key][1:]}" if key else ""), head, rows, 2)
 
 
@@ -64,14 +66,14 @@ def sites(merges: Sequence[Row]) -> Table:
                 counts = (sum(r[k] for r in some) for k in ("near", "fine", "every_room", "merged", "false", "refused"))
                 names = {r[k] for r in some for k in ("capture_a", "capture_b")}
                 rows.append([site, title, str(len(names)), str(len(some)), *map(str, counts)])
-    head = ["site", "the maps of a pair are", "captures", "pairs", *NUMBERS]
-    return Table("Real pairs by site, in pairs: right within 0.5 m and 5°", head, rows, 2)
+    head = ["site", "the two maps are", "captures", "pairs", *NUMBERS]
+    return Table("Real pairs by site: numbers of pairs; right: within 0.5 m and 5°", head, rows, 2)
 
 
 NUMBERS = (
     "right",
     "within 0.1 m, 1°",
-    "every room within 0.1 m",
+    "all rooms within 0.1 m",
     "believed and right",
     "believed and wrong",
     "right and refused",
@@ -89,9 +91,9 @@ def independence(merges: Sequence[Row], settings: Evaluation) -> Table:
             some, every = sum(s > 0 for s in by_site), sum(s == 1 for s in by_site)
             shares = [f"{np.mean(by_site):.2f}", f"{some} of {len(by_site)}", f"{every} of {len(by_site)}"]
             rows.append([title, str(len(these)), str(len(by_site)), *cells, *shares, _wrong(these)])
-    over = ["merged, mean of the sites", "sites with a merge", "with all merged"]
-    head = ["the maps of a pair are", "pairs", "sites", *(METRIC_NAMES[m] for m in MERGING), *over, "merged wrong"]
-    return Table("Real pairs by independence: shares of pairs, over sites", head, rows)
+    over = ["merged right, mean over sites", "sites with a merge", "sites with all merged"]
+    head = ["the two maps are", "pairs", "sites", *(METRIC_NAMES[m] for m in MERGING), *over, "merged wrongly"]
+    return Table("Independent and dependent real pairs: shares of pairs", head, rows)
 
 
 def chosen(merges: Sequence[Row]) -> list[Row]:
@@ -113,8 +115,8 @@ def decides(merges: Sequence[Row]) -> Table:
         counts = map(str, (len(both), verdicts, poses))
         rows.append([first, second, *counts, f"{np.max(apart[:, 0], initial=0.0):.3f}", f"{chance:.3f}"])
     same = f"same pose ({SAME_POSE[0]:g} m, {SAME_POSE[1]:g}°)"
-    head = ["merged by", "and by", "pairs", "same verdict", same, "farthest apart, m", "probabilities differ by at most"]
-    return Table("What decides: the same pairs, merged with and without descriptors of rooms", head, rows, 2)
+    head = ["merged with", "and with", "pairs", "same verdict", same, *LARGEST]
+    return Table("Effect of room descriptors: the same pairs, merged with and without them", head, rows, 2)
 
 
 def _apart(a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:
@@ -133,9 +135,9 @@ def reliability(matches: Sequence[Row], merges: Sequence[Row]) -> Table:
     for name, variant_rows in by_variant(merges).items():
         rows += _calibrated(f"merge, {name}", variant_rows, _of_merges)
         rows += _calibrated(f"match of believed merges, {name}", variant_rows, _of_matches)
-    more = ("by chance", "number from 0.1 on", "predicted", "right", "error", "by chance")
-    head = ["probability of", "maps from", "number", "predicted, mean", "right", "expected calibration error", *more]
-    return Table("Calibration, over ten bins of equal mass; and of the probabilities from 0.1 on alone", head, rows, 2)
+    more = ("expected by chance", "number ≥ 0.1", "mean probability", "share right", "error", "expected by chance")
+    head = ["probability of", "maps from", "number", "mean probability", "share right", "calibration error (ECE)", *more]
+    return Table("Calibration over ten bins of equal mass: of all probabilities, and of those of 0.1 or more", head, rows, 2)
 
 
 def _of_matches(rows: Sequence[Row]) -> tuple[list[float], list[bool]]:

@@ -17,11 +17,11 @@ from topomerge.io.atomic import replacing
 
 BY = {
     "overlap": "Share of rooms in common, or kind of hard negative",
-    "area": "m² that both maps saw",
+    "area": "Area that both maps saw, m²",
     "sensors": "Sensors",
     "modality": "Kind of maps",
     "source": "Source",
-    "seen": "Sources that trained something, and those that did not",
+    "seen": "Sources that training data came from, and unseen sources",
 }
 RANKING = ("recall@1", "recall@1_single", "recall@1_twin", "recall@1_whole", "recall@5", "MRR")
 AFTER = ("recall@1_after", "recall@1_single_after", "recall@5_after")
@@ -32,9 +32,9 @@ METRIC_NAMES = {
     "recall@1_whole": "entered", "recall@5": "recall@5", "MRR": "MRR",
     "recall@1_after": "after consensus: recall@1", "recall@1_single_after": "without twin", "recall@5_after": "recall@5",
     "precision": "precision", "recall": "recall", "F1": "F1", "F1_single": "F1 without twin", "F1_twin": "F1 with twin",
-    "strict recall": "recall one to one", "right poses": "best pose right", "merged": "merged right", "refused": "right, refused",
-    "right finely": "within 0.1 m, 1°", "every room": "every room within 0.1 m", "rooms": "of the rooms",
-    "merged finely": "and within 0.1 m, 1°",
+    "strict recall": "one-to-one recall", "right poses": "best pose right", "merged": "merged right",
+    "refused": "right but refused", "right finely": "within 0.1 m, 1°", "every room": "all rooms within 0.1 m",
+    "rooms": "rooms within 0.1 m", "merged finely": "merged within 0.1 m, 1°",
 }  # fmt: skip
 
 
@@ -105,8 +105,8 @@ def ranking(ranks: Sequence[Row], settings: Evaluation) -> Table:
         took = np.median([r["seconds"] for r in variant_rows])
         cells += [_signed(better), *(cell(value(variant_rows, m, settings.rounds), m == AFTER[0]) for m in after)]
         rows.append([name, *cells, f"{took:.2f}"])
-    more = f"recall@1 more than {settings.baseline}"
-    head = ["descriptor", *(METRIC_NAMES[m] for m in RANKING), more, *(METRIC_NAMES[m] for m in after), "s a pair"]
+    more = f"recall@1 gain over {settings.baseline}"
+    head = ["descriptor", *(METRIC_NAMES[m] for m in RANKING), more, *(METRIC_NAMES[m] for m in after), "s per pair"]
     return Table("Ranking of rooms: is a room's true partner the nearest?", head, rows)
 
 
@@ -135,8 +135,8 @@ def matching(matches: Sequence[Row], settings: Evaluation) -> Table:
             wrong = f"{np.mean([r['predicted'] for r in apart]):.1f}" if apart else "–"
             rows.append([name, method, *cells, large, wrong, f"{np.median([r['seconds'] for r in these]):.2f}"])
     metrics = (METRIC_NAMES[m] for m in MATCHING)
-    head = ["descriptor", "matching", *metrics, "F1, ≥ 80 m² shared", "matches where none is", "s a pair"]
-    return Table("Matches of rooms, in pairs that share some", head, rows, 2)
+    head = ["descriptor", "matching", *metrics, "F1, ≥ 80 m² shared", "matches per pair without shared rooms", "s per pair"]
+    return Table("Room matches, on pairs that share rooms", head, rows, 2)
 
 
 def beside(matches: Sequence[Row], settings: Evaluation) -> Table:
@@ -151,7 +151,7 @@ def beside(matches: Sequence[Row], settings: Evaluation) -> Table:
             cells += [both if these else "–", cell(value(these, "F1", settings.rounds))]
         rows.append([name, *cells])
     head = ["descriptor", *(text for m in methods for text in (f"{m}: P / R", f"{m}: F1"))]
-    return Table("Matches of rooms by each method, in pairs that share some", head, rows)
+    return Table("Room matches by method, on pairs that share rooms", head, rows)
 
 
 def shares(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:

@@ -10,7 +10,7 @@ from topomerge.fusion.posterior import POSTERIOR, WORDS, evidence_limit, in_word
 from topomerge.fusion.registration import Registration
 from topomerge.matching.poses import PoseHypothesis
 
-Row = tuple[str, str, str]  # what, how much, what it says
+Row = tuple[str, str, str]  # evidence, value, meaning
 
 
 def why(registration: Registration, threshold: float, force: bool = False) -> str:
@@ -25,11 +25,11 @@ def why(registration: Registration, threshold: float, force: bool = False) -> st
     words.append(f"{100 * f['conflict_share']:.1f} % of the walls stand on free floor of the other map")
     if not believed:
         if evidence_limit(f) < 1:
-            words.append("both maps show too little of one place for any verdict")
+            words.append("the maps share too little area for a verdict")
         elif registration.posterior and (beside := in_words(registration.posterior, threshold)):
             words.append(beside)
     if force and not believed:
-        words.append("joined all the same, as was asked for (--force)")
+        words.append("joined anyway (--force)")
     return "; ".join(words)
 
 
@@ -39,36 +39,34 @@ def chance(probability: float) -> str:
 
 
 def evidence_rows(registration: Registration) -> list[Row]:
-    """What the best hypothesis was judged by: (what, how much, what it says)."""
+    """What the best hypothesis was judged by: (evidence, value, meaning)."""
     if registration.transform is None:
         return []
     f = registration.features
-    conflicts = f"{_percent(f['conflict_share'])} of the walls that meet anything, {_percent(f['worst_conflict'])} of one map's"
-    furniture = f"{_percent(f['met'])} of it meets furniture of the other map; by chance {_percent(f['chance'])}"
+    conflicts = f"{_percent(f['conflict_share'])} of the walls compared, {_percent(f['worst_conflict'])} in the worse map"
+    furniture = f"{_percent(f['met'])} of it matches furniture of the other map; expected by chance: {_percent(f['chance'])}"
     rows = [
-        ("walls on walls", f"{f['walls']:.1f} m²", f"{_percent(f['ratio'])} of the walls that both could have seen; speaks for"),
-        ("free floor in common", f"{f['free']:.0f} m²", "seen empty by both; speaks for"),
-        ("walls on free floor", f"{f['conflict']:.1f} m²", f"{conflicts}; speaks against"),
-        ("walls back to back", _percent(f["opposed"]), "of the walls that meet face apart, as those of neighbouring rooms do"),
+        ("matching walls", f"{f['walls']:.1f} m²", f"{_percent(f['ratio'])} of the walls both could have seen; evidence for"),
+        ("shared free floor", f"{f['free']:.0f} m²", "seen empty by both maps; evidence for"),
+        ("walls on free floor", f"{f['conflict']:.1f} m²", f"{conflicts}; evidence against"),
+        ("walls back to back", _percent(f["opposed"]), "of the matching walls face opposite ways, as between neighbouring rooms"),
         ("furniture", f"{f['clutter']:.1f} m²", furniture),
-        ("floors", f"{f['level']:.2f} m", "largest step between floors or ceilings that should be one"),
+        ("floors", f"{f['level']:.2f} m", "largest step between floors or ceilings that should coincide"),
     ]
     if f.get("ceiling_area", 0) > 0:
-        words = f"how unlike they are over {f['ceiling_area']:.0f} m²; storeys of one plan often differ here"
+        words = f"difference over {f['ceiling_area']:.0f} m²; storeys with the same plan often differ here"
         rows.append(("ceilings", f"{f['ceilings']:.2f} m", words))
     rows += _winner_rows(f)
     if np.isfinite(f.get("rmse", np.nan)):
-        rows.append(("surfaces", f"{100 * f['rmse']:.1f} cm", "root mean square distance of surfaces that are one"))
+        rows.append(("surfaces", f"{100 * f['rmse']:.1f} cm", "RMS distance of matching surfaces"))
     if registration.places is not None and len(registration.places):
         odds = registration.places.log_odds
-        words = (
-            f"{(odds > 0).sum()} look like one place, {(odds <= 0).sum()} rather like another one; each is coloured on the plan"
-        )
+        words = f"{(odds > 0).sum()} look like the same place, {(odds <= 0).sum()} more like another one; coloured on the plan"
         rows.append(("places compared", f"{len(odds)}", words))
     if len(registration.alternatives) > 1:
         times = np.exp(min(f["margin"], 15.0))
         words = f"{times:,.0f} times as probable" if times >= 1.5 else "about as probable"
-        rows.append(("next best place", words, "how far the best hypothesis is ahead of the next one, each seen by itself"))
+        rows.append(("lead over the next pose", words, "the best hypothesis against the next one, each judged alone"))
     return rows
 
 
@@ -84,14 +82,14 @@ def _winner_rows(f: Mapping[str, float]) -> list[Row]:
     if "moved_walls" not in f:
         return []
     rows = [
-        ("walls one way", _percent(f["worst_ratio"]), "of the walls along the worse of the two main directions agree"),
-        ("squares of 3 m", f"{f['squares']:.0f}", f"in which walls agree; in {_percent(f['bad_squares'])} of all most do not"),
-        ("parts that fit better elsewhere", _percent(f["moved_walls"]), "more walls agree if squares of 6 m move one by one"),
+        ("walls in one direction", _percent(f["worst_ratio"]), "of the walls match along the worse of the two main directions"),
+        ("squares of 3 m", f"{f['squares']:.0f}", f"with matching walls; {_percent(f['bad_squares'])} of all match poorly"),
+        ("local misfit", _percent(f["moved_walls"]), "more walls match if squares of 6 m are moved separately"),
     ]
     if f["tall_conflict"] > 0:
-        rows.append(("high walls on free floor", f"{f['tall_conflict']:.1f} m²", "higher than furniture; speaks against"))
+        rows.append(("high walls on free floor", f"{f['tall_conflict']:.1f} m²", "higher than furniture; evidence against"))
     if f["hanging"] >= 1:
-        words = f"of {f['hanging']:.0f} pieces of lamps, beams and ducts hang in both maps; no two storeys share theirs"
+        words = f"of {f['hanging']:.0f} pieces of lamps, beams and ducts match; storeys do not share theirs"
         rows.append(("under the ceiling", f"{f['hanging_met']:.0f}", words))
     return rows
 

@@ -134,7 +134,7 @@ def _merge_several(maps: Sequence[TopometricMap], settings: _Settings) -> MergeR
     if status == "abstained" and atlas.status != "abstained":
         reason = f"not merged: {atlas.names[0]} stands apart; {reason}"
     if settings.force and atlas.status != "merged":
-        reason += "; joined all the same, as was asked for (--force)"
+        reason += "; joined anyway (--force)"
         atlas = solve(maps, replace(atlas_settings, threshold=0.0), registrations)
     members, component = _with_first(atlas), atlas.component_of(0)
     matches: list[RoomMatch] = []

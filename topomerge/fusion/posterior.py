@@ -25,12 +25,12 @@ SAME = {
     "storey": ("here", "elsewhere", "wing", "outside"),
 }
 WORDS = {
-    "here": "this place",
+    "here": "the same place",
     "elsewhere": "another place in these maps",
-    "storey": "the same plan on another storey",
-    "wing": "a twin: a wing, module or room that looks the same",
+    "storey": "another storey with the same plan",
+    "wing": "a wing, module or room that looks the same",
     "building": "another building",
-    "outside": "a place that the other map did not see",
+    "outside": "a place outside the other map",
 }
 COMMON_WALLS, COMMON_FLOOR = 1.0, 6.0  # m2 of wall columns that meet and of free floor that both saw: below, nothing can be sure
 FEW = 0.5  # probability that so little evidence can carry at most
@@ -89,9 +89,7 @@ def threshold_of(risk: float, curve: Sequence[Sequence[float]]) -> float:
         raise InputError(f"risk must be above 0 and at most 1000 false merges in a thousand pairs, not {risk:g}")
     least = next((threshold for threshold, false in curve if false <= risk), None)
     if least is None:
-        raise InputError(
-            f"risk {risk:g}: the least that was shown to be possible is {min(f for _, f in curve):.2g} in a thousand"
-        )
+        raise InputError(f"risk {risk:g}: the lowest measured risk is {min(f for _, f in curve):.2g} in a thousand")
     return float(least)
 
 
@@ -104,5 +102,5 @@ def in_words(each: Mapping[str, float], threshold: float) -> str:
         return ""
     if name == "storey" and each["here"] + each["storey"] >= threshold:
         both = each["here"] + each["storey"]
-        return f"the place is sure ({both:.2f}), the storey is not ({each['here']:.2f} this one)"
-    return f"it may as well be {WORDS[name]} ({each[name]:.2f})"
+        return f"the position is certain ({both:.2f}), the storey is not ({each['here']:.2f} for this one)"
+    return f"it could also be {WORDS[name]} ({each[name]:.2f})"

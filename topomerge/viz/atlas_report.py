@@ -91,7 +91,7 @@ def _tile(n: int, map: TopometricMap, parts: Sequence[Array], tile: int) -> tupl
     beyond = sorted({(a, b) for a, b in ways if home[b] != tile})
     if beyond:
         rows = [(str(a), str(b), _linked(f"tile {home[b]}", page_file(n, home[b]))) for a, b in beyond]
-        sections.append(section("Into other tiles", _texts(("from room", "to room", "in"), rows), "beyond"))
+        sections.append(section("Doors into other tiles", _texts(("from room", "to room", "in"), rows), "beyond"))
     return [*sections, _space(part)], {"scene-data": _scene(part, sheet.turn, rooms)}
 
 
@@ -102,7 +102,7 @@ def _tiles_index(n: int, map: TopometricMap, parts: Sequence[Array]) -> Markup:
         storeys = np.unique(map.rooms["storey"][rooms]).tolist()
         area = f"{float(map.rooms['area'][rooms].sum()):.0f} m²"
         rows.append((_linked(f"tile {k}", page_file(n, k)), str(len(rooms)), area, ", ".join(str(s) for s in storeys)))
-    words = element("p", "Each tile shows all of its cells in three dimensions.", class_="note")
+    words = element("p", "Each tile shows all of its cells in 3D.", class_="note")
     return section("Tiles", join([words, _texts(("page", "rooms", "floor area", "storeys"), rows)]), "tiles")
 
 
@@ -111,7 +111,7 @@ def _joined(result: AtlasResult, n: int, map: TopometricMap, in_space: bool) -> 
     prefix = f"m{n}-" if n else ""
     sheet, plans = lay_out(map, prefix)
     view = element("div", plan_view(map, sheet, plans), scroller(rooms_table(map, prefix)), class_="beside")
-    sections = [section(f"{_names(result, result.components[n])}: rooms found anew", view, f"joined-{n}")]
+    sections = [section(f"{_names(result, result.components[n])}: rooms extracted again", view, f"joined-{n}")]
     if not in_space:
         return sections, {}
     return [*sections, _space(map)], {"scene-data": _scene(map, sheet.turn)}
@@ -133,7 +133,7 @@ def _linked(words: str, file: str | None) -> str:
 
 
 def _verdict(result: AtlasResult, parts: Iterable[str]) -> Markup:
-    head = {"merged": "All maps belong together", "parted": "Some maps belong together", "abstained": "Nothing is believed"}
+    head = {"merged": "All maps are connected", "parted": "Some maps are connected", "abstained": "No maps are connected"}
     words = [element("b", head[result.status]), element("ul", *(element("li", part) for part in parts))]
     return element("div", *words, class_="verdict" if result.status != "abstained" else "verdict refused")
 
@@ -162,7 +162,7 @@ def _maps(result: AtlasResult, components: Sequence[int] | None = None, pages: M
             where = "apart" if len(members) == 1 else _linked(f"joined map {n}", (pages or {}).get(n))
             missed = f"{100 * off:.0f} cm" if np.isfinite(off) else "–"
             rows.append((str(k), result.names[k], where, "–" if pose == Sim3() else moved + scale, missed))
-    heads = ("map", "name", "where", "turn, x, y, z in m", "measurements miss it by")
+    heads = ("map", "name", "where", "rotation, x, y, z in m", "residual")
     return section("The maps", _texts(heads, rows), "maps")
 
 
@@ -172,15 +172,15 @@ def _links(result: AtlasResult, within: Sequence[int] | None = None) -> Markup:
     links, rejected = ([x for x in of if within is None or {*x.maps} & {*within}] for of in (result.links, result.rejected))
     if links:
         rows = [(*_pair(result, x.maps), chance(x.hypothesis.probability), chance(x.probability)) for x in links]
-        words = "Every other two maps that a link brings over each other say what they think of it."
-        parts += [element("p", words, class_="note"), _texts(("map", "map", "by itself", "with all that is said"), rows)]
+        words = "Each link is also checked by all other pairs of maps that it places over each other."
+        parts += [element("p", words, class_="note"), _texts(("map", "map", "alone", "with all evidence"), rows)]
     if rejected:
         out = [
             (*_pair(result, x.maps), chance(x.hypothesis.probability), _names(result, x.against) if x.against else "other maps")
             for x in rejected
         ]
-        parts += [element("h3", "Thrown out"), _texts(("map", "map", "by itself", "contradicted by"), out)]
-    tried = f"{result.registered[0]} of {result.registered[1]} pairs were searched in each other, in {result.seconds:.1f} s."
+        parts += [element("h3", "Thrown out"), _texts(("map", "map", "alone", "contradicted by"), out)]
+    tried = f"{result.registered[0]} of {result.registered[1]} pairs were registered, in {result.seconds:.1f} s."
     if within is None:
         parts.append(element("p", tried, class_="note"))
     return section("Links between the maps", join(parts), "links")
@@ -215,6 +215,6 @@ def _space(map: TopometricMap) -> Markup:
         for k in (1, 2, 3, 0)
         if share[k]
     ]
-    words = element("p", "Colour by “map” shows how many maps saw what.", class_="note")
+    words = element("p", "Colour by “map” shows how many maps saw each cell.", class_="note")
     legend = element("ul", *items, class_="legend")
-    return section("In three dimensions", join([words, scene_view("scene-data"), legend]), "space")
+    return section("3D view", join([words, scene_view("scene-data"), legend]), "space")

@@ -47,7 +47,7 @@ def match_html(matching: Matching, a: TopometricMap, b: TopometricMap) -> str:
     for name, m, (sheet, plans), colours in zip("ab", (a, b), drawn, shades, strict=True):
         head = element("h3", f"{name}: {Path(m.source).name or 'map'} ", element("small", f"{len(m.rooms)} rooms"))
         views.append(element("div", head, plan_view(m, sheet, plans, colours)))
-    words = "Green rooms have a partner, the greener the surer; grey ones have none. Click a room to see what stands around both."
+    words = "Green rooms have a match (greener: more probable), grey ones none. Click a room to compare the surroundings."
     compared = [
         element("p", words, class_="note"),
         element("div", *views, class_="pair"),
@@ -57,11 +57,11 @@ def match_html(matching: Matching, a: TopometricMap, b: TopometricMap) -> str:
         _summary(matches, a, b),
         section("The two maps", join(compared), "places"),
         section(
-            "The matches, drawn between the maps",
+            "Room matches",
             element("div", lines_view((a, b), drawn, matches, shades), class_="sheet"),
             "lines",
         ),
-        section("Rooms that are one", scroller(_table(matches, a, b)), "matches"),
+        section("Matched rooms", scroller(_table(matches, a, b)), "matches"),
         section("How it was made", _made(matching, a, b), "made"),
     ]
     names = " + ".join(Path(m.source).name or "map" for m in (a, b))
@@ -74,7 +74,7 @@ def _summary(matches: Sequence[RoomMatch], a: TopometricMap, b: TopometricMap) -
         (len(a.rooms), "rooms of a"),
         (len(b.rooms), "rooms of b"),
         (len(matches), "matches"),
-        (sure, "rather right than wrong"),
+        (sure, "with probability 0.5 or more"),
     ]
     items = [element("li", element("b", str(value)), element("span", name)) for value, name in figures]
     return element("ul", *items, class_="summary")
@@ -101,9 +101,9 @@ def _pairs(matches: Sequence[RoomMatch], a: TopometricMap, b: TopometricMap) -> 
             element("img", src=png_uri(surroundings_image(crop)), alt=f"room {r} of {name} from above", width="192", height="192")
             for name, r, crop in (("a", i, around_a[i]), ("b", j, turned[j]))
         ]
-        words = f"{CROP * SHEET_PIXEL:g} m about room {i} of a, and about room {j} of b, turned as a is"
+        words = f"{CROP * SHEET_PIXEL:g} m around room {i} of a and room {j} of b, turned alike"
         cards = element("div", element("figure", *images, element("figcaption", words)), class_="cards")
-        head = element("summary", room_link("a", i), " is ", room_link("b", j), f", probability {match.probability:.2f}")
+        head = element("summary", room_link("a", i), " matches ", room_link("b", j), f", probability {match.probability:.2f}")
         out.append(element("details", head, cards, data_room_of_a=i, data_room_of_b=j))
     return out
 
@@ -139,16 +139,16 @@ def _table(matches: Sequence[RoomMatch], a: TopometricMap, b: TopometricMap) -> 
             area = float(m.rooms["area"][room])
             cells += [cell(room_link(key, room), room), cell(f"{area:.1f}", area)]
         rows.append(element("tr", *cells, cell(share_bar(match.probability), match.probability, kind="text")))
-    return table(columns, rows, "Rooms that are one")
+    return table(columns, rows, "Matched rooms")
 
 
 def _made(matching: Matching, a: TopometricMap, b: TopometricMap) -> Markup:
     sources = {name: m.source or "–" for name, m in zip("ab", (a, b), strict=True)}
     poses = {
-        f"{k + 1}": f"probability {h.probability:.2f}, {len(h.rooms)} matches, turn {np.degrees(h.transform.yaw):.1f}°"
+        f"{k + 1}": f"probability {h.probability:.2f}, {len(h.rooms)} matches, rotation {np.degrees(h.transform.yaw):.1f}°"
         for k, h in enumerate(matching.alternatives[:5])
     }
-    return element("div", facts(sources, "Maps"), facts(poses or {"poses": "none were needed"}, "Poses of b"), class_="facts-row")
+    return element("div", facts(sources, "Maps"), facts(poses or {"poses": "none needed"}, "Poses of b"), class_="facts-row")
 
 
 def _mates(matches: Sequence[RoomMatch]) -> dict[str, Any]:

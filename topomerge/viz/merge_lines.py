@@ -49,7 +49,7 @@ def lines_view(
     unit = max(width / LINES_WIDTH, height / 600)
     margin = round(20 * unit)
     view = f"{-margin} {-margin} {width + 2 * margin} {height + 2 * margin}"
-    words = f"{len(matches)} pairs of rooms that are one, each joined by a line"
+    words = f"{len(matches)} matched room pairs, each joined by a line"
     style = f"--unit:{unit:.3f}"
     return element("svg", *parts, class_="plan lines", viewBox=view, style=style, role="img", aria_label=words)
 
@@ -70,7 +70,7 @@ def _lines(matches: Sequence[RoomMatch], a: dict[int, tuple[int, int]], b: dict[
         if i not in a or j not in b:
             continue
         (x1, y1), (x2, y2) = a[i], b[j]
-        title = element("title", f"room {i} of a is room {j} of b: probability {match.probability:.2f}")
+        title = element("title", f"room {i} of a matches room {j} of b: probability {match.probability:.2f}")
         strength = f"{0.25 + 0.75 * match.probability:.2f}"
         parts.append(element("line", title, x1=x1, y1=y1, x2=x2, y2=y2, class_="match", stroke_opacity=strength))
         parts += [element("circle", class_="end", cx=x, cy=y) for x, y in ((x1, y1), (x2, y2))]

@@ -56,7 +56,7 @@ def blend_view(
     bar = element("div", _source("a", a), slider, _source("b", b), class_="blend")
     groups = [bar, *([bend_controls()] if bent else []), *([element("div", *choices, class_="choices")] if choices else [])]
     controls = element("div", *groups, element("div", *zoom_buttons(), class_="zoom"), class_="controls")
-    hint = element("p", "Walls of one map that lie on walls of the other speak for the merge.", class_="told", aria_live="polite")
+    hint = element("p", "Walls of one map on walls of the other support the merge.", class_="told", aria_live="polite")
     words = [element("p", bend_words(len(bent), factor), class_="note")] if bent else []
     return element("div", controls, element("div", *figures, class_="sheet", tabindex=0), hint, *words, class_="plan-view")
 

@@ -75,7 +75,7 @@ def _write(text: str, path: Path) -> None:
 
 
 def merge_html(result: MergeResult) -> str:
-    """The report as HTML. A result that is not believed shows its best hypothesis, said to be none."""
+    """The report as HTML. A result that is not believed shows its best hypothesis, and says so."""
     if result.atlas is not None:
         names = " + ".join(Path(m.source).name or "map" for m in result.maps)
         joined = {} if result.map is None else {result.atlas.component_of(0): result.map}
@@ -91,7 +91,7 @@ def merge_html(result: MergeResult) -> str:
     if result.map is not None:
         sheet, plans = lay_out(result.map, turn=drawn[0][0].turn)
         view = element("div", plan_view(result.map, sheet, plans), scroller(rooms_table(result.map)), class_="beside")
-        sections.append(section("The joined map, rooms found anew", view, "joined"))
+        sections.append(section("The joined map, rooms extracted again", view, "joined"))
         sections.append(_space(result))
         data = {"scene-data": _scene(result, sheet.turn), "mates": _mates(result)}
     if registration is not None:
@@ -111,7 +111,7 @@ def _bends(result: MergeResult) -> list[Markup]:
 
 
 def _verdict(result: MergeResult) -> Markup:
-    head = "Merged" if result.merged else "Not merged: not believed" if not result.transforms else "Joined by force: not believed"
+    head = "Merged" if result.merged else "Joined by force (not believed)" if result.transforms else "Not merged (not believed)"
     parts = result.reason.replace(" m2 ", " m² ").split(": ", 1)[-1].split("; ")
     items = element("ul", *(element("li", part) for part in parts))
     words = element("b", f"{head} · probability {chance(result.probability)}")
@@ -125,11 +125,11 @@ def _figures(result: MergeResult) -> Markup:
         joined, pose = result.map, result.transforms[1]
         bits = np.bincount(_seen(result), minlength=4) / max(len(joined.grid), 1)
         figures += [
-            (str(len(result.matches)), "pairs of rooms that are one"),
+            (str(len(result.matches)), "matched room pairs"),
             (f"{len(joined.rooms)}", "rooms of the joined map"),
             (f"{float(joined.rooms['area'].sum()):,.0f} m²".replace(",", "\u202f"), "floor area"),
             (f"{100 * bits[3]:.0f} %", "of the cells seen by both"),
-            (f"{np.degrees(pose.yaw):.1f}°", "turn of b"),
+            (f"{np.degrees(pose.yaw):.1f}°", "rotation of b"),
         ]
         if pose.scale != 1.0:
             figures.append((f"{pose.scale:.3f}", "scale of b"))
@@ -146,13 +146,13 @@ def _maps(result: MergeResult, drawn: tuple[Drawn, Drawn]) -> Markup:
         views.append(element("div", head, plan_view(m, sheet, plans, shades)))
     parts: list[Markup] = []
     if result.map is not None:
-        words = "Rooms of one colour are one room; grey ones were found in one map only. Point at a room to see its partners."
+        words = "Matched rooms share a colour; grey rooms are in one map only. Point at a room to highlight its match."
         parts.append(element("p", words, class_="note"))
     parts.append(element("div", *views, class_="pair"))
     if result.matches:
         figure = element("div", lines_view(result.maps, drawn, result.matches, colours), class_="sheet")
-        parts.append(element("div", element("h3", "The matches, drawn between the maps"), figure, class_="more"))
-        parts.append(element("div", element("h3", "Rooms that are one"), scroller(_matches(result)), class_="more"))
+        parts.append(element("div", element("h3", "Room matches"), figure, class_="more"))
+        parts.append(element("div", element("h3", "Matched rooms"), scroller(_matches(result)), class_="more"))
     return section("The two maps", join(parts), "maps")
 
 
@@ -213,19 +213,19 @@ def _matches(result: MergeResult) -> Markup:
             cell(joined, float(within[i])),
         ]
         rows.append(element("tr", *cells))
-    return table(columns, rows, "Rooms that are one")
+    return table(columns, rows, "Matched rooms")
 
 
 def _over(result: MergeResult, drawn: tuple[Drawn, Drawn], pose: Sim3) -> Markup:
     a, b = result.maps
-    words = "Map b laid over map a. Move the slider to see the one, both, or the other."
+    words = "Map b over map a. Move the slider to fade from one to the other."
     if not result.merged:
-        words = "The best place that was found for map b, which is not believed. " + words
+        words = "The best pose found for map b; it is not believed. " + words
     parts = [element("p", words, class_="note"), blend_view(a, b, drawn, pose, result.bends)]
     if result.bends:
         where = placements(result.maps, {1: pose}, result.bends)
         parts.append(element("div", element("h3", "How the maps were bent"), bend_table(where, "ab", "ab"), class_="more"))
-    return section("One over the other", join(parts), "over")
+    return section("Overlay", join(parts), "over")
 
 
 def _seen(result: MergeResult) -> Array:
@@ -254,8 +254,8 @@ def _space(result: MergeResult) -> Markup:
             sign = element("i", style=f"background:{SEEN_OF_COLOURS[k]}")
             items.append(element("li", sign, f"{name}: {100 * share[k] / share.sum():.0f} %"))
     legend = element("ul", *items, class_="legend")
-    words = element("p", "Colour by “map” shows which map saw what.", class_="note")
-    return section("In three dimensions", join([words, scene_view("scene-data"), legend]), "space")
+    words = element("p", "Colour by “map” shows which map saw each cell.", class_="note")
+    return section("3D view", join([words, scene_view("scene-data"), legend]), "space")
 
 
 def _evidence(result: MergeResult, registration: Registration) -> Markup:
@@ -265,16 +265,16 @@ def _evidence(result: MergeResult, registration: Registration) -> Markup:
         return section(title, element("p", result.reason), "why")
     parts = []
     if registration.posterior:
-        words = "What the best place may be, with the odds of the stated priors (docs/method.md)"
-        parts.append(_texts(("it is", "probability"), posterior_rows(registration), words))
-    parts.append(_texts(("evidence", "measured", "what it says"), rows, "Evidence for the best hypothesis"))
+        words = "What the best pose may show, under the stated priors (docs/method.md)"
+        parts.append(_texts(("alternative", "probability"), posterior_rows(registration), words))
+    parts.append(_texts(("evidence", "value", "meaning"), rows, "Evidence for the best hypothesis"))
     if len(registration.alternatives) > 1:
         best, middle = registration.alternatives[0], result.maps[1].grid.centroids().mean(axis=0)
         others = [hypothesis_row(k, other, best, middle) for k, other in enumerate(registration.alternatives[:HYPOTHESES])]
-        heads = ("place", "turn °", "from the best m", "odds", "walls m²", "free floor m²", "walls on free floor")
-        words = "The odds are against the best place, each seen by itself; 1 is as good."
-        more = [element("h3", "Other places that were tried"), element("p", words, class_="note")]
-        parts.append(element("div", *more, _texts(heads, others, "Other places"), class_="more"))
+        heads = ("pose", "rotation °", "distance to best m", "odds", "walls m²", "free floor m²", "walls on free floor")
+        words = "Odds are relative to the best pose, each judged alone; 1 means equally good."
+        more = [element("h3", "Other poses that were tried"), element("p", words, class_="note")]
+        parts.append(element("div", *more, _texts(heads, others, "Other poses"), class_="more"))
     return section(title, join(parts), "why")
 
 

@@ -31,21 +31,19 @@ def places_section(a: TopometricMap, drawn: Drawn, places: Places) -> Markup:
     rooms = rooms_of(a, places)
     odds = room_log_odds(places, rooms, len(a.rooms))
     sheet, plans = drawn
-    words = "Green rooms look the same in both maps, red ones rather like another room; grey ones say nothing."
+    words = "Green rooms look the same in both maps, red ones more like another room; grey ones give no evidence."
     view = plan_view(a, sheet, plans, room_shades(odds))
     order = np.argsort(-np.abs(places.log_odds), kind="stable")[:MOST_SHOWN]
     by_room = sorted({int(rooms[k]) for k in order}, key=lambda i: odds[i] if i >= 0 and np.isfinite(odds[i]) else 0.0)
     groups = [_room(i, [int(k) for k in order if rooms[k] == i], odds, places) for i in by_room]
-    note = (
-        "Click a room to see what was compared there, map a on the left, map b on the right; rooms that speak against come first."
-    )
+    note = "Click a room to see what was compared there, map a left, map b right; rooms with evidence against come first."
     parts = [
         element("p", words, class_="note"),
         view,
         element("p", note, class_="note"),
         element("div", *groups, class_="places"),
     ]
-    return section("What each room says", join(parts), "places")
+    return section("Evidence by room", join(parts), "places")
 
 
 def rooms_of(map: TopometricMap, places: Places) -> Array:
@@ -75,7 +73,7 @@ def room_shades(odds: Array) -> Array:
 
 def _room(room: int, shown: Sequence[int], odds: Array, places: Places) -> Markup:
     """A room's places, folded."""
-    name = room_link("a", room) if room >= 0 else Markup("beside rooms")
+    name = room_link("a", room) if room >= 0 else Markup("outside rooms")
     words = f" {said(float(odds[room]))}, {len(shown)} shown" if room >= 0 else f" {len(shown)} shown"
     cards = [_card(k, places) for k in shown]
     return element("details", element("summary", name, words), element("div", *cards, class_="cards"), data_room_of_a=room)
@@ -93,7 +91,7 @@ def _card(k: int, places: Places) -> Markup:
 def said(odds: float) -> str:
     """Log odds in words."""
     if abs(odds) < 0.5:
-        return "says little"
+        return "little evidence"
     times = np.exp(min(abs(odds), MOST_ODDS))
     return f"{times:.0f} times as likely {'the same place' if odds > 0 else 'another place'}"
 

@@ -53,7 +53,7 @@ def report_html(map: TopometricMap) -> str:
         summary(map),
         warnings(map.warnings),
         section("Plan and rooms", rooms, "plan"),
-        section("In three dimensions", scene_view("scene-data"), "space"),
+        section("3D view", scene_view("scene-data"), "space"),
         section("Doors and stairs", scroller(doors_table(map)), "doors"),
         section("How it was made", origin, "made"),
     ]
@@ -173,7 +173,7 @@ def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], col
         boxes.append(element("label", box, f" {name}"))
     if len(map.rooms):
         slider = element("input", type="range", min=0, max=90, step=10, value=0, data_sure="")
-        boxes.append(element("label", "rooms listed from this confidence on: ", slider))
+        boxes.append(element("label", "minimum confidence of listed rooms: ", slider))
     groups = [("choices", choices), ("layers", boxes), ("zoom", zoom_buttons())]
     bar = element("div", *(element("div", *parts, class_=name) for name, parts in groups if parts), class_="controls")
     figures = [
@@ -205,7 +205,7 @@ def legend(map: TopometricMap) -> Markup:
         ("glimpsed", "glimpsed: only looked into", bool(map.rooms["glimpsed"].any())),
         ("narrow", "narrowing within a room", len(map.narrows) > 0),
         ("wall", "wall, cut at 1 to 1.9 m", True),
-        ("seen", "seen, no room", True),
+        ("seen", "seen, not a room", True),
     ]
     items = [element("li", element("i", class_=f"sign-{sign}"), words) for sign, words, there in entries if there]
     return element("ul", *items, class_="legend")

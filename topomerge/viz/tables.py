@@ -15,9 +15,9 @@ from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.scene import hex_colour
 
 ROOM_WORDS = {  # of `room_words`, and why
-    "outside": "probably out of doors",
+    "outside": "probably outdoors",
     "glimpsed": "probably only looked into, through a door or a window",
-    "doubtful": "probably no room, or a part of one",
+    "doubtful": "probably not a room, or only part of one",
 }
 Column = tuple[str, str]  # heading; "number" or "text"
 

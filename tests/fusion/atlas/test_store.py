@@ -59,7 +59,7 @@ def test_what_is_written(built):
     assert np.bitwise_or.reduce(joined.provenance) == 0b11
     assert [e.name for e in read_atlas(built).entries] == ["west", "east", "stranger"]
     page = (built / "report.html").read_text(encoding="utf-8")
-    assert "Some maps belong together" in page and "http" not in page.replace("http-equiv", "")
+    assert "Some maps are connected" in page and "http" not in page.replace("http-equiv", "")
 
 
 def test_adding_later_is_building_at_once(built, tmp_path):

@@ -191,13 +191,13 @@ async function startScene(place) {
     state.cut = Math.min(2, tallest * 0.75);
     const cut = control("range", "Cut at", { min: 0.1, max: tallest + 0.1, step: 0.1, value: state.cut }, (value, output) => {
       state.cut = value > tallest ? null : value;
-      output.textContent = state.cut === null ? "nothing" : `${value.toFixed(1)} m`;
+      output.textContent = state.cut === null ? "off" : `${value.toFixed(1)} m`;
       moved();
     });
     const parts = [cut];
     if (data.storeys.length > 1) {
       const most = Math.max(size * 0.6, 4);
-      parts.push(control("range", "Storeys apart", { min: 0, max: most, step: most / 100, value: most * 0.5 }, (value, output) => {
+      parts.push(control("range", "Storey spacing", { min: 0, max: most, step: most / 100, value: most * 0.5 }, (value, output) => {
         const rise = ((value - state.apart) * (data.storeys.length - 1)) / 2; // the middle stays in the middle
         camera.target[2] += rise;
         start.target[2] += rise;
@@ -222,7 +222,7 @@ async function startScene(place) {
     parts.push(control("checkbox", "numbers", { checked: true }, (on) => { state.numbers = on; ask(); }));
     const views = document.createElement("span");
     views.className = "zoom";
-    for (const [name, pitch] of [["From above", Math.PI / 2 - 0.001], ["Aslant", start.pitch]]) {
+    for (const [name, pitch] of [["From above", Math.PI / 2 - 0.001], ["Oblique", start.pitch]]) {
       const button = document.createElement("button");
       button.type = "button";
       button.textContent = name;
@@ -243,7 +243,7 @@ async function startScene(place) {
   const told = document.createElement("p");
   told.className = "told";
   const merged = data.merged > 1 ? ` Of ${data.cells.toLocaleString("en")} cells, cubes of ${data.merged} × ${data.merged} × ${data.merged} are drawn as one.` : "";
-  told.textContent = `Drag to turn, with shift to move; click, then scroll to zoom.${merged}`;
+  told.textContent = `Drag to rotate, with shift to move; click, then scroll to zoom.${merged}`;
   place.replaceChildren(controls(), stage, told);
   [canvas.width, canvas.height] = [stage.clientWidth, stage.clientHeight];
   startCamera(stage, camera, moved);
