@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 
 
 ROOMS_SHOWN = 8  # pairs of rooms of a map that `find` prints
+COLUMNS = """\
+Listed by fit, best first, then by share. fit: log odds that the new map lies there; other buildings mostly have less than 0.
+share: each room of the new map has one vote, which goes to the rooms that look most like it; those of this map got this share.
+rooms: pairs that look most like each other among the rooms of both maps, even if they look little alike.
+`topomerge merge` tells whether it is the same place."""
 
 
 def atlas_command(args: argparse.Namespace) -> int:
@@ -81,6 +86,8 @@ def _find(args: argparse.Namespace) -> int:
         rows.append((s.name, "" if s.fit is None else f"{s.fit:+.1f}", f"{s.share:.2f}", rooms))
     widths = [max(len(row[c]) for row in rows) for c in range(3)]
     say("\n".join("  ".join((*(f"{word:<{wide}}" for word, wide in zip(row, widths, strict=False)), row[3])) for row in rows))
+    if not args.quiet:
+        say(f"\n{COLUMNS}")
     return 0
 
 

@@ -137,6 +137,7 @@ def test_the_command(house: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("map") and lines[1].startswith(NAMES[0]) and "0 = 0" in lines[1]
+    assert lines[3] == "" and lines[4].startswith("Listed by fit, best first") and lines[5].startswith("share: ")
     assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap"), "--json", "--first", "1"]) == 0
     listed = json.loads(capsys.readouterr().out)
     assert len(listed) == 1 and listed[0]["name"] == NAMES[0]

@@ -30,6 +30,7 @@ MAPS_AT_ONCE, SECONDS_AT_ONCE = 8, 10.0  # that are read before they are written
 SECONDS_TO_ANSWER = 5.0  # of registering, before it is said where new maps lie; the rest follows when nothing new is there
 SECONDS_BETWEEN = 60.0  # … before that is written, and new files are looked for
 NAMED_AT_MOST = 6  # maps, in a line
+TRUTH = '{"format":1,"building":'  # that truth.json of `simulate` begins with, but for blanks
 PICTURES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
@@ -129,6 +130,8 @@ class Watch:
         described = {p.stem for p in there if p.suffix.lower() in (".yaml", ".yml")}  # their pictures are no maps of their own
         kinds = {*suffixes(), ".tmap"}
         own = [p for p in there if not (p.suffix.lower() in PICTURES and p.stem in described)]
+        if _is_truth(self.folder / "truth.json"):
+            own = [p for p in own if p.name not in ("truth.json", "plan.png")]
         for p in sorted({p for p in own if p.is_symlink() and not p.exists()} - self._broken):
             self.tell(f"{p}: is a link to what is not there; it is skipped until it is", True)
             self._broken.add(p)
@@ -241,6 +244,15 @@ class _Plan:
         self.counts["replaced" if longer else "added"] += 1
         self.names[entry.name] = described(name, entry.name, map, longer, old.name if old else "")
         return replace(wanted, stored=stored, new={**wanted.new, entry.name: map}), replace(looked.source, map=entry.name)
+
+
+def _is_truth(path: Path) -> bool:
+    """Did `simulate` write this beside its clouds?"""
+    try:
+        with path.open("rb") as file:
+            return "".join(file.read(200).decode(errors="replace").split()).startswith(TRUTH)
+    except OSError:
+        return False
 
 
 def described(file: str, name: str, map: TopometricMap, longer: Longer | None, old: str) -> str:
