@@ -64,7 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"topomerge {__version__}")
-    parser.set_defaults(run=None, paths=(), commands=COMMANDS)
+    parser.set_defaults(run=None, paths=(), one_input="", commands=COMMANDS)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in COMMANDS:
         _add(commands, command)
@@ -83,21 +83,22 @@ def _add(commands: Any, command: Command) -> None:
     for flags, settings in command.arguments:
         parser.add_argument(*flags, **settings)
     parser.add_argument("-v", "--verbose", action="count", default=0, help="print more; twice: also tracebacks")
-    parser.set_defaults(run=command.run, paths=command.paths)
+    parser.set_defaults(run=command.run, paths=command.paths, one_input=command.one_input)
 
 
-def _named_paths(args: argparse.Namespace) -> list[str]:
-    """The files that the user named, the input first."""
-    values = [getattr(args, name) for name in args.paths if getattr(args, name, None)]
-    return [str(path) for value in values for path in (value if isinstance(value, list) else [value])]
+def _named_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
+    """The files that the user named, the input first; and the output."""
+    values = {name: getattr(args, name) for name in args.paths if getattr(args, name, None)}
+    output = values.pop("output", None)
+    paths = [str(path) for value in values.values() for path in (value if isinstance(value, list) else [value])]
+    return paths, [] if output is None else [str(output)]
 
 
-def _refuse_empty_names(args: argparse.Namespace) -> None:
-    """An empty name is what a script's unset variable leaves; pathlib would take it for the current folder."""
-    for name in args.paths:
-        value = getattr(args, name, None)
-        if value == "" or (isinstance(value, list) and "" in value):
-            raise ValueError(f"the name given for {name} is empty; give the name of a file or folder")
+def _empty_name(args: argparse.Namespace) -> str:
+    """For which file an empty name was given, if for one; that is what a script's unset variable leaves, and pathlib would take
+    it for the current folder."""
+    values = {name: getattr(args, name, None) for name in args.paths}
+    return next((name for name, value in values.items() if value == "" or (isinstance(value, list) and "" in value)), "")
 
 
 def _joined(words: Sequence[str]) -> list[str]:
@@ -124,7 +125,6 @@ def _run(args: argparse.Namespace) -> int:
     logging.basicConfig(format="topomerge: %(message)s")
     logging.getLogger("topomerge").setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[min(args.verbose, 2)])
     try:
-        _refuse_empty_names(args)
         status = int(args.run(args))
         sys.stdout.flush()
         return status
@@ -141,7 +141,7 @@ def _run(args: argparse.Namespace) -> int:
             return 130
         if debug:
             traceback.print_exc()
-        print(printable(f"topomerge: {failure_line(error, _named_paths(args))}"), file=sys.stderr)
+        print(printable(f"topomerge: {failure_line(error, *_named_paths(args))}"), file=sys.stderr)
         return 1
 
 
@@ -162,7 +162,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")  # a terminal without m² must not end the work
     parser = build_parser()
     try:
-        args = parser.parse_args(_joined(sys.argv[1:] if argv is None else argv))
+        args, unknown = parser.parse_known_args(_joined(sys.argv[1:] if argv is None else argv))
+        if unknown:
+            one_input = "" if unknown[0].startswith("-") or not args.one_input else f": {args.one_input}"
+            parser.error(f"unrecognized arguments: {' '.join(unknown)}{one_input}")
+        if empty := _empty_name(args):
+            parser.error(f"the name given for {empty} is empty; give the name of a file or folder")
         if args.run is None:
             parser.print_help(sys.stderr)
             return 1

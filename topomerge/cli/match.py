@@ -6,8 +6,17 @@ import argparse
 import sys
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, check_outputs, warn
-from topomerge.cli.options import CLOUD_OPTIONS, CONTEXT_STEPS, DESCRIPTOR, json_option, map_from
+from topomerge.cli.console import PAGE_SUFFIXES, check_inputs, check_outputs, check_suffix, warn
+from topomerge.cli.options import (
+    CLOUD_OPTIONS,
+    CONTEXT_STEPS,
+    DESCRIPTOR,
+    check_cloud_options,
+    check_descriptor,
+    json_option,
+    map_from,
+)
+from topomerge.errors import InputError
 
 
 def match_command(args: argparse.Namespace) -> int:
@@ -18,7 +27,13 @@ def match_command(args: argparse.Namespace) -> int:
     from topomerge.matching.match import check, match
 
     check_inputs([args.a, args.b])
+    check_cloud_options([args.a, args.b], args)
+    if args.method != "thesis":  # which has a descriptor and a context of its own
+        check_descriptor(args)
+    if args.method == "attention" and (args.descriptor != "learned" or args.scale_of_b == "free"):
+        raise InputError("--method attention needs the embedder that ships, and maps of one scale; take --method consistent")
     if args.report:
+        check_suffix("--report", args.report, PAGE_SUFFIXES)
         check_outputs([args.report], [args.a, args.b])
     a, b = map_from(args.a, args), map_from(args.b, args)
     check(a, b)

@@ -9,11 +9,9 @@ from functools import partial
 from pathlib import Path
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, check_outputs, write_all
+from topomerge.cli.console import PAGE_SUFFIXES, check_inputs, check_outputs, check_suffix, write_all
 from topomerge.cli.options import count
 from topomerge.errors import InputError
-
-PAGE_SUFFIXES = (".html", ".htm")
 
 
 def view_command(args: argparse.Namespace) -> int:
@@ -58,6 +56,7 @@ def _page(args: argparse.Namespace, scratch: str | None = None) -> Path:
 
     topomap = load_map(path)
     if args.output is not None:
+        check_suffix("-o", args.output, PAGE_SUFFIXES)
         place = Path(args.output)
     else:  # a browser reads it after this program has ended: only what is served is deleted
         place = Path(scratch or tempfile.mkdtemp(prefix="topomerge-")) / f"{path.stem}.html"

@@ -23,7 +23,7 @@ from topomerge.fusion.atlas.store import Change, Report, change, entry_of
 from topomerge.fusion.atlas.stored import Stored, check_folder, held_by
 from topomerge.fusion.inputs import check_cells, check_units
 from topomerge.io.maps import load_map
-from topomerge.io.points import suffixes
+from topomerge.io.points import PICTURES, suffixes
 from topomerge.types import TopometricMap
 
 MAPS_AT_ONCE, SECONDS_AT_ONCE = 8, 10.0  # that are read before they are written: a stop costs no more
@@ -31,7 +31,6 @@ SECONDS_TO_ANSWER = 5.0  # of registering, before it is said where new maps lie;
 SECONDS_BETWEEN = 60.0  # … before that is written, and new files are looked for
 NAMED_AT_MOST = 6  # maps, in a line
 TRUTH = '{"format":1,"building":'  # that truth.json of `simulate` begins with, but for blanks
-PICTURES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 @dataclass(frozen=True)
