@@ -91,6 +91,17 @@ def test_a_stream_that_the_caller_closed_is_no_failure(tmp_path: Path) -> None:
         assert (done.returncode, done.stdout, done.stderr) == (status, "", "")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("words", ["info a.tmap", "info a.tmap --json", "completion bash"])
+def test_a_full_disk_is_not_the_inputs_fault(tmp_path: Path, words: str) -> None:
+    topomerge.save_map(building(2, 2), tmp_path / "a.tmap")
+    with Path("/dev/full").open("w") as full:
+        started = [sys.executable, "-m", "topomerge", *words.split()]
+        done = subprocess.run(started, cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
+    said = "topomerge: what is printed can't be written (No space left on device)"
+    assert done.returncode == 1 and done.stderr.splitlines()[-1] == said and done.stderr.count(said) == 1
+
+
 def test_presets_are_those_of_extract() -> None:
     from topomerge.extraction.parameters import PRESETS
 

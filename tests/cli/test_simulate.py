@@ -13,7 +13,7 @@ from topomerge.datasets.buildings.profiles import BUILDING_KINDS
 
 import topomerge
 from topomerge.cli.main import main as cli
-from topomerge.cli.simulate import BUILDING_KINDS as kinds_of_buildings
+from topomerge.cli.simulate import KINDS_OF_BUILDINGS
 
 SMALL_BUILDING = ("--building", "house", "--seed", "3", "--rooms", "4", "--quiet")
 
@@ -48,7 +48,7 @@ def test_what_cannot_be_simulated_leaves_no_folder(tmp_path: Path, capsys: Any) 
 
 
 def test_kinds_of_buildings_are_those_that_are_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert kinds_of_buildings == BUILDING_KINDS
+    assert KINDS_OF_BUILDINGS == BUILDING_KINDS
     assert cli(["simulate", "--building", "castle", "-o", str(tmp_path / "pair")]) == 1
     assert "--building: invalid choice: 'castle' (choose from" in capsys.readouterr().err
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, say, say_line, warn
+from topomerge.cli.console import check_inputs, say, say_line, warn, write_out
 from topomerge.cli.options import (
     ATLAS_OPTIONS,
     CLOUD_OPTIONS,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 ROOMS_SHOWN = 8  # pairs of rooms of a map that `find` prints
-COLUMNS = """\
+FIND_COLUMNS = """\
 Listed by fit, best first, then by share. fit: log odds that the new map lies there; other buildings mostly have less than 0.
 share: each room of the new map has one vote, which goes to the rooms that look most like it; those of this map got this share.
 rooms: pairs that look most like each other among the rooms of both maps, even if they look little alike.
@@ -89,7 +89,7 @@ def _find(args: argparse.Namespace) -> int:
     check_cloud_options(args.items, args)
     sightings = find(args.folder, map_from(args.items[0], args), args.first)
     if args.json:
-        sys.stdout.write(json.dumps([asdict(s) for s in sightings], indent=1, ensure_ascii=False) + "\n")
+        write_out(json.dumps([asdict(s) for s in sightings], indent=1, ensure_ascii=False) + "\n")
         return 0
     rows = [("map", "fit", "share", "rooms (of the new map = of the atlas' map)")]
     for s in sightings:
@@ -98,7 +98,7 @@ def _find(args: argparse.Namespace) -> int:
     widths = [max(len(row[c]) for row in rows) for c in range(3)]
     say("\n".join("  ".join((*(f"{word:<{wide}}" for word, wide in zip(row, widths, strict=False)), row[3])) for row in rows))
     if not args.quiet:
-        say(f"\n{COLUMNS}")
+        say(f"\n{FIND_COLUMNS}")
     return 0
 
 
@@ -119,7 +119,7 @@ def _list(args: argparse.Namespace) -> int:
         raise InputError(f"{args.items[0]}: list takes the folder only")
     listing = read_atlas(args.folder).listing or {}
     if args.json:
-        sys.stdout.write(json.dumps(listing, indent=1, ensure_ascii=False) + "\n")
+        write_out(json.dumps(listing, indent=1, ensure_ascii=False) + "\n")
         return 0
     try:
         table = _table(listing)

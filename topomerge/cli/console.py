@@ -81,9 +81,36 @@ class Bars:
             self._shown.update(self._rows[title], completed=fraction, description=text or title)
 
 
+class PrintError(Exception):
+    """What is printed can't be written: no file's fault."""
+
+
+@contextmanager
+def printing() -> Iterator[None]:
+    """Within, only what is printed is written.
+
+    Raises:
+        PrintError: the disk is full, for example.
+        BrokenPipeError: what read it has gone away.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise PrintError(f"what is printed can't be written ({error.strerror or error})") from error
+
+
+def write_out(text: str) -> None:
+    """Write to stdout as it is."""
+    with printing():
+        sys.stdout.write(text)
+
+
 def say(text: str, stream: TextIO | None = None) -> None:
     """Print what may quote a stranger's file; to stdout by default."""
-    print(printable(text), file=stream)
+    with printing():
+        print(printable(text), file=stream)
 
 
 def say_line(text: str, stream: TextIO | None = None) -> None:

@@ -21,8 +21,8 @@ from topomerge.cli.options import (
 
 def embed_command(args: argparse.Namespace) -> int:
     """`topomerge embed`: describe each room of a map; write a NumPy array (rooms, numbers), or (rooms, 4, numbers)."""
-    check_suffix("-o", args.output, (".npy",))
     check_outputs([args.output], [args.input])
+    check_suffix("-o", args.output, (".npy",))
     check_cloud_options([args.input], args)
     check_descriptor(args)
     from topomerge.embedding.embedders import embedder

@@ -18,7 +18,7 @@ from topomerge import __version__
 from topomerge.cli.atlas import ATLAS
 from topomerge.cli.command import Command
 from topomerge.cli.completion import COMPLETION
-from topomerge.cli.console import failure_line, signal_behind
+from topomerge.cli.console import PrintError, failure_line, printing, signal_behind
 from topomerge.cli.embed import EMBED
 from topomerge.cli.export import EXPORT
 from topomerge.cli.export_embedder import EXPORT_EMBEDDER
@@ -120,17 +120,22 @@ def _open_closed_streams() -> None:
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
 
 
+def _drop_output() -> None:
+    """The interpreter flushes stdout once more at exit: give it a place where that succeeds."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _run(args: argparse.Namespace) -> int:
     debug = args.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
     logging.basicConfig(format="topomerge: %(message)s")
     logging.getLogger("topomerge").setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[min(args.verbose, 2)])
     try:
         status = int(args.run(args))
-        sys.stdout.flush()
+        with printing():
+            sys.stdout.flush()
         return status
     except BrokenPipeError:
-        # The interpreter flushes stdout once more at exit: give it a place where that succeeds.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 141
     except (KeyboardInterrupt, Exception) as error:
         signalled = signal_behind(error)
@@ -141,6 +146,10 @@ def _run(args: argparse.Namespace) -> int:
             return 130
         if debug:
             traceback.print_exc()
+        if isinstance(error, PrintError):
+            _drop_output()
+            print(f"topomerge: {error}", file=sys.stderr)
+            return 1
         print(printable(f"topomerge: {failure_line(error, *_named_paths(args))}"), file=sys.stderr)
         return 1
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import PAGE_SUFFIXES, check_inputs, check_outputs, check_suffix, warn
+from topomerge.cli.console import PAGE_SUFFIXES, check_inputs, check_outputs, check_suffix, warn, write_out
 from topomerge.cli.options import (
     CLOUD_OPTIONS,
     CONTEXT_STEPS,
@@ -33,8 +32,8 @@ def match_command(args: argparse.Namespace) -> int:
     if args.method == "attention" and (args.descriptor != "learned" or args.scale_of_b == "free"):
         raise InputError("--method attention needs the embedder that ships, and maps of one scale; take --method consistent")
     if args.report:
-        check_suffix("--report", args.report, PAGE_SUFFIXES)
         check_outputs([args.report], [args.a, args.b])
+        check_suffix("--report", args.report, PAGE_SUFFIXES)
     a, b = map_from(args.a, args), map_from(args.b, args)
     check(a, b)
     alone = [path for path, topomap in ((args.a, a), (args.b, b)) if len(topomap.rooms) == 1]
@@ -45,7 +44,7 @@ def match_command(args: argparse.Namespace) -> int:
         from topomerge.viz.match_report import save_match_report
 
         save_match_report(matching, a, b, args.report)
-    sys.stdout.write(json_text(matching_to_json(matching, a, b)) if args.json else matching_to_text(matching, a, b) + "\n")
+    write_out(json_text(matching_to_json(matching, a, b)) if args.json else matching_to_text(matching, a, b) + "\n")
     return 0
 
 

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import PAGE_SUFFIXES, check_inputs, check_outputs, check_suffix, write_all
+from topomerge.cli.console import PAGE_SUFFIXES, check_inputs, check_outputs, check_suffix, printing, say, write_all
 from topomerge.cli.options import count
 from topomerge.errors import InputError
 
@@ -21,7 +21,7 @@ def view_command(args: argparse.Namespace) -> int:
         if args.open:
             _show(page.resolve().as_uri(), str(page))
         else:
-            print(page)
+            say(str(page))
         return 0
     from topomerge.viz.serve import serve
 
@@ -31,7 +31,8 @@ def view_command(args: argparse.Namespace) -> int:
 
 
 def _print_address(address: str) -> None:
-    print(address, flush=True)
+    with printing():
+        print(address, flush=True)
 
 
 def _page(args: argparse.Namespace, scratch: str | None = None) -> Path:
