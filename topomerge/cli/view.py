@@ -57,11 +57,11 @@ def _page(args: argparse.Namespace, scratch: str | None = None) -> Path:
 
     topomap = load_map(path)
     if args.output is not None:
-        check_suffix("-o", args.output, PAGE_SUFFIXES)
         place = Path(args.output)
     else:  # a browser reads it after this program has ended: only what is served is deleted
         place = Path(scratch or tempfile.mkdtemp(prefix="topomerge-")) / f"{path.stem}.html"
     check_outputs([place], [path])
+    check_suffix("-o", str(place), PAGE_SUFFIXES)
     write_all([(place, partial(save_report, topomap))])
     return place
 
