@@ -142,6 +142,8 @@ def test_three_maps_are_merged(run: Run, folder: Path, monkeypatch: pytest.Monke
         (("add", "other", "east.tmap"), "other: is no atlas"),
         (("add", "new", "broken.tmap"), "topomerge: broken.tmap: "),
         (("add", "new", "west.tmap", "--threshold", "2"), "from 0 to 1"),
+        (("add", "new", "west.tmap", "--jobs", "0"), "--jobs: must be a whole number from 1 on, not '0'"),
+        (("find", "house", "west.tmap", "--first", "0"), "--first: must be a whole number from 1 on, not '0'"),
         (("remove", "house", "attic"), "attic: is no map of house; it holds west, east, stranger"),
         (("remove", "house"), "name the maps to take out; it holds west, east, stranger"),
         (("remove", "nowhere", "west"), "nowhere: no such folder"),

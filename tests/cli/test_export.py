@@ -48,8 +48,8 @@ def names(folder: str) -> list[str]:
 def test_names_with_line_breaks_are_printed_in_one_line(run: Run) -> None:
     status, out, _ = run("export", "a.tmap", "--to", "graphml", "-o", "li\nne.graphml")
     assert (status, out) == (0, "6 rooms, 5 doors and stairs -> li ne.graphml\n") and Path("li\nne.graphml").exists()
-    status, out, _ = run("embed", "a.tmap", "--descriptor", "engineered", "-o", "ro\nws.npz")
-    assert status == 0 and out.endswith(" -> ro ws.npz\n") and out.count("\n") == 1
+    status, out, _ = run("embed", "a.tmap", "--descriptor", "engineered", "-o", "ro\nws.npy")
+    assert status == 0 and out.endswith(" -> ro ws.npy\n") and out.count("\n") == 1
     whole = run("info", "a.tmap")[1]
     topomerge.save_map(replace(topomerge.load_map("a.tmap"), source="sc\nan.ply"), "b.tmap")
     status, out, _ = run("info", "b.tmap")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shlex
 import signal
@@ -16,6 +17,7 @@ import topomerge
 from tests.cli.processes import Run, process
 from tests.scenes_map import building, same
 from topomerge.cli.main import COMMANDS
+from topomerge.cli.options import check_cloud_options
 from topomerge.errors import InputError
 from topomerge.io.maps import load_map
 
@@ -89,6 +91,17 @@ def test_a_stream_that_the_caller_closed_is_no_failure(tmp_path: Path) -> None:
         assert (done.returncode, done.stdout, done.stderr) == (status, "", "")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("words", ["info a.tmap", "info a.tmap --json", "completion bash"])
+def test_a_full_disk_is_not_the_inputs_fault(tmp_path: Path, words: str) -> None:
+    topomerge.save_map(building(2, 2), tmp_path / "a.tmap")
+    with Path("/dev/full").open("w") as full:
+        started = [sys.executable, "-m", "topomerge", *words.split()]
+        done = subprocess.run(started, cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
+    said = "topomerge: what is printed can't be written (No space left on device)"
+    assert done.returncode == 1 and done.stderr.splitlines()[-1] == said and done.stderr.count(said) == 1
+
+
 def test_presets_are_those_of_extract() -> None:
     from topomerge.extraction.parameters import PRESETS
 
@@ -119,6 +132,7 @@ def test_wrong_words(run: Run, words: list[str]) -> None:
 def test_empty_names_are_no_files(run: Run, stages: dict[str, Any], tmp_path: Path, words: list[str]) -> None:
     status, out, err = run("extract", *words)
     assert status == 1 and out == "" and "is empty; give the name of a file" in err and err.count("\n") == 1
+    assert err.startswith("topomerge: the name given for ")
     assert not stages.keys() & {"read"} and not list(tmp_path.iterdir())
 
 
@@ -126,6 +140,46 @@ def test_empty_names_are_no_files(run: Run, stages: dict[str, Any], tmp_path: Pa
 def test_values_may_start_with_a_dash(run: Run, stages: dict[str, Any], words: list[str]) -> None:
     assert run("extract", "scan.ply", "-o", "a.tmap", *words)[0] == 0
     assert stages["read"]["up"] == "-y"
+
+
+def test_a_second_scan_is_for_merge(run: Run) -> None:
+    status, _, err = run("extract", "a.ply", "b.ply", "-o", "a.tmap")
+    assert status == 1 and "unrecognized arguments: b.ply: extract takes one scan; `topomerge merge` takes several" in err
+    assert "merge`" not in run("extract", "a.ply", "-o", "a.tmap", "--figures", "a.png")[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("merge a.tmap b.tmap -o m --descriptor nowhere", "--descriptor: unknown descriptor 'nowhere'"),
+        ("merge a.tmap b.tmap -o m --poses rooms --scale free", "--poses: poses of rooms alone are for two maps of one scale"),
+        ("merge a.tmap b.tmap -o m --voxel-size 0.2", "--voxel-size: is for clouds, of no use to a .tmap"),
+        ("match a.tmap b.tmap --k 1000", "--k: steps of context "),
+        ("match a.tmap b.tmap --k 1", "--k: steps of context are for descriptors of single rooms"),
+        ("match a.tmap b.tmap --method attention --scale free", "--method attention needs the embedder that ships"),
+        ("match a.tmap b.tmap --up y", "--up: is for clouds"),
+        ("embed a.tmap -o a.npy --unit mm", "--unit: is for clouds"),
+        ("embed a.tmap -o a.npy --descriptor nowhere", "--descriptor: unknown descriptor"),
+        ("embed a.tmap -o a.npz", "a.npz: -o writes .npy; end its name with .npy"),
+        ("match a.tmap b.tmap --report m.pdf", "m.pdf: --report writes .html; end its name with .html or .htm"),
+        ("atlas add new a.tmap --sensor tls", "--sensor: is for clouds"),
+        ("view a.tmap -o a.pdf", "a.pdf: -o writes .html"),
+        ("simulate --building house --storeys 9 -o pair", "storeys must be 1 to 8"),
+    ],
+)
+def test_what_is_wrong_with_an_option_is_no_files_fault(run: Run, tmp_path: Path, words: str, message: str) -> None:
+    for k, name in enumerate(("a.tmap", "b.tmap")):
+        topomerge.save_map(building(k + 1), tmp_path / name)
+    status, out, err = run(*words.split())
+    assert (status, out) == (1, "") and err.startswith(f"topomerge: {message}") and err.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.tmap", "b.tmap"]
+
+
+def test_an_option_that_one_input_can_use_is_fine() -> None:
+    args = argparse.Namespace(up="y")
+    check_cloud_options(["a.tmap", "b.ply"], args)
+    with pytest.raises(InputError, match="^--up: is for clouds"):
+        check_cloud_options(["a.tmap", "b.TMAP"], args)
 
 
 def test_no_words(run: Run) -> None:
@@ -209,6 +263,8 @@ def test_a_fault_of_ours_asks_for_a_report(run: Run, stages: dict[str, Any], mon
         (["-o", "scan.ply"], "is the input"),
         (["-o", "rooms.ply"], "rooms.ply: -o names the map; end its name with .tmap"),
         (["-o", "a.tmap", "--figure", "a.docx"], "unknown kind of figure"),
+        (["-o", "a.tmap", "--report", "a.pdf"], "a.pdf: --report writes .html; end its name with .html or .htm"),
+        (["-o", "a.tmap", "--ply", "a.las"], "a.las: --ply writes .ply; end its name with .ply"),
         (["-o", "a.tmap", "--ply", "absent/a.ply"], "absent/a.ply: can't be written"),
     ],
 )

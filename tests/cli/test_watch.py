@@ -40,6 +40,18 @@ def test_once(run: Run, scans: Path) -> None:
     assert json.loads((Path("site") / "watch.json").read_text())["format"] == 1
 
 
+def test_what_simulate_wrote_beside_clouds_is_passed_over(run: Run, scans: Path) -> None:
+    words = ("simulate", "--building", "house", "--rooms", "3", "--sensors", "tls", "-q", "-o", "pair")
+    assert run(*words) == (0, "", "")
+    for name in ("truth.json", "plan.png"):
+        (scans / name).write_bytes((Path("pair") / name).read_bytes())
+    status, out, err = run("watch", "scans", "-o", "site", "--once", *QUICK)
+    assert (status, err) == (0, "") and out.splitlines()[-1] == "2 added; site holds 2 maps"
+    (scans / "truth.json").write_text('{"format": 1}')
+    _, _, err = run("watch", "scans", "-o", "site", "--once", *QUICK)
+    assert err.count("\n") == 2 and "plan.png" in err and "truth.json" in err
+
+
 def test_a_link_to_nothing_is_told_of_once(run: Run, scans: Path) -> None:
     (scans / "gone.ply").symlink_to(scans / "other.ply")
     status, out, err = run("watch", "scans", "-o", "site", "--once", *QUICK)

@@ -11,6 +11,7 @@ from PIL import Image
 from tests.scenes import two_rooms
 from topomerge.extraction.scan import read_scan
 from topomerge.extraction.slices import is_raised, with_raised_slice
+from topomerge.extraction.voxels import voxelise
 from topomerge.io import read_points
 
 
@@ -45,4 +46,4 @@ def test_walls_without_anything_in_between_but_with_a_lintel_are_none(drawn: Pat
 
 
 def test_no_cells() -> None:
-    assert not is_raised(read_scan(np.zeros((1, 3)), 0.1).grid)
+    assert not is_raised(voxelise(np.zeros((1, 3)), 0.1))

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.scenes_map import building
+from tests.scenes_map import building, same
 from topomerge.errors import InputError
-from topomerge.fusion.inputs import check_different, check_pair, check_units, checked_threshold, pair_warnings
+from topomerge.fusion.atlas.solve import atlas
+from topomerge.fusion.inputs import check_different, check_pair, check_units, checked_threshold, loaded, pair_warnings
 from topomerge.fusion.merge import merge
 from topomerge.fusion.verify import model
+from topomerge.io.maps import save_map
 from topomerge.types import PointCloud, TopometricMap
 
 
@@ -59,10 +61,26 @@ def test_one_map_is_not_merged_with_itself():
 
 
 def test_what_is_no_map_is_named():
-    with pytest.raises(InputError, match=r"^a\.tmap: merge takes maps; read a \.tmap with load_map"):
+    with pytest.raises(InputError, match=r"^a\.ply: merge takes maps and \.tmap files; make a map of points with extract"):
+        merge(["a.ply", "b.ply"])
+    with pytest.raises(InputError, match=r"^a\.tmap: no such file"):
         merge(["a.tmap", "b.tmap"])
     with pytest.raises(InputError, match="^PointCloud: merge takes maps"):
         merge([building(1), PointCloud(np.zeros((1, 3)))])
+
+
+@pytest.mark.parametrize("function", [merge, atlas])
+def test_what_is_no_list_of_maps_is_named(function):
+    name = function.__name__
+    for maps in (building(1), (building(k) for k in (1, 2)), "a.tmap"):
+        with pytest.raises(InputError, match=rf"^{name} takes a list of maps, not a {type(maps).__name__}; give it as {name}\("):
+            function(maps)
+
+
+def test_maps_are_read_where_they_are_files(tmp_path):
+    save_map(building(1), tmp_path / "a.tmap")
+    for path in (tmp_path / "a.tmap", str(tmp_path / "a.tmap")):
+        assert same(loaded(path), building(1))
 
 
 def test_storeys_twice_as_high_are_told_of_with_the_unit_in_mind():

@@ -86,6 +86,21 @@ def test_one_point_is_a_cloud_and_none_is_an_error(tmp_path: Path) -> None:
             read_points(save(tmp_path / "a.npy", points))
 
 
+def test_options_that_a_format_cannot_use_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.npy", box_points())
+    for name, value in (
+        ("resolution", 0.05),
+        ("extrude", 2.5),
+        ("ceiling", True),
+        ("doors", True),
+        ("poses", "x"),
+        ("topic", "x"),
+    ):
+        with pytest.raises(InputError, match=f"a.npy: --{name} is of no use to a NumPy file, only to "):
+            read_points(path, **{name: value})
+    assert len(read_points(path, resolution=None, ceiling=False, doors=False)) == len(box_points())
+
+
 @pytest.mark.parametrize(("factor", "unit"), [(1000, "mm"), (100, "cm")])
 def test_wrong_units_are_noticed(tmp_path: Path, factor: float, unit: str) -> None:
     path = save(tmp_path / "a.npy", room(31, 20, 2.7, 0.2) * factor)

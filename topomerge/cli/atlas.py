@@ -12,8 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, say, say_line, warn
-from topomerge.cli.options import ATLAS_OPTIONS, CLOUD_OPTIONS, atlas_choices, count, json_option, map_from, quiet
+from topomerge.cli.console import check_inputs, say, say_line, warn, write_out
+from topomerge.cli.options import (
+    ATLAS_OPTIONS,
+    CLOUD_OPTIONS,
+    at_least_one,
+    atlas_choices,
+    check_cloud_options,
+    json_option,
+    map_from,
+    quiet,
+)
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,6 +31,11 @@ if TYPE_CHECKING:
 
 
 ROOMS_SHOWN = 8  # pairs of rooms of a map that `find` prints
+FIND_COLUMNS = """\
+Listed by fit, best first, then by share. fit: log odds that the new map lies there; other buildings mostly have less than 0.
+share: each room of the new map has one vote, which goes to the rooms that look most like it; those of this map got this share.
+rooms: pairs that look most like each other among the rooms of both maps, even if they look little alike.
+`topomerge merge` tells whether it is the same place."""
 
 
 def atlas_command(args: argparse.Namespace) -> int:
@@ -41,6 +55,7 @@ def _add(args: argparse.Namespace) -> int:
     check_folder(args.folder)
     choices, workers = atlas_choices(args), _workers(args)
     check_inputs(args.items)
+    check_cloud_options(args.items, args)
     maps = ((Path(path).stem, replace(map_from(path, args), source=path)) for path in args.items)  # one in memory at a time
     return _report(add(args.folder, maps, atlas_html, workers, **choices), args)
 
@@ -71,9 +86,10 @@ def _find(args: argparse.Namespace) -> int:
     if len(args.items) != 1:
         raise InputError(f"{args.folder}: name the one map or cloud to look for: topomerge atlas find {args.folder} MAP")
     check_inputs(args.items)
+    check_cloud_options(args.items, args)
     sightings = find(args.folder, map_from(args.items[0], args), args.first)
     if args.json:
-        sys.stdout.write(json.dumps([asdict(s) for s in sightings], indent=1, ensure_ascii=False) + "\n")
+        write_out(json.dumps([asdict(s) for s in sightings], indent=1, ensure_ascii=False) + "\n")
         return 0
     rows = [("map", "fit", "share", "rooms (new map = atlas map)")]
     for s in sightings:
@@ -81,6 +97,8 @@ def _find(args: argparse.Namespace) -> int:
         rows.append((s.name, "" if s.fit is None else f"{s.fit:+.1f}", f"{s.share:.2f}", rooms))
     widths = [max(len(row[c]) for row in rows) for c in range(3)]
     say("\n".join("  ".join((*(f"{word:<{wide}}" for word, wide in zip(row, widths, strict=False)), row[3])) for row in rows))
+    if not args.quiet:
+        say(f"\n{FIND_COLUMNS}")
     return 0
 
 
@@ -101,7 +119,7 @@ def _list(args: argparse.Namespace) -> int:
         raise InputError(f"{args.items[0]}: list takes the folder only")
     listing = read_atlas(args.folder).listing or {}
     if args.json:
-        sys.stdout.write(json.dumps(listing, indent=1, ensure_ascii=False) + "\n")
+        write_out(json.dumps(listing, indent=1, ensure_ascii=False) + "\n")
         return 0
     try:
         table = _table(listing)
@@ -137,13 +155,13 @@ ATLAS = Command(
         ),
         option("folder", metavar="DIR", help="the atlas"),
         option("items", nargs="*", metavar="MAP", help="add, find: clouds or .tmap; remove: names as `list` prints them"),
-        option("--first", type=int, default=5, metavar="N", help="find: how many maps to name (default 5)"),
-        option("--jobs", type=count, default=1, metavar="N", help="add: register pairs in N processes (default 1)"),
+        option("--first", type=at_least_one, default=5, metavar="N", help="find: how many maps to name (default 5)"),
+        option("--jobs", type=at_least_one, default=1, metavar="N", help="add: register pairs in N processes (default 1)"),
         option("--cluster", default="", metavar="ADDRESS", help="add: register pairs on a Dask cluster, e.g. tcp://host:8786"),
         *ATLAS_OPTIONS,
         *CLOUD_OPTIONS,
         json_option("list: print atlas.json; find: print maps and rooms as JSON"),
-        quiet("print nothing but warnings and what stands apart"),
+        quiet("print nothing but warnings and what stands apart; find: only the table"),
     ),
     paths=("folder", "items"),
     description="Keep many maps together: those that belong to each other are joined, the others stay apart and are named. "

@@ -15,7 +15,7 @@ class Command:
     """One command: its function, its words for the help and its arguments.
 
     `run` takes the parsed arguments and returns the exit status; `paths` are the arguments that name files, the input first:
-    an error that names no file is reported under the first of them.
+    an error that names no file is reported under the first of them. `one_input` is said of words too many.
     """
 
     name: str
@@ -25,6 +25,7 @@ class Command:
     arguments: tuple[Argument, ...]
     paths: tuple[str, ...] = ()
     description: str = ""
+    one_input: str = ""
 
 
 def option(*flags: str, **settings: Any) -> Argument:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from topomerge.cli.command import Command, option
+from topomerge.cli.console import write_out
 
 SHELLS = ("bash", "zsh", "fish")
 FOLDER_METAVARS = ("DIR", "FOLDER")
@@ -33,7 +33,7 @@ class Word:
 
 def completion_command(args: argparse.Namespace) -> int:
     """`topomerge completion`: print the script that completes all of `args.commands`."""
-    sys.stdout.write(script(args.shell, args.commands))
+    write_out(script(args.shell, args.commands))
     return 0
 
 

@@ -15,6 +15,7 @@ from topomerge.errors import InputError, printable
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+PAGE_SUFFIXES = (".html", ".htm")
 Report = Callable[[float, str], None]  # fraction done in 0..1, what is being done
 
 
@@ -80,9 +81,36 @@ class Bars:
             self._shown.update(self._rows[title], completed=fraction, description=text or title)
 
 
+class PrintError(Exception):
+    """What is printed can't be written: no file's fault."""
+
+
+@contextmanager
+def printing() -> Iterator[None]:
+    """Within, only what is printed is written.
+
+    Raises:
+        PrintError: the disk is full, for example.
+        BrokenPipeError: what read it has gone away.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise PrintError(f"what is printed can't be written ({error.strerror or error})") from error
+
+
+def write_out(text: str) -> None:
+    """Write to stdout as it is."""
+    with printing():
+        sys.stdout.write(text)
+
+
 def say(text: str, stream: TextIO | None = None) -> None:
     """Print what may quote a stranger's file; to stdout by default."""
-    print(printable(text), file=stream)
+    with printing():
+        print(printable(text), file=stream)
 
 
 def say_line(text: str, stream: TextIO | None = None) -> None:
@@ -96,8 +124,8 @@ def warn(messages: Iterable[str]) -> None:
         say(f"topomerge: warning: {' '.join(message.split())}", sys.stderr)
 
 
-def failure_line(error: BaseException, paths: Sequence[str]) -> str:
-    """One line about an error that names the file it is about."""
+def failure_line(error: BaseException, paths: Sequence[str], outputs: Sequence[str] = ()) -> str:
+    """One line about an error that names the file it is about, of those that were read the first."""
     if isinstance(error, MemoryError):
         text = "not enough memory; take larger voxels or a part of the input"
     elif isinstance(error, OSError) and error.strerror:
@@ -109,7 +137,7 @@ def failure_line(error: BaseException, paths: Sequence[str]) -> str:
     else:
         text = f"unexpected {type(error).__name__}: {error} (a fault in topomerge: run again with -v -v and report it)"
     text = " ".join(text.split()) or type(error).__name__
-    named = any(" ".join(path.split()) in text for path in paths)
+    named = any(" ".join(path.split()) in text for path in (*paths, *outputs))
     if paths and not text.startswith("--") and not named:  # an option is no file's fault
         text = f"{paths[0]}: {text}"
     return " ".join(text.split())
@@ -168,6 +196,20 @@ def output_folder(path: str | Path) -> Iterator[Path]:
         for empty in missing:
             with suppress(OSError):  # what is written stays
                 empty.rmdir()
+
+
+def check_suffix(name: str, path: str, suffixes: Sequence[str]) -> None:
+    """Refuse an output whose name promises another format.
+
+    Args:
+        name: of the option, with its dashes.
+        suffixes: in small letters; the first is the usual one.
+
+    Raises:
+        InputError: its suffix is none of them.
+    """
+    if Path(path).suffix.lower() not in suffixes:
+        raise InputError(f"{path}: {name} writes {suffixes[0]}; end its name with {' or '.join(suffixes)}")
 
 
 def check_outputs(outputs: Sequence[str | Path], inputs: Sequence[str | Path] = ()) -> None:

@@ -6,13 +6,25 @@ import argparse
 from pathlib import Path
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_outputs, say_line, write_all
-from topomerge.cli.options import CLOUD_OPTIONS, CONTEXT_STEPS, DESCRIPTOR, map_from, output, quiet
+from topomerge.cli.console import check_outputs, check_suffix, say_line, write_all
+from topomerge.cli.options import (
+    CLOUD_OPTIONS,
+    CONTEXT_STEPS,
+    DESCRIPTOR,
+    check_cloud_options,
+    check_descriptor,
+    map_from,
+    output,
+    quiet,
+)
 
 
 def embed_command(args: argparse.Namespace) -> int:
     """`topomerge embed`: describe each room of a map; write a NumPy array (rooms, numbers), or (rooms, 4, numbers)."""
     check_outputs([args.output], [args.input])
+    check_suffix("-o", args.output, (".npy",))
+    check_cloud_options([args.input], args)
+    check_descriptor(args)
     from topomerge.embedding.embedders import embedder
     from topomerge.embedding.turns import numbers
 
@@ -21,7 +33,7 @@ def embed_command(args: argparse.Namespace) -> int:
     import numpy as np
 
     def save(path: Path) -> None:
-        with path.open("wb") as file:  # np.save would add .npy to another name
+        with path.open("wb") as file:  # np.save would add .npy to a name in capitals
             np.save(file, rows, allow_pickle=False)
 
     write_all([(args.output, save)])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import topomerge
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import Bars, check_outputs, say, warn, write_all
+from topomerge.cli.console import PAGE_SUFFIXES, Bars, check_outputs, check_suffix, say, warn, write_all
 from topomerge.cli.options import UNIT, UP, above_zero, given, output, quiet
 from topomerge.errors import InputError
 
@@ -43,6 +43,9 @@ def _outputs(args: argparse.Namespace) -> list[tuple[str, str]]:
     """Where to write, and the name of topomerge's function (map, path) that writes it."""
     if args.figure and Path(args.figure).suffix.lower() not in FIGURE_FORMATS:
         raise InputError(f"{args.figure}: unknown kind of figure; end the name with one of {' '.join(FIGURE_FORMATS)}")
+    for name, suffixes in (("ply", (".ply",)), ("report", PAGE_SUFFIXES)):
+        if getattr(args, name):
+            check_suffix(f"--{name}", getattr(args, name), suffixes)
     writers = {"output": "save_map", "json": "save_json", "ply": "save_rooms_ply", "figure": "save_figure"}
     writers["report"] = "save_report"
     return [(getattr(args, name), writer) for name, writer in writers.items() if getattr(args, name)]
@@ -86,4 +89,5 @@ EXTRACT = Command(
     ),
     paths=("input", "output", "json", "ply", "figure", "report", "poses"),
     description="Find the rooms, doors and storeys of one partial map, and print a table of them.",
+    one_input="extract takes one scan; `topomerge merge` takes several",
 )

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import say, warn
+from topomerge.cli.console import say, warn, write_out
 from topomerge.cli.options import json_option
 
 
@@ -18,7 +17,7 @@ def info_command(args: argparse.Namespace) -> int:
     topomap = load_map(args.input)
     warn(topomap.warnings)
     if args.json:
-        sys.stdout.write(json_text(map_to_json(topomap)))
+        write_out(json_text(map_to_json(topomap)))
     else:
         say(map_to_text(topomap))
     return 0

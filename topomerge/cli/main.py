@@ -18,7 +18,7 @@ from topomerge import __version__
 from topomerge.cli.atlas import ATLAS
 from topomerge.cli.command import Command
 from topomerge.cli.completion import COMPLETION
-from topomerge.cli.console import failure_line, signal_behind
+from topomerge.cli.console import PrintError, failure_line, printing, signal_behind
 from topomerge.cli.embed import EMBED
 from topomerge.cli.export import EXPORT
 from topomerge.cli.export_embedder import EXPORT_EMBEDDER
@@ -64,7 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"topomerge {__version__}")
-    parser.set_defaults(run=None, paths=(), commands=COMMANDS)
+    parser.set_defaults(run=None, paths=(), one_input="", commands=COMMANDS)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in COMMANDS:
         _add(commands, command)
@@ -83,21 +83,22 @@ def _add(commands: Any, command: Command) -> None:
     for flags, settings in command.arguments:
         parser.add_argument(*flags, **settings)
     parser.add_argument("-v", "--verbose", action="count", default=0, help="print more; twice: also tracebacks")
-    parser.set_defaults(run=command.run, paths=command.paths)
+    parser.set_defaults(run=command.run, paths=command.paths, one_input=command.one_input)
 
 
-def _named_paths(args: argparse.Namespace) -> list[str]:
-    """The files that the user named, the input first."""
-    values = [getattr(args, name) for name in args.paths if getattr(args, name, None)]
-    return [str(path) for value in values for path in (value if isinstance(value, list) else [value])]
+def _named_paths(args: argparse.Namespace) -> tuple[list[str], list[str]]:
+    """The files that the user named, the input first; and the output."""
+    values = {name: getattr(args, name) for name in args.paths if getattr(args, name, None)}
+    output = values.pop("output", None)
+    paths = [str(path) for value in values.values() for path in (value if isinstance(value, list) else [value])]
+    return paths, [] if output is None else [str(output)]
 
 
-def _refuse_empty_names(args: argparse.Namespace) -> None:
-    """An empty name is what a script's unset variable leaves; pathlib would take it for the current folder."""
-    for name in args.paths:
-        value = getattr(args, name, None)
-        if value == "" or (isinstance(value, list) and "" in value):
-            raise ValueError(f"the name given for {name} is empty; give the name of a file or folder")
+def _empty_name(args: argparse.Namespace) -> str:
+    """For which file an empty name was given, if for one; that is what a script's unset variable leaves, and pathlib would take
+    it for the current folder."""
+    values = {name: getattr(args, name, None) for name in args.paths}
+    return next((name for name, value in values.items() if value == "" or (isinstance(value, list) and "" in value)), "")
 
 
 def _joined(words: Sequence[str]) -> list[str]:
@@ -119,18 +120,22 @@ def _open_closed_streams() -> None:
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
 
 
+def _drop_output() -> None:
+    """The interpreter flushes stdout once more at exit: give it a place where that succeeds."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _run(args: argparse.Namespace) -> int:
     debug = args.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
     logging.basicConfig(format="topomerge: %(message)s")
     logging.getLogger("topomerge").setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[min(args.verbose, 2)])
     try:
-        _refuse_empty_names(args)
         status = int(args.run(args))
-        sys.stdout.flush()
+        with printing():
+            sys.stdout.flush()
         return status
     except BrokenPipeError:
-        # The interpreter flushes stdout once more at exit: give it a place where that succeeds.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 141
     except (KeyboardInterrupt, Exception) as error:
         signalled = signal_behind(error)
@@ -141,7 +146,11 @@ def _run(args: argparse.Namespace) -> int:
             return 130
         if debug:
             traceback.print_exc()
-        print(printable(f"topomerge: {failure_line(error, _named_paths(args))}"), file=sys.stderr)
+        if isinstance(error, PrintError):
+            _drop_output()
+            print(f"topomerge: {error}", file=sys.stderr)
+            return 1
+        print(printable(f"topomerge: {failure_line(error, *_named_paths(args))}"), file=sys.stderr)
         return 1
 
 
@@ -162,7 +171,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")  # a terminal without m² must not end the work
     parser = build_parser()
     try:
-        args = parser.parse_args(_joined(sys.argv[1:] if argv is None else argv))
+        args, unknown = parser.parse_known_args(_joined(sys.argv[1:] if argv is None else argv))
+        if unknown:
+            one_input = "" if unknown[0].startswith("-") or not args.one_input else f": {args.one_input}"
+            parser.error(f"unrecognized arguments: {' '.join(unknown)}{one_input}")
+        if empty := _empty_name(args):
+            parser.error(f"the name given for {empty} is empty; give the name of a file or folder")
         if args.run is None:
             parser.print_help(sys.stderr)
             return 1

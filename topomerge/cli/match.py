@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, check_outputs, warn
-from topomerge.cli.options import CLOUD_OPTIONS, CONTEXT_STEPS, DESCRIPTOR, json_option, map_from
+from topomerge.cli.console import PAGE_SUFFIXES, check_inputs, check_outputs, check_suffix, warn, write_out
+from topomerge.cli.options import (
+    CLOUD_OPTIONS,
+    CONTEXT_STEPS,
+    DESCRIPTOR,
+    check_cloud_options,
+    check_descriptor,
+    json_option,
+    map_from,
+)
+from topomerge.errors import InputError
 
 
 def match_command(args: argparse.Namespace) -> int:
@@ -18,8 +26,14 @@ def match_command(args: argparse.Namespace) -> int:
     from topomerge.matching.match import check, match
 
     check_inputs([args.a, args.b])
+    check_cloud_options([args.a, args.b], args)
+    if args.method != "thesis":  # which has a descriptor and a context of its own
+        check_descriptor(args)
+    if args.method == "attention" and (args.descriptor != "learned" or args.scale_of_b == "free"):
+        raise InputError("--method attention needs the embedder that ships, and maps of one scale; take --method consistent")
     if args.report:
         check_outputs([args.report], [args.a, args.b])
+        check_suffix("--report", args.report, PAGE_SUFFIXES)
     a, b = map_from(args.a, args), map_from(args.b, args)
     check(a, b)
     alone = [path for path, topomap in ((args.a, a), (args.b, b)) if len(topomap.rooms) == 1]
@@ -30,7 +44,7 @@ def match_command(args: argparse.Namespace) -> int:
         from topomerge.viz.match_report import save_match_report
 
         save_match_report(matching, a, b, args.report)
-    sys.stdout.write(json_text(matching_to_json(matching, a, b)) if args.json else matching_to_text(matching, a, b) + "\n")
+    write_out(json_text(matching_to_json(matching, a, b)) if args.json else matching_to_text(matching, a, b) + "\n")
     return 0
 
 

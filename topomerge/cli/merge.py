@@ -14,7 +14,19 @@ import topomerge
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, check_outputs, output_folder, say_line, warn
 from topomerge.cli.merge_points import point_files, points_written, with_points
-from topomerge.cli.options import BELIEF_OPTIONS, CLOUD_OPTIONS, DESCRIPTOR, belief_choices, given, map_from, output, quiet
+from topomerge.cli.options import (
+    BELIEF_OPTIONS,
+    CLOUD_OPTIONS,
+    DESCRIPTOR,
+    about,
+    belief_choices,
+    check_cloud_options,
+    check_descriptor,
+    given,
+    map_from,
+    output,
+    quiet,
+)
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,6 +52,7 @@ def merge_command(args: argparse.Namespace) -> int:
 
 def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) -> int:
     belief = belief_choices(args)
+    _check_choices(args)
     maps, read_seconds, extract_seconds = [], 0.0, 0.0
     for path in args.inputs:
         topomap, read, extract = _timed_map(path, args)
@@ -59,6 +72,23 @@ def _merge(args: argparse.Namespace, folder: Path, files: Mapping[int, Path]) ->
     elif not result.merged:
         say_line(f"topomerge: {result.reason}", sys.stderr)
     return 0 if result.merged else 2
+
+
+def _check_choices(args: argparse.Namespace) -> None:
+    """Find out before the work starts whether it can be done as it is asked for.
+
+    Raises:
+        InputError: the line begins with the option.
+    """
+    from topomerge.fusion.inputs import check_poses
+    from topomerge.fusion.thesis.fpfh import check_open3d
+
+    check_cloud_options(args.inputs, args)
+    check_descriptor(args)
+    with about("--poses"):
+        check_poses(args.poses, len(args.inputs), args.scale_of_b)
+        if args.poses == "rooms":
+            check_open3d()
 
 
 def _timed_map(path: str, args: argparse.Namespace) -> tuple[TopometricMap, float, float]:

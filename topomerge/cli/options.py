@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,9 +44,42 @@ def count(text: str) -> int:
     return int(text)
 
 
+def at_least_one(text: str) -> int:
+    """A whole number from 1 on, as the `type` of an argument."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 on, not {text!r}")
+    return int(text)
+
+
 def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Those of the options that were given: for the others, the function that takes them has its defaults."""
     return {name: getattr(args, name) for name in names if hasattr(args, name)}
+
+
+@contextmanager
+def about(name: str) -> Iterator[None]:
+    """An error of the input within is the fault of this option: its line begins with it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+
+
+def check_descriptor(args: argparse.Namespace) -> None:
+    """Find out before the work starts whether the descriptor can be had with the steps of context.
+
+    Raises:
+        InputError: no.
+    """
+    from topomerge.embedding.embedders import embedder
+
+    with about("--descriptor"):
+        embedder(args.descriptor)
+    with about("--k"):
+        steps = getattr(args, "k", 0)
+        if steps and args.descriptor == "learned":
+            raise InputError("steps of context are for descriptors of single rooms; learned sees what is around: leave it out")
+        embedder(args.descriptor, steps)
 
 
 def belief_choices(args: argparse.Namespace) -> dict[str, Any]:
@@ -144,6 +178,18 @@ CLOUD_OPTIONS = (
 
 # Advice of the readers that only `extract` can take: --scale and --poses of `merge` are others.
 EXTRACT_ADVICE = ("--resolution", "--poses", "--topic", "--scale", "--spacing")
+
+
+def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
+    """Refuse `CLOUD_OPTIONS` where no input is a cloud.
+
+    Raises:
+        InputError: names the first of them.
+    """
+    useless = given(args, "voxel_size", "up", "unit", "sensor")
+    if useless and all(Path(path).suffix.lower() == ".tmap" for path in paths):
+        name = next(iter(useless)).replace("_", "-")
+        raise InputError(f"--{name}: is for clouds, of no use to a .tmap; give the scan that it was made of, or leave it out")
 
 
 def map_from(path: str, args: argparse.Namespace) -> TopometricMap:

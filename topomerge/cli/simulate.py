@@ -8,6 +8,8 @@ from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_outputs, output_folder, say_line, write_all
 from topomerge.cli.options import count, given, output, quiet
 
+KINDS_OF_BUILDINGS = ("office", "openplan", "apartment", "hotel", "hospital", "school", "lab", "house")  # of datasets/buildings
+
 
 def simulate_command(args: argparse.Namespace) -> int:
     """`topomerge simulate`: scan a building of a seed; write the clouds, the truth and a picture into a folder."""
@@ -22,7 +24,8 @@ def simulate_command(args: argparse.Namespace) -> int:
         files = outputs(building, sessions, frame, folder)
         write_all(files)
     if not args.quiet:
-        say_line(f"{building.name}: {len(building.rooms)} rooms -> {' '.join(str(path) for path, _ in files)}")
+        rooms = f"the building {building.name} has {len(building.rooms)} rooms"
+        say_line(f"{rooms} -> {' '.join(str(path) for path, _ in files)}")
     return 0
 
 
@@ -32,7 +35,14 @@ SIMULATE = Command(
     "make one or two partial maps of a building that is known exactly",
     "topomerge simulate --building office --seed 7 --sensors tls,depth --overlap 0.4 -o pair/",
     (
-        option("--building", required=True, metavar="KIND", default=None, help="office, hotel, house, school, ..."),
+        option(
+            "--building",
+            required=True,
+            choices=KINDS_OF_BUILDINGS,
+            metavar="KIND",
+            default=None,
+            help=", ".join(KINDS_OF_BUILDINGS),
+        ),
         option("--seed", type=count, metavar="N", help="each number makes another building (default 7)"),
         option("--storeys", type=count, metavar="N", help="1 to 8 (default 1)"),
         option("--sensors", metavar="A,B", help="tls lidar depth mono laser2d tablet; one gives one cloud (default tls,depth)"),

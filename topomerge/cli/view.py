@@ -9,11 +9,9 @@ from functools import partial
 from pathlib import Path
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_inputs, check_outputs, write_all
+from topomerge.cli.console import PAGE_SUFFIXES, check_inputs, check_outputs, check_suffix, printing, say, write_all
 from topomerge.cli.options import count
 from topomerge.errors import InputError
-
-PAGE_SUFFIXES = (".html", ".htm")
 
 
 def view_command(args: argparse.Namespace) -> int:
@@ -23,7 +21,7 @@ def view_command(args: argparse.Namespace) -> int:
         if args.open:
             _show(page.resolve().as_uri(), str(page))
         else:
-            print(page)
+            say(str(page))
         return 0
     from topomerge.viz.serve import serve
 
@@ -33,7 +31,8 @@ def view_command(args: argparse.Namespace) -> int:
 
 
 def _print_address(address: str) -> None:
-    print(address, flush=True)
+    with printing():
+        print(address, flush=True)
 
 
 def _page(args: argparse.Namespace, scratch: str | None = None) -> Path:
@@ -62,6 +61,7 @@ def _page(args: argparse.Namespace, scratch: str | None = None) -> Path:
     else:  # a browser reads it after this program has ended: only what is served is deleted
         place = Path(scratch or tempfile.mkdtemp(prefix="topomerge-")) / f"{path.stem}.html"
     check_outputs([place], [path])
+    check_suffix("-o", str(place), PAGE_SUFFIXES)
     write_all([(place, partial(save_report, topomap))])
     return place
 

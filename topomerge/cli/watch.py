@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from topomerge.cli.command import Command, option
-from topomerge.cli.console import check_outputs, failure_line, say, say_line, signal_behind, warn
+from topomerge.cli.console import check_outputs, failure_line, printing, say, say_line, signal_behind, warn
 from topomerge.cli.options import (
     ATLAS_OPTIONS,
     CLOUD_OPTIONS,
@@ -43,7 +43,8 @@ def watch_command(args: argparse.Namespace) -> int:
             warn([line])
         elif not args.quiet:
             say_line(line)
-            sys.stdout.flush()
+            with printing():
+                sys.stdout.flush()
 
     log = _rerun_log(args)
 

@@ -17,6 +17,7 @@ from topomerge.types import Array, PointCloud, VoxelGrid
 
 FINEST_CELL = 0.02  # m
 FINE_CELL = 0.05  # m: of the cells in which walls are looked at closely
+SHORTEST_ROW = 1.0  # m: the cells of any scan, laid in a row, are longer
 LEAST_FINE = 2.05  # times as long: a grid of such cells will do, if it has the means of its points
 MOST_FINE_CELLS = 12_000_000  # 0.7 GB; some 4,000 m2 of floor
 MOST_RAYS = 400_000  # of a portion of two million points
@@ -67,14 +68,15 @@ def read_scan(
         least_neighbours: that the median cell has, of 26; the cells are doubled until it has them. 0: never.
 
     Raises:
-        InputError: no finite point, an absurd extent, cells of a size that shows no rooms and doors, or a path or a list in
-            place of points.
+        InputError: no finite point, hardly any cells, an absurd extent, cells of a size that shows no rooms and doors, or a path
+            or a list in place of points.
     """
     if isinstance(source, str | Path):
         raise InputError(f"{source}: extract takes points, not the name of a file; read it with read_points or read_chunks")
     edge = source.edge if isinstance(source, VoxelGrid) else voxel_size
     if not (isinstance(edge, int | float) and FINEST_CELL <= edge <= COARSEST_CELL):
-        raise InputError(f"voxel size must be between {FINEST_CELL} and {COARSEST_CELL} m to find rooms and doors, not {edge}")
+        size = f"a number between {FINEST_CELL} and {COARSEST_CELL} (m)"
+        raise InputError(f"voxel size must be {size} to find rooms and doors, not {edge!r}")
     if isinstance(source, VoxelGrid):
         return Scan(source, source if "offset" in source.properties and edge <= LEAST_FINE * FINE_CELL else None)
     parts = max(round(edge / FINE_CELL), 1)
@@ -82,6 +84,9 @@ def read_scan(
     chunks = _Chunks([PointCloud(source)] if isinstance(source, np.ndarray) else source, fine)
     with reasons(chunks.warnings):
         grid = voxelise(chunks, edge, chunks.warnings)
+        if len(grid) * edge < SHORTEST_ROW:
+            cells = f"{len(grid)} cell{'s' * (len(grid) != 1)} of {edge:g} m"
+            raise InputError(f"too few points, or all in one place: they lie in {cells}; check the file and --unit")
     close = fine.within(grid) if fine is not None else grid
     if close is None:
         chunks.warnings.append("the scan is large: doors are read off its plan alone, not off its walls")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
+from numbers import Real
 
 import numpy as np
 from scipy import ndimage
@@ -36,8 +37,8 @@ def voxelise(cloud: PointCloud | Array | Iterable[PointCloud], edge: float = 0.1
     Raises:
         InputError: no finite point, or an extent that no building has.
     """
-    if not (np.isfinite(edge) and 0.001 <= edge <= 10):
-        raise InputError(f"voxel size must be between 0.001 and 10 m, not {edge}")
+    if not (isinstance(edge, Real) and 0.001 <= edge <= 10):
+        raise InputError(f"voxel size must be a number between 0.001 and 10 (m), not {edge!r}")
     if isinstance(cloud, PointCloud):
         chunks: Iterable[PointCloud] = [cloud]
     elif isinstance(cloud, np.ndarray):

@@ -11,6 +11,7 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.fusion.posterior import threshold_of
 from topomerge.fusion.verify import model
+from topomerge.io.maps import load_map
 from topomerge.types import TopometricMap
 
 MERGE_SCALES = ("fixed", "free")
@@ -23,12 +24,26 @@ UNIT_RATIO_MM = 300.0  # times the other map: in millimetres rather than centime
 TALL_RATIO = 2.2  # times the height of the other's storeys: another unit, or a hall
 
 
-def check_maps(maps: Sequence[object]) -> None:
-    """Raise InputError for what is no map, as a path or a cloud."""
-    for map in maps:
-        if not isinstance(map, TopometricMap):
-            name = str(map) if isinstance(map, str | Path) else type(map).__name__
-            raise InputError(f"{name}: merge takes maps; read a .tmap with load_map, make a map of points with extract")
+def check_list(maps: object, taker: str) -> None:
+    """Raise InputError for no list of two maps or more, as one map or a generator; `taker` is the function that was called."""
+    if isinstance(maps, str) or not isinstance(maps, Sequence):
+        raise InputError(f"{taker} takes a list of maps, not a {type(maps).__name__}; give it as {taker}([a, b])")
+    if len(maps) < 2:
+        raise InputError(f"{taker} takes two maps or more, {len(maps)} given; give another one")
+
+
+def loaded(map: object) -> TopometricMap:
+    """A map, read where it is a `.tmap` file.
+
+    Raises:
+        InputError: the file can't be read, or it is no map, as a cloud or the file of one.
+    """
+    if isinstance(map, str | Path) and Path(map).suffix.lower() == ".tmap":
+        return load_map(map)
+    if not isinstance(map, TopometricMap):
+        name = str(map) if isinstance(map, str | Path) else type(map).__name__
+        raise InputError(f"{name}: merge takes maps and .tmap files; make a map of points with extract")
+    return map
 
 
 def check_scale(scale: str) -> None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,13 @@ from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.turns import Rows
-from topomerge.errors import InputError
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, solve
 from topomerge.fusion.bend.bend import NEITHER_BENDS
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import fuse, rooms_in_common
-from topomerge.fusion.inputs import check_maps, check_pair, check_poses, check_scale, checked_threshold, pair_warnings
+from topomerge.fusion.inputs import check_list, check_pair, check_poses, check_scale, checked_threshold, loaded, pair_warnings
 from topomerge.fusion.posterior import check_same
 from topomerge.fusion.prepared import registration_order
 from topomerge.fusion.registration import Registration, register
@@ -35,7 +35,7 @@ from topomerge.types import Sim3, TopometricMap
 
 
 def merge(
-    maps: Sequence[TopometricMap],
+    maps: Sequence[TopometricMap | str | Path],
     *,
     scale: str = "fixed",
     force: bool = False,
@@ -48,7 +48,8 @@ def merge(
     """Bring maps together, or say why not. `merge([b, a])` gives the inverse transform.
 
     Args:
-        maps: two topometric maps or more; `atlas` brings more than two together, as many as belong to the first one.
+        maps: topometric maps or `.tmap` files, two or more; `atlas` brings more than two together, as many as belong to the first
+            one.
         scale: "fixed", or "free" where the scale of the second map is unknown.
         force: give the best transform and its joined map, too, where it is not believed; the status stays "abstained".
         threshold: probability from which a merge is believed; that of the calibration if None; `fusion.inputs.risk_threshold`
@@ -61,20 +62,19 @@ def merge(
         same: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
 
     Raises:
-        InputError: fewer than two maps, something that is no map, one map twice, a map without cells, maps in different units,
-            another word for the scale, the poses or what the maps are of, or poses of rooms without Open3D (`pip install
+        InputError: no list, fewer than two maps, something that is no map, one map twice, a map without cells, maps in different
+            units, another word for the scale, the poses or what the maps are of, or poses of rooms without Open3D (`pip install
             topomerge[open3d]`).
     """
+    check_list(maps, "merge")
     check_poses(poses, len(maps), scale)
     if poses == "rooms":
         check_open3d()
-    if len(maps) < 2:
-        raise InputError(f"merge takes two maps or more, {len(maps)} given; give another one")
-    check_maps(maps)
+    read = [loaded(map) for map in maps]
     check_scale(scale)
     check_same(same)
     settings = _Settings(scale, force, threshold, embedder, poses, rigid, same)
-    return _merge_two(maps[0], maps[1], settings) if len(maps) == 2 else _merge_several(maps, settings)
+    return _merge_two(read[0], read[1], settings) if len(read) == 2 else _merge_several(read, settings)
 
 
 @dataclass(frozen=True)

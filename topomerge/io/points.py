@@ -42,6 +42,8 @@ class Format:
     takes: tuple[str, ...] = ()
 
 
+PICTURES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+DRAWN = ("resolution", "extrude", "ceiling")  # options of drawings, whose walls are raised
 FORMATS = (
     Format("a PLY file", "ply", (".ply",)),
     Format("a PCD file", "pcd", (".pcd",)),
@@ -52,12 +54,12 @@ FORMATS = (
     Format("a mesh", "mesh", (".obj", ".stl")),
     Format("a glTF mesh", "mesh", (".glb", ".gltf"), up="y"),
     Format("an OctoMap", "octomap", (".bt", ".ot")),
-    Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc"),
-    Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic")),
-    Format("a map in JSON", "json_map", (".json",), fixed=True),
+    Format("an IFC model", "ifc", (".ifc",), fixed=True, extra="ifc", takes=("doors",)),
+    Format("a ROS bag", "bag", (".bag", ".db3", ".mcap"), extra="ros", takes=("poses", "topic", "extrude", "ceiling")),
+    Format("a map in JSON", "json_map", (".json",), fixed=True, takes=DRAWN),
     Format("an RTAB-Map database", "rtabmap", (".db",)),
     Format("a ScanNet recording", "sens", (".sens",)),
-    Format("a floor plan", "grid", (".yaml", ".yml", ".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"), fixed=True),
+    Format("a floor plan", "grid", (".yaml", ".yml", *PICTURES), fixed=True, takes=DRAWN),
 )
 SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
 RGBD_FOLDER = Format("a folder of RGB-D images", "rgbd", (), takes=("poses",))
@@ -108,8 +110,8 @@ def read_chunks(
     reading = read_options(path, options)
     if chunk < 1:
         raise InputError(f"{path}: a chunk of {chunk} points can't be read; give 1 or more")
-    for name in ("poses", "topic"):
-        if getattr(reading, name) is not None and name not in file_format.takes:
+    for name in ("poses", "topic", "doors", *DRAWN):
+        if options.get(name) not in (None, False) and name not in file_format.takes:
             able = ", ".join(f.name for f in (*FORMATS, SCAN_FOLDER, RGBD_FOLDER) if name in f.takes)
             raise InputError(f"{path}: --{name} is of no use to {file_format.name}, only to {able}; leave it out")
     warnings: list[str] = []

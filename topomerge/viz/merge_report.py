@@ -50,7 +50,7 @@ def save_merge(result: MergeResult, folder: str | Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: can't be made ({error.strerror or error}); give the name of a folder") from error
+        raise InputError(f"{folder}: can't be made ({error.strerror or error}); give another folder") from error
     writers: list[tuple[str, Callable[[Path], None]]] = [
         ("merge.json", partial(_write, json_text(merge_to_json(result)))),
         ("report.html", partial(_write, merge_html(result))),

@@ -119,6 +119,11 @@ def test_a_file_of_rooms_that_is_damaged_or_another_s_is_refused(house: Path, tm
         find(house, office_map(0))
 
 
+def test_a_map_and_a_folder_that_were_swapped_are_told(house: Path) -> None:
+    with pytest.raises(InputError, match="find takes the folder of an atlas and a map, .*, not TopometricMap and "):
+        find(office_map(0), house)  # type: ignore[arg-type]
+
+
 def test_empty_atlases_and_maps_without_rooms(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         find(tmp_path / "nowhere", office_map(0))
@@ -137,10 +142,11 @@ def test_the_command(house: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("map") and lines[1].startswith(NAMES[0]) and "0 = 0" in lines[1]
+    assert lines[3] == "" and lines[4].startswith("Listed by fit, best first") and lines[5].startswith("share: ")
     assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap"), "--json", "--first", "1"]) == 0
     listed = json.loads(capsys.readouterr().out)
     assert len(listed) == 1 and listed[0]["name"] == NAMES[0]
     assert cli(["atlas", "find", str(house), str(tmp_path / "new.tmap"), "--first", "0"]) == 1
-    assert "must be 1 or more" in capsys.readouterr().err
+    assert "must be a whole number from 1 on" in capsys.readouterr().err
     assert cli(["atlas", "find", str(house)]) == 1
     assert "name the one map" in capsys.readouterr().err

@@ -26,6 +26,16 @@ def change(folder: Path) -> None:
             (place / name).write_text("2")
 
 
+def test_a_full_disk_is_not_taken_for_a_wrong_name(tmp_path, monkeypatch):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(InputError, match=r"No space left on device\); make room there, or give another folder"):
+        change(tmp_path / "house")
+    assert not (tmp_path / "house").exists()
+
+
 @pytest.mark.longer
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a copy of this process")
 def test_a_kill_at_any_moment_leaves_the_old_or_the_new(tmp_path):

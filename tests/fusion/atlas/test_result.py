@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from topomerge.errors import InputError
 from topomerge.fusion.atlas.assembly import Link
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.matching.poses import PoseHypothesis
@@ -41,6 +42,11 @@ def test_a_component_is_as_probable_as_its_weakest_link():
 )
 def test_the_status_and_who_stands_alone(components, status, alone):
     assert atlas(*components).status == status and atlas(*components).alone == alone
+
+
+def test_a_component_that_is_not_there_is_named():
+    with pytest.raises(InputError, match="^there is no component 9: the atlas has 2 components, counted from 0"):
+        atlas((0, 1), (2,)).joined(9)
 
 
 def test_words_name_who_belongs_together_who_stands_apart_and_what_was_thrown_out():

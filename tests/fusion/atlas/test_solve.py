@@ -225,7 +225,7 @@ def test_strangers_stay_strangers(maps, registrations):
 def test_bad_maps_are_refused(maps):
     with pytest.raises(InputError, match="copy: is the same map as west; give it once"):
         tm.atlas([maps[0], maps[1], replace(maps[0], source="copy")])
-    with pytest.raises(InputError, match="two or more maps, not 1"):
+    with pytest.raises(InputError, match="atlas takes two maps or more, 1 given"):
         tm.atlas(maps[:1])
     with pytest.raises(InputError, match="fixed or free"):
         tm.atlas(maps, scale="any")

@@ -62,9 +62,12 @@ def find(folder: str | Path, map: TopometricMap, number: int = 5) -> tuple[Sight
         number: of maps, at most.
 
     Raises:
-        InputError: no atlas, one without maps or whose `rooms.npz` or `rooms_index.npz` is damaged or of another embedder, a map
-            without rooms, or a number below 1.
+        InputError: no folder or no map, no atlas, one without maps or whose `rooms.npz` or `rooms_index.npz` is damaged or of
+            another embedder, a map without rooms, or a number below 1.
     """
+    if not isinstance(folder, str | Path) or not isinstance(map, TopometricMap):
+        given = f"{type(folder).__name__} and {type(map).__name__}"
+        raise InputError(f"find takes the folder of an atlas and a map, find(folder, map), not {given}")
     if number < 1:
         raise InputError(f"the number of maps to name must be 1 or more, not {number}")
     stored = read_atlas(folder)

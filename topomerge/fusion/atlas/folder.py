@@ -56,7 +56,8 @@ def changing(folder: Path, gone: list[str], patience: float | None = None) -> It
                 raise
             _finish(folder)
     except OSError as error:
-        raise InputError(f"{folder}: can't be written ({error.strerror or error}); give the name of a folder") from error
+        reason = error.strerror or error
+        raise InputError(f"{folder}: can't be written ({reason}); make room there, or give another folder") from error
 
 
 def finished(folder: Path) -> None:

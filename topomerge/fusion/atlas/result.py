@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from topomerge.errors import InputError
 from topomerge.fusion.atlas.assembly import Link
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.bend.deformation import Deformation
@@ -81,8 +82,12 @@ class AtlasResult:
         """The joined map of a component in its frame; made anew at each call.
 
         Raises:
-            InputError: more maps together than provenance can tell apart.
+            InputError: no such component, or more maps together than provenance can tell apart.
         """
+        count = len(self.components)
+        if component not in range(-count, count):
+            there = f"{count} component{'s' * (count != 1)}, counted from 0"
+            raise InputError(f"there is no component {component!r}: the atlas has {there}")
         return fuse(self.maps, [(k, self.transforms[k]) for k in self.components[component]], self.bends)
 
     def words(self) -> str:

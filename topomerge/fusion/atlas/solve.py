@@ -26,7 +26,7 @@ from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.workers import PairTask, Workers, register_pair
 from topomerge.fusion.bend.bend import NEITHER_BENDS
 from topomerge.fusion.bend.deformation import Deformation
-from topomerge.fusion.inputs import check_cells, check_scale, check_units, link_threshold, without_rooms
+from topomerge.fusion.inputs import check_cells, check_list, check_scale, check_units, link_threshold, without_rooms
 from topomerge.fusion.posterior import check_same
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Array, Sim3, TopometricMap
@@ -86,11 +86,10 @@ def atlas(
         registrations: made before, by the keys of both maps; those made now are added.
 
     Raises:
-        InputError: fewer than two maps, one map twice, a map without cells, maps in different units, a wrong threshold, risk or
-            scale, or another word for what is known.
+        InputError: no list, fewer than two maps, one map twice, a map without cells, maps in different units, a wrong threshold,
+            risk or scale, or another word for what is known.
     """
-    if len(maps) < 2:
-        raise InputError(f"an atlas needs two or more maps, not {len(maps)}; give another one")
+    check_list(maps, "atlas")
     return solve(maps, AtlasSettings(scale, threshold, embedder, rigid, same), registrations)
 
 

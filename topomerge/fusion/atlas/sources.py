@@ -15,6 +15,7 @@ from typing import Any
 from topomerge.io.listing import json_text
 
 SOURCES_FILE, SOURCES_FORMAT = "watch.json", 1
+TRUTH = '{"format":1,"building":'  # that truth.json of `simulate` begins with, but for blanks
 HASHED_AT_ONCE = 1 << 20  # bytes
 
 
@@ -56,6 +57,16 @@ def _source(listed: Mapping[str, Any]) -> Source:
 def sources_to_json(sources: Mapping[str, Source]) -> str:
     """What `read_sources` reads."""
     return json_text({"format": SOURCES_FORMAT, "files": {path: asdict(sources[path]) for path in sorted(sources)}})
+
+
+def beside_clouds(folder: Path) -> tuple[str, ...]:
+    """The files that `simulate` wrote beside its clouds, if its truth.json is in the folder."""
+    try:
+        with (folder / "truth.json").open("rb") as file:
+            start = "".join(file.read(200).decode(errors="replace").split())
+    except OSError:
+        return ()
+    return ("truth.json", "plan.png") if start.startswith(TRUTH) else ()
 
 
 def stamp_of(path: Path, options: str) -> str:

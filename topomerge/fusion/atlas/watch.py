@@ -18,19 +18,18 @@ from topomerge.fusion.atlas.folder import changing
 from topomerge.fusion.atlas.memory import Memory
 from topomerge.fusion.atlas.replacement import Longer, longer_version, replaced
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.sources import SOURCES_FILE, Source, digest_of, read_sources, sources_to_json, stamp_of
+from topomerge.fusion.atlas.sources import SOURCES_FILE, Source, beside_clouds, digest_of, read_sources, sources_to_json, stamp_of
 from topomerge.fusion.atlas.store import Change, Report, change, entry_of
 from topomerge.fusion.atlas.stored import Stored, check_folder, held_by
 from topomerge.fusion.inputs import check_cells, check_units
 from topomerge.io.maps import load_map
-from topomerge.io.points import suffixes
+from topomerge.io.points import PICTURES, suffixes
 from topomerge.types import TopometricMap
 
 MAPS_AT_ONCE, SECONDS_AT_ONCE = 8, 10.0  # that are read before they are written: a stop costs no more
 SECONDS_TO_ANSWER = 5.0  # of registering, before it is said where new maps lie; the rest follows when nothing new is there
 SECONDS_BETWEEN = 60.0  # … before that is written, and new files are looked for
 NAMED_AT_MOST = 6  # maps, in a line
-PICTURES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 @dataclass(frozen=True)
@@ -126,8 +125,10 @@ class Watch:
             there = sorted(p for p in self.folder.resolve().iterdir() if not p.name.startswith("."))
         except OSError as error:
             raise InputError(f"{self.folder}: can't be read ({error.strerror or error}); is it there?") from error
+        simulated = beside_clouds(self.folder)
         described = {p.stem for p in there if p.suffix.lower() in (".yaml", ".yml")}  # their pictures are no maps of their own
         kinds = {*suffixes(), ".tmap"}
+        there = [p for p in there if p.name not in simulated]
         own = [p for p in there if not (p.suffix.lower() in PICTURES and p.stem in described)]
         for p in sorted({p for p in own if p.is_symlink() and not p.exists()} - self._broken):
             self.tell(f"{p}: is a link to what is not there; it is skipped until it is", True)
