@@ -21,6 +21,8 @@ FLAGS = (
     *("--remote-debugging-port=0", "--remote-allow-origins=*", "--window-size=1440,1500"),
 )
 
+LEFT = "Inspected target navigated or closed"  # what the browser says of it
+
 
 def browser() -> str:
     """The program; the test is skipped where there is none."""
@@ -99,9 +101,18 @@ class Page:
     def wait(self, condition: str, seconds: float = 60.0) -> None:
         """Until an expression is true."""
         end = time.monotonic() + seconds
-        while not self.run(condition):
+        while not self._holds(condition):
             assert time.monotonic() < end, f"not within {seconds:g} s: {condition}"
             time.sleep(0.1)
+
+    def _holds(self, condition: str) -> bool:
+        """Is an expression true? Of a page that loads itself anew meanwhile nothing is."""
+        try:
+            return bool(self.run(condition))
+        except AssertionError as failure:
+            if LEFT not in str(failure):
+                raise
+            return False
 
     def theme(self, name: str) -> None:
         """As if the machine's were "light" or "dark"."""
