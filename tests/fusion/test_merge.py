@@ -76,7 +76,7 @@ def test_what_the_maps_are_of_raises_what_is_believed_and_a_risk_sets_the_thresh
     assert 0.5 <= risk_threshold(1000) < checked_threshold(None) < risk_threshold(5) < 1
     with pytest.raises(InputError, match="same must be nothing, building, storey"):
         tm.merge(halves, same="house")
-    with pytest.raises(InputError, match=r"risk 1e-05: the least"):
+    with pytest.raises(InputError, match=r"risk 1e-05: the lowest measured risk"):
         risk_threshold(1e-5)
 
 
