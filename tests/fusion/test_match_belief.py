@@ -25,8 +25,10 @@ from topomerge.fusion.match_belief import (
 from topomerge.fusion.verify import PLACE_AREA
 from topomerge.io.maps import save_map
 from topomerge.io.weight_files import VARIABLE
+from topomerge.matching.consistency import matches_under
 from topomerge.matching.match import match
 from topomerge.matching.result import Matching
+from topomerge.matching.room_plans import room_plans
 from topomerge.types import Sim3
 
 
@@ -68,16 +70,32 @@ def test_the_probability_is_that_of_the_model(halves, matching):
     assert np.array_equal(believed.rooms, matching.rooms) and believed.alternatives == matching.alternatives
 
 
+def lying_on_each_other(matching, a, b):
+    """(M,) bool: do the rooms of each match share floor under the pose?"""
+    shared, _ = matches_under(matching.transform, (room_plans(a), room_plans(b)))
+    return np.array([pair in shared.tolist() for pair in matching.rooms.tolist()])
+
+
+def believed(west, other):
+    matching = match(west, other, method="attention")
+    return matching, believed_matches(matching, west, other, "attention").probability
+
+
 def test_rooms_that_lie_right_are_believed_and_those_that_do_not_are_not(halves, matching):
-    """North lies right on west; east is laid 9 m off, as the rooms look alike; the third one is another building. Of the rooms of
-    north one was hardly seen by west, so that the matcher is not sure of it to begin with."""
+    """North lies right on west; east is laid 9 m off, as the rooms look alike; the third one is another building."""
     west, east = halves
-    right, wrong, other = (
-        (m.probability, believed_matches(m, west, b, "attention").probability)
-        for m, b in ((match(west, b, method="attention"), b) for b in (office_map(3), east, stranger()))
-    )
-    assert np.median(right[1]) > np.median(right[0]) and (right[1] > 0.5).mean() >= 0.8
-    assert (wrong[1] < wrong[0]).all() and np.median(wrong[1]) < 0.5 and (other[1] < 0.1).all()
+    (right, now), (wrong, wrong_now), (_, other_now) = (believed(west, b) for b in (office_map(3), east, stranger()))
+    lying = lying_on_each_other(right, west, office_map(3))
+    assert lying.any() and np.median(now[lying]) > np.median(right.probability[lying]) and (now[lying] > 0.5).all()
+    assert (wrong_now < wrong.probability).all() and np.median(wrong_now) < 0.5 and (other_now < 0.1).all()
+
+
+@pytest.mark.xfail(strict=True, reason="the model hears how right the pose is, not whether both rooms of a match lie there")
+def test_rooms_apart_under_a_right_pose_are_not_believed(halves):
+    """The pose of north on west is right, and some of the rooms that are matched lie 8 m apart under it."""
+    matching, now = believed(halves[0], office_map(3))
+    apart = ~lying_on_each_other(matching, halves[0], office_map(3))
+    assert not apart.any() or (now[apart] < 0.5).all()
 
 
 @pytest.mark.parametrize("method", BELIEVED_METHODS)

@@ -215,7 +215,8 @@ def test_bad_folders(tmp_path: Path, walk: Walk) -> None:
     assert "is a folder; --poses names" in refusal_of(tmp_path / "a", poses=str(empty))
     assert "--poses is empty" in refusal_of(tmp_path / "a", poses=" ")
     says = refusal_of(tmp_path / "a")
-    assert says.startswith(f"{tmp_path / 'a'}: has no trajectory") and "--poses" in says and "name the files" in says
+    assert says.startswith(f"{tmp_path / 'a'}: has no trajectory") and "--poses" in says
+    assert "name the files, if each is a map" in says
     write_kitti(tmp_path / "a" / "poses.txt", walk.poses[:2])
     assert "poses.txt: has 2 poses, fewer than the 3 scans" in refusal_of(tmp_path / "a")
     write_tum(tmp_path / "a" / "poses.txt", walk.poses[:2], walk.times[:2])
