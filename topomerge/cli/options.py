@@ -79,7 +79,8 @@ def check_descriptor(args: argparse.Namespace) -> None:
         steps = getattr(args, "k", 0)
         if steps and args.descriptor == "learned":
             raise InputError("steps of context are for descriptors of single rooms; learned sees what is around: leave it out")
-        embedder(args.descriptor, steps)
+        if steps:
+            embedder(args.descriptor, steps)
 
 
 def belief_choices(args: argparse.Namespace) -> dict[str, Any]:
