@@ -112,13 +112,22 @@ def _drawings(split: str) -> list[Path]:
 
 
 def peer_pairs(what: str, done: set[str]) -> Iterator[PeerPair]:
-    """The pairs that are not done: of `cached_order`, or ``real``, or ``heldout`` (maps that `evaluate.py` kept)."""
+    """The pairs that are not done: of `cached_order`, or ``real``, or ``heldout`` (maps that `evaluate.py` kept).
+
+    Raises:
+        InputError: the cached pairs of ``raw`` were made by another version.
+    """
     if what in ("real", "heldout"):
         every = real_pairs() if what == "real" else heldout_pairs()
         yield from (thinned(pair) for pair in every if pair.name not in done)
         return
     left = [path for path in cached_order(what) if path.stem not in done]
     items = raw_items({path.stem for path in left}) if what == "raw" else {}
+    if older := [path for path in left if what == "raw" and path.stem not in items]:
+        made = "python -m benchmarks.merging.cached_pairs test"
+        raise InputError(
+            f"{older[0]}: was made by another version, its points can't be simulated again; make the pairs anew: {made}"
+        )
     for path in left:
         pair = load_grids(path)
         yield raw(pair, *items[path.stem]) if what == "raw" else thinned(pair)

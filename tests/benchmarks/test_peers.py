@@ -307,3 +307,11 @@ def test_without_a_peer_nothing_is_measured(module, monkeypatch) -> None:
     monkeypatch.setitem(peers.PACKAGES, "no_such_module", "no-such-package==1.0")
     with pytest.raises(InputError, match=r"no-such-package==1.0: not installed.*pip install"):
         peers.check_peers()
+
+
+def test_points_of_pairs_of_another_version_are_not_simulated(module, monkeypatch, tmp_path) -> None:
+    pairs = module("peer_pairs")
+    monkeypatch.setattr(pairs, "cached_order", lambda what: [tmp_path / "old.npz"])
+    monkeypatch.setattr(pairs, "raw_items", lambda names: {})
+    with pytest.raises(InputError, match="old.npz: was made by another version.*cached_pairs test"):
+        next(pairs.peer_pairs("raw", set()))
