@@ -97,8 +97,14 @@ def _settings(split: str, words: tuple[str, ...] = ()) -> Any:
 
 
 def main(split: str, *words: str) -> None:
-    """Make what is missing of a split."""
+    """Make what is missing of a split.
+
+    Raises:
+        InputError: nothing tells where the real plans are, of which half of the pairs are; without them others would be made.
+    """
     settings = _settings(split, words)
+    if not settings.data.folder and not any(word.startswith("data.folder=") for word in words):
+        raise InputError("TOPOMERGE_DATA is not set: name the folder of the real plans by it, or data.folder= for none")
     for build in (build_grids, build_drawings):
         print(build(settings.data, settings, lambda text: print(text, flush=True))[1])
 

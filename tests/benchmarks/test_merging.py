@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from topomerge.datasets.buildings.procedural import make_building
 
+from topomerge.errors import InputError
 from topomerge.types import Sim3
 
 
@@ -69,6 +70,13 @@ def test_where_both_maps_are_from(module, monkeypatch) -> None:
     )
     place = pairs.places_of(pairs.buildings_of(drawn, "test_drawings"))
     assert place["physical"] == "campus/school/sabadell" and place["other_source"] == "procedural"
+
+
+def test_pairs_of_the_tables_are_not_made_without_the_real_plans(module, monkeypatch) -> None:
+    """Half of them are drawn from these; without them the same command would make other pairs."""
+    monkeypatch.delenv("TOPOMERGE_DATA", raising=False)
+    with pytest.raises(InputError, match="TOPOMERGE_DATA is not set: name the folder of the real plans by it, or data.folder="):
+        module("cached_pairs").main("test", "jobs=1")
 
 
 def test_what_makes_a_pair_hard(module) -> None:

@@ -76,3 +76,21 @@ def test_a_part_without_doors_and_one_without_rooms_change_nothing(open_map):
     bare = replace(open_map, edges=open_map.edges[:0])
     empty = replace(bare, navigable_room=np.full(len(bare.navigable), -1, np.int32), navigable_area=None)
     assert len(with_doors(bare, [(bare, Laying(Sim3())), (empty, Laying(Sim3()))]).edges) == 0
+
+
+def test_a_door_lies_where_the_surest_part_saw_it(open_map):
+    """The joined cells show it 0.4 m off; of two parts the surer one decides, whichever comes first."""
+    edges, (first, second) = open_map.edges, (open_map.edges.copy(), open_map.edges.copy())
+    first["confidence"], second["confidence"] = 0.7, 0.95
+    first["centre"][:, 1] += 0.2
+    second["width"] = 0.83
+    moved = edges.copy()
+    moved["centre"][:, 1] -= 0.4
+    moved["confidence"] = 0.8
+    parts = [(replace(open_map, edges=e), Laying(Sim3())) for e in (first, second)]
+    for order in (parts, parts[::-1]):
+        out = with_doors(replace(open_map, edges=moved), order).edges
+        assert len(out) == len(edges) and np.allclose(out["centre"], edges["centre"])
+        assert np.allclose(out["width"], 0.83) and np.allclose(out["confidence"], 0.95)
+    alone = with_doors(replace(open_map, edges=moved), parts[:1]).edges
+    assert np.allclose(alone["centre"], first["centre"]) and np.allclose(alone["confidence"], 0.8)

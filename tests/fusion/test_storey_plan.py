@@ -99,5 +99,8 @@ def test_a_slice_that_was_given_walls_stays_a_slice(room):
     inside = np.stack(np.meshgrid(np.arange(1, 59), np.arange(1, 39), [0]), -1).reshape(-1, 3)
     raised = VoxelGrid.from_cells(np.concatenate([walls, inside]).astype(np.int32))
     assert extruded(raised) and not extruded(grid_of(room))
+    coarse = VoxelGrid.from_cells(raised.cells[raised.cells[:, 2] < 12], edge=0.2)  # what a sparse slice gets
+    low = VoxelGrid.from_cells(raised.cells[raised.cells[:, 2] < 12], edge=0.1)
+    assert extruded(coarse) and not extruded(low)
     (plan,) = plans(raised)
     assert plan.sliced and at(plan, plan.wall | plan.clutter, 2.5, 0.05) and at(plan, plan.free, 1, 3)

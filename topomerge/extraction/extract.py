@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+from topomerge.extraction.distinct_doors import distinct_doors
 from topomerge.extraction.elevations.doorways import place_classes
 from topomerge.extraction.elevations.elevation import wall_elevations
 from topomerge.extraction.elevations.wall_doors import with_wall_doors
@@ -14,6 +15,7 @@ from topomerge.extraction.floor import Floor
 from topomerge.extraction.free_space import free_space
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
+from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.plans.plan_rooms import rooms_of_plans
 from topomerge.extraction.room_odds import with_room_odds
 from topomerge.extraction.scan import Scan, read_scan
@@ -34,6 +36,7 @@ def extract(
     preset: str | Parameters = "default",
     name: str | None = None,
     progress: Progress | None = None,
+    parts: Sequence[PartRooms] = (),
     **overrides: Any,
 ) -> TopometricMap:
     """Extract rooms, doors and storeys (seeds 2).
@@ -44,6 +47,7 @@ def extract(
         preset: ``"default"``, ``"thesis"``, or the parameters of one of them (`PRESETS`).
         name: where the map comes from; the cloud's own source by default.
         progress: called now and then with the share done and a text.
+        parts: rooms of the maps that these cells were joined of, which have a say in where rooms part (`fusion.fuse`).
         overrides: single parameters of the preset.
 
     Raises:
@@ -53,7 +57,7 @@ def extract(
     p = chosen_parameters(preset, overrides)
     watch = Stopwatch(progress)
 
-    scan, navigable, floor, map = rooms_and_passages(source, voxel_size, p, watch)
+    scan, navigable, floor, map = rooms_and_passages(source, voxel_size, p, watch, parts)
 
     watch.begin("odds of rooms, doors on walls", 0.87)
     map, doubts = _with_odds_and_openings(map, scan, floor, p)
@@ -73,12 +77,16 @@ def extract(
 
 
 def rooms_and_passages(
-    source: PointCloud | VoxelGrid | Array | Iterable[PointCloud], voxel_size: float, p: Parameters, watch: Stopwatch
+    source: PointCloud | VoxelGrid | Array | Iterable[PointCloud],
+    voxel_size: float,
+    p: Parameters,
+    watch: Stopwatch,
+    parts: Sequence[PartRooms] = (),
 ) -> tuple[Scan, VoxelGrid, Floor, TopometricMap]:
     """The scan, its navigable volume, its floors cut into rooms, and the map of these with what the floors show of doors.
 
     Args:
-        source, voxel_size: as of `extract`.
+        source, voxel_size, parts: as of `extract`.
         p: of its preset.
 
     Raises:
@@ -96,7 +104,8 @@ def rooms_and_passages(
     if isinstance(p, ThesisParameters):
         floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
     else:
-        floor = rooms_of_plans(scan.grid, navigable, p.slice_door if flat else p.door, p.narrow, p.standing_height)
+        door = p.slice_door if flat else p.door
+        floor = rooms_of_plans(scan.grid, navigable, door, p.narrow, p.standing_height, parts)
 
     watch.begin("topology", 0.85)
     return scan, navigable, floor, topometric_map(scan.grid, floor, p.standing_height)  # 2.7
@@ -113,6 +122,7 @@ def _with_odds_and_openings(map: TopometricMap, scan: Scan, floor: Floor, p: Par
     if p.walls:
         map = with_wall_doors(map, floor.classified_storeys, walls, classes)
     map, doubt = with_walked_doors(map, scan.places)
+    map = distinct_doors(map)
     if walls is not None and classes is not None:
         map = with_windows(map, walls, classes)
     return map, [doubt] if doubt else []

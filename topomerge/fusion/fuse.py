@@ -19,11 +19,14 @@ from scipy import ndimage
 from topomerge.errors import InputError
 from topomerge.extraction.cell_means import with_means
 from topomerge.extraction.convolution import convolve, moore
+from topomerge.extraction.distinct_doors import rooms_at
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
+from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.bend.deformation import Deformation
-from topomerge.fusion.joined_doors import joined_rooms, laid_floor, with_doors
+from topomerge.fusion.joined_doors import laid_floor, with_doors
+from topomerge.fusion.joined_odds import with_part_odds
 from topomerge.fusion.joined_windows import laid_windows, with_joined_windows
 from topomerge.fusion.resampling import Laying, decoded, encoded, laid_means, resampled
 from topomerge.fusion.single_walls import copies
@@ -68,13 +71,15 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     cells = _JoinedCells(maps[poses[0][0]].grid.origin, _edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     layings = [Laying.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
-    windows = []
+    windows, rooms = [], []
     for n in order:
         map = maps[poses[n][0]]
         cells.add_map(map, layings[n], int(first_bits[n]), parts[n].assumed and n != order[0])
         windows.append(laid_windows(map, layings[n]))
+        rooms.append(PartRooms(*laid_floor(map, layings[n]), map.rooms["entered"], parts[n].edge ** 2))
     name = " + ".join(maps[k].source or "map" for k, _ in poses)
-    joined = _extracted(cells, min(part.neighbours for part in parts), name)
+    joined = _extracted(cells, min(part.neighbours for part in parts), name, rooms)
+    joined = with_part_odds(joined, rooms)
     joined = with_doors(joined, ((maps[k], laying) for (k, _), laying in zip(poses, layings, strict=True)))
     return with_joined_windows(joined, windows)
 
@@ -127,7 +132,7 @@ class _JoinedCells:
         provenance = provenance[rows] << np.uint32(first_bit)
         means, points = laid_means(map.grid, laying, rows, cells, self.origin, self.edge)
         if assumed and len(cells):
-            added = self._contains(cells) | ~self._surveyed(cells)
+            added = self._contains(cells) | ~(self._surveyed(cells) | self._seen_through(cells))
             cells, provenance, means, points = cells[added], provenance[added], means[added], points[added]
         free_cells = None if map.free is None else resampled(map.free, laying, self.origin, 2 * self.edge)[0]
         if free_cells is not None and len(self.free_codes) and len(cells):
@@ -159,6 +164,10 @@ class _JoinedCells:
         """(n,) bool: is a cell there already?"""
         return np.isin(encoded(cells), self.codes)
 
+    def _seen_through(self, cells: Array) -> Array:
+        """(n,) bool: do cells lie where rays went?"""
+        return np.isin(encoded(cells // 2), self.free_codes)
+
     def _surveyed(self, cells: Array) -> Array:
         """(n,) bool: have the columns of cells, at the heights between the lowest and the highest of them, anything near?"""
         occupied = decoded(self.codes)
@@ -175,12 +184,13 @@ class _JoinedCells:
         return surveyed
 
 
-def _extracted(joined: _JoinedCells, neighbours: float, name: str) -> TopometricMap:
+def _extracted(joined: _JoinedCells, neighbours: float, name: str, rooms: Sequence[PartRooms]) -> TopometricMap:
     """Rooms and doors of what was joined.
 
     Args:
         neighbours: usual number of neighbours of a cell in the sparsest map. Where several maps saw a place cells are dense, and
             floors that only the sparsest one saw must not count as noise beside them.
+        rooms: of the maps, as they lie in the joined one.
     """
     cells = decoded(joined.codes)
     base = 2 * (cells.min(axis=0) // 2)  # even: free cells are twice as long
@@ -195,7 +205,7 @@ def _extracted(joined: _JoinedCells, neighbours: float, name: str) -> Topometric
         free = VoxelGrid.from_cells(free_cells, grid.origin, 2 * grid.edge, (x, y, z))
         free = free.subset(~grid.coarser(2).contains(free.cells))
     noise = PRESETS["default"].noise * min(neighbours / max(_usual_neighbours(grid), 1.0), 1.0)
-    map = extract(grid, name=name, carve=free is None, noise=noise)
+    map = extract(grid, name=name, carve=free is None, noise=noise, parts=rooms)
     # Floors that the extraction assumes under slices are cells that no map saw.
     rows = grid.rows(grid.locate(map.grid.centroids()))
     seen_by = np.where(rows >= 0, provenance[rows], 0).astype(np.uint32)
@@ -238,7 +248,7 @@ def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3, bend: 
     """
     rooms = np.full(len(part.rooms), -1, np.int64)
     floor, part_room = laid_floor(part, Laying.of(pose, bend))
-    joined_room = joined_rooms(joined, floor)
+    joined_room = rooms_at(joined, floor)
     for i in range(len(part.rooms)):
         votes = joined_room[part_room == i]
         votes = votes[votes >= 0]

@@ -13,17 +13,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from topomerge.extraction.distinct_doors import LEVEL_KINDS, distinct_doors, rooms_at
 from topomerge.fusion.resampling import Laying
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
 
 DOOR_SIDE = 1.0  # m around a door in which floor says which rooms it joins
 LEAST_FLOOR = 5  # cells of it, from which a map saw that side of a door
 ONE_DOOR = 1.2  # m: doors of two maps that are this close are one
-LEVEL_KINDS = ("door", "opening")
+SEEN_BY_A_PART = ("centre", "lower", "upper", "direction", "width", "height", "kind", "open")  # of a door
 
 
 def with_doors(joined: TopometricMap, parts: Iterable[tuple[TopometricMap, Laying]]) -> TopometricMap:
-    """The joined map with those doors and openings of its parts that it lacks, and without those that its parts deny.
+    """The joined map with those doors and openings of its parts that it lacks, without those that its parts deny, and each as the
+    part saw it that is surest of it.
 
     Args:
         parts: maps, one at a time, and how each is laid into the joined one.
@@ -31,27 +33,17 @@ def with_doors(joined: TopometricMap, parts: Iterable[tuple[TopometricMap, Layin
     laid = [_LaidFloor.of(part, joined, laying) for part, laying in parts]
     level = np.isin(joined.edges["kind"], LEVEL_KINDS)
     edges = joined.edges[[not level[k] or _confirmed(edge, laid) for k, edge in enumerate(joined.edges)]]
+    edges = _as_seen(edges, np.concatenate([np.zeros(0, EDGE_DTYPE), *(part.doors for part in laid)]))
     for part in laid:
         new = [door for door in part.doors if not _is_there(edges, door)]
         edges = np.concatenate([edges, np.array(new, EDGE_DTYPE)])
-    return replace(joined, edges=edges[np.lexsort((*edges["centre"].T[::-1], *edges["rooms"].T[::-1]))])
+    return distinct_doors(replace(joined, edges=edges[np.lexsort((*edges["centre"].T[::-1], *edges["rooms"].T[::-1]))]))
 
 
 def laid_floor(part: TopometricMap, laying: Laying) -> tuple[Array, Array]:
     """(k, 3) m in the joined map, and (k,) their rooms in the part: the floor of its rooms."""
     inside = part.navigable_room >= 0
     return laying.apply(part.navigable.centroids(part.navigable.cells[inside])), part.navigable_room[inside]
-
-
-def joined_rooms(joined: TopometricMap, floor: Array) -> Array:
-    """(k,) room of the joined map, -1 none, in which each place (k, 3) of a laid floor lies."""
-    cells = joined.navigable.locate(floor)
-    out = np.full(len(cells), -1, np.int64)
-    for up in (0, 1, -1, 2, -2):  # floors of two maps are seldom at one height to a cell
-        rows = joined.navigable.rows(cells + (0, 0, up))
-        missing = (out < 0) & (rows >= 0)
-        out[missing] = joined.navigable_room[rows[missing]]
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +65,7 @@ class _LaidFloor:
     @classmethod
     def of(cls, part: TopometricMap, joined: TopometricMap, laying: Laying) -> _LaidFloor:
         floor, part_room = laid_floor(part, laying)
-        room = joined_rooms(joined, floor)
+        room = rooms_at(joined, floor)
         doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)].copy()
         for name in ("centre", "lower", "upper"):
             doors[name] = laying.apply(doors[name])
@@ -103,6 +95,22 @@ def _confirmed(edge: Array, parts: Sequence[_LaidFloor]) -> bool:
     if (np.linalg.norm(at - edge["centre"], axis=1) < ONE_DOOR).any():
         return True
     return not any(part.saw_both_sides(edge) for part in parts)
+
+
+def _as_seen(edges: Array, doors: Array) -> Array:
+    """Doors of the joined map as the surest of the parts' doors that are the same has them; its sureness is the higher one."""
+    edges = edges.copy()
+    for edge in edges:
+        if edge["kind"] not in LEVEL_KINDS:
+            continue
+        near = (doors["rooms"] == np.sort(edge["rooms"])).all(axis=1)
+        near &= np.linalg.norm(doors["centre"] - edge["centre"], axis=1) <= ONE_DOOR
+        if near.any():
+            surest = doors[near][doors["confidence"][near].argmax()]
+            for name in SEEN_BY_A_PART:
+                edge[name] = surest[name]
+            edge["confidence"] = max(edge["confidence"], surest["confidence"])
+    return edges
 
 
 def _is_there(edges: Array, door: Array) -> bool:

@@ -1,4 +1,5 @@
-"""How likely two rooms that `match` names are one, with what both maps show under the pose that it proposes.
+"""How likely two rooms that `match` names are one, with what both maps show under the pose that it proposes, and with how the two
+rooms lie on each other there.
 
 Logistic models of what matching says and of the network of places, fitted by ``train.py task=match_belief``; their weights stand
 in `match_belief.json`.
@@ -9,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from topomerge.errors import InputError
 from topomerge.fusion.evidence.places import MOST_ODDS, Places, places
@@ -17,14 +19,16 @@ from topomerge.fusion.verify import PLACE_AREA
 from topomerge.io.weight_files import read_weights_json
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.result import Matching
-from topomerge.types import Array, TopometricMap
+from topomerge.types import Array, Sim3, TopometricMap
 
 BELIEF_FILE = "match_belief.json"
 BELIEVED_METHODS = ("attention",)  # that are told better so; walls decide for "consistent", whose odds are as good without
-BELIEF_NAMES = ("constant", "matching", "places", "room")
+BELIEF_NAMES = ("constant", "matching", "places", "room", "overlap")
 SUREST = 1e-3  # probabilities of matching are that far from 0 and 1 at least
 ROOM_RIM = 1.5  # m around a room from which places speak for it, too: a tile is wider than most walls are apart
 SAME_FLOOR = 1.0  # m
+NEAR_FLOOR = 0.3  # m: floor of one room that is this close to floor of the other is shared
+FLOOR_PLACES = 500  # of a room, that are looked at
 
 
 def believed_matches(matching: Matching, a: TopometricMap, b: TopometricMap, method: str) -> Matching:
@@ -39,7 +43,7 @@ def believed_matches(matching: Matching, a: TopometricMap, b: TopometricMap, met
         return matching
     if not len(a.grid) or not len(b.grid):
         return matching
-    x = belief_features(matching, a, places_of(matching, a, b))
+    x = belief_features(matching, a, b, places_of(matching, a, b))
     return replace(matching, probability=1 / (1 + np.exp(-np.clip(x @ belief_weights(method), -50, 50))))
 
 
@@ -51,7 +55,7 @@ def places_of(matching: Matching, a: TopometricMap, b: TopometricMap) -> Places:
 
 
 def belief_weights(method: str) -> Array:
-    """(4,) weights of `BELIEF_NAMES` for one of `BELIEVED_METHODS`.
+    """(5,) weights of `BELIEF_NAMES` for one of `BELIEVED_METHODS`.
 
     Raises:
         InputError: the file holds none of that length.
@@ -63,13 +67,33 @@ def belief_weights(method: str) -> Array:
     return weights
 
 
-def belief_features(matching: Matching, a: TopometricMap, seen: Places) -> Array:
-    """(M, 4) 1, log odds by matching, what all places say, and what those around the room of a say (mean log odds; 0 of none)."""
+def belief_features(matching: Matching, a: TopometricMap, b: TopometricMap, seen: Places) -> Array:
+    """(M, 5) of each match: 1, log odds by matching, what all places say, what those around the room of a say (mean log odds;
+    0 of none), and share 0..1 of the floor of the smaller room that lies on the other."""
     whole_features = seen.features
     p = np.clip(matching.probability, SUREST, 1 - SUREST)
     whole = np.full(len(p), whole_features["place_mean"] * np.log1p(whole_features["place_area"] / PLACE_AREA))
     around = np.array([room_places(seen, a, room) for room in matching.rooms[:, 0].tolist()])
-    return np.stack([np.ones(len(p)), np.log(p / (1 - p)), whole, around], axis=1)
+    return np.column_stack([np.ones(len(p)), np.log(p / (1 - p)), whole, around, floor_shared(matching, a, b)])
+
+
+def floor_shared(matching: Matching, a: TopometricMap, b: TopometricMap) -> Array:
+    """(M,) share 0..1 of the floor of the smaller room of each match that lies on the other's under the pose; 0 without floor."""
+    assert matching.transform is not None
+    floors = [_floors(a, Sim3()), _floors(b, matching.transform)]
+    out = np.zeros(len(matching.rooms))
+    for k, (i, j) in enumerate(matching.rooms.tolist()):
+        small, large = sorted((floors[0][i], floors[1][j]), key=len)
+        if len(small):
+            apart, _ = cKDTree(large).query(small[:: -(-len(small) // FLOOR_PLACES)], distance_upper_bound=NEAR_FLOOR)
+            out[k] = np.isfinite(apart).mean()
+    return out
+
+
+def _floors(map: TopometricMap, pose: Sim3) -> list[Array]:
+    """(k, 3) m under a pose: where one can stand in each room."""
+    places = pose.apply(map.navigable.centroids())
+    return [places[map.navigable_room == room] for room in range(len(map.rooms))]
 
 
 def room_places(seen: Places, a: TopometricMap, room: int) -> float:

@@ -34,7 +34,7 @@ BEFORE, AFTER = "before", "after"  # places were compared
 
 
 class MatchRows(NamedTuple):
-    """Of a pair of maps: its building, do both show it, and of each method the features of its matches (M, 4), their
+    """Of a pair of maps: its building, do both show it, and of each method the features of its matches (M, 5), their
     probabilities by matching alone (M,) and which are right (M,)."""
 
     building: str
@@ -92,13 +92,13 @@ def rows_of(path: Path, other: Path | None = None) -> dict[str, Array]:
         i, j = matching.rooms.T
         right = (pair.true[0][i] == pair.true[1][j]) & (pair.true[0][i] >= 0) if other is None else np.zeros(len(i), bool)
         posed = matching.transform is not None and len(i) > 0
-        x = belief_features(matching, a, places_of(matching, a, b)) if posed else np.zeros((0, len(BELIEF_NAMES)))
+        x = belief_features(matching, a, b, places_of(matching, a, b)) if posed else np.zeros((0, len(BELIEF_NAMES)))
         out |= {f"{method}.x": x, f"{method}.p": matching.probability[: len(x)], f"{method}.y": right[: len(x)]}
     return out
 
 
 def fitted_weights(rows: Sequence[MatchRows], method: str, pull: float) -> Array:
-    """(4,) weights of the most likely logistic model, pulled to what matching says. None but the constant is below 0: what speaks
+    """(5,) weights of the most likely logistic model, pulled to what matching says. None but the constant is below 0: what speaks
     for a match never lowers it.
 
     Raises:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from heapq import heappop, heappush
+from types import MappingProxyType
 
 import numpy as np
 
 from topomerge.extraction.plans.passages import Passage, door_features
+from topomerge.numpy_nn import sigmoid
 from topomerge.types import Array
 
 DoorClassifier = Callable[[Array], Array]  # (n, 17) features -> (n,) probability that a door parts the two
 Pair = tuple[int, int]
+SUREST = 1e-6  # probabilities are that far from 0 and 1 at least where other maps are weighed
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,7 @@ def merge_regions(
     door: float,
     narrow: float,
     least_area: float,
+    log_odds: Mapping[Pair, float] = MappingProxyType({}),
 ) -> Partition:
     """Merge neighbouring regions, the least likely door first; each merger changes the features of the next ones.
 
@@ -51,8 +55,9 @@ def merge_regions(
         door: probability from which on two rooms stay apart.
         narrow: the lower one from which on two areas of a room do.
         least_area: m2, smaller rooms are given to the neighbour from which the least likely door parts them.
+        log_odds: what is added to the log odds of a door in each passage (`part_rooms`).
     """
-    rooms = _GrowingRooms(region, clearance, passages, edge, classify)
+    rooms = _GrowingRooms(region, clearance, passages, edge, classify, log_odds)
     area: Array | None = None
     while rooms.door_probability:
         pair = rooms.weakest()
@@ -77,7 +82,13 @@ class _GrowingRooms:
     """Rooms that grow by merging and how likely doors part them; a room is named by one of its regions."""
 
     def __init__(
-        self, region: Array, clearance: Array, passages: dict[Pair, Passage], edge: float, classify: DoorClassifier
+        self,
+        region: Array,
+        clearance: Array,
+        passages: dict[Pair, Passage],
+        edge: float,
+        classify: DoorClassifier,
+        log_odds: Mapping[Pair, float],
     ) -> None:
         count = int(region.max(initial=-1)) + 1
         in_region = region >= 0
@@ -86,6 +97,7 @@ class _GrowingRooms:
         self.peak = np.zeros(count)
         np.maximum.at(self.peak, region[in_region], clearance[in_region])
         self.passages = dict(passages)
+        self.log_odds = dict(log_odds)
         self.classify = classify
         self.door_probability: dict[Pair, float] = {}
         self.queue: list[tuple[float, Pair]] = []  # holds outdated probabilities, too
@@ -98,9 +110,16 @@ class _GrowingRooms:
     def _score(self, pairs: list[Pair]) -> None:
         if pairs:
             x = np.array([door_features(self.passages[p], self.peak[list(p)], self.area[list(p)]) for p in pairs])
-            for pair, probability in zip(pairs, self.classify(x).tolist(), strict=True):
+            for pair, probability in zip(pairs, self._probability(pairs, x).tolist(), strict=True):
                 self.door_probability[pair] = probability
                 heappush(self.queue, (probability, pair))
+
+    def _probability(self, pairs: list[Pair], x: Array) -> Array:
+        """(n,) of doors, from their features (n, 17) and the log odds that are added."""
+        probability = self.classify(x)
+        added = np.array([self.log_odds.get(pair, 0.0) for pair in pairs])
+        sure = np.clip(probability, SUREST, 1 - SUREST)
+        return np.where(added == 0, probability, sigmoid(np.log(sure / (1 - sure)) + added))
 
     def weakest(self) -> Pair:
         """The pair that the least likely door parts; there must be one."""
@@ -121,10 +140,10 @@ class _GrowingRooms:
             self.neighbours[other].discard(absorbed)
             self.neighbours[other].add(room)
             self.neighbours[room].add(other)
-            passage = self.passages.pop(old)
+            passage, log_odds = self.passages.pop(old), self.log_odds.pop(old, 0.0)
             del self.door_probability[old]
             if new not in self.passages or passage.width > self.passages[new].width:
-                self.passages[new] = passage
+                self.passages[new], self.log_odds[new] = passage, log_odds
         self._score(sorted(_pair(room, other) for other in self.neighbours[room]))
 
 

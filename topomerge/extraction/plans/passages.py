@@ -60,7 +60,7 @@ def clearance_of(plan: StoreyPlan) -> Array:
     return np.asarray(edt.edt(plan.inside.view(np.uint8), black_border=True, parallel=1), np.float64) * plan.edge
 
 
-def regions_of(plan: StoreyPlan, probability: Array) -> Array:
+def regions_of(plan: StoreyPlan, probability: Array, parted: Array | None = None) -> Array:
     """(nx, ny) int64 basin of each open column, -1 elsewhere.
 
     What the network takes for a wall or a doorway parts basins as walls do: openings as wide as the room have no narrowing, and
@@ -68,8 +68,10 @@ def regions_of(plan: StoreyPlan, probability: Array) -> Array:
 
     Args:
         probability: (nx, ny, 5) what probably stands in each column, see `COLUMN_CLASSES`.
+        parted: (nx, ny) bool, columns in which regions end whatever stands there; None: nowhere.
     """
     barrier = plan.inside & (probability[..., WALL_CLASS : SHUT_CLASS + 1].sum(axis=-1) > BARRIER_CHANCE)
+    barrier = barrier if parted is None else barrier | (plan.inside & parted)
     clearance = edt.edt((plan.inside & ~barrier).view(np.uint8), black_border=True, parallel=1) * plan.edge
     order = np.argsort(-clearance, axis=None, kind="stable")
     order = order[clearance.ravel()[order] > 0]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from topomerge.extraction.classified_storey import ClassifiedStorey
 from topomerge.extraction.plans.door_classifier import door_probability
+from topomerge.extraction.plans.part_rooms import PartRooms, door_log_odds, laid_rooms, parted_columns
 from topomerge.extraction.plans.partition import Pair, Partition, merge_regions
 from topomerge.extraction.plans.passages import clearance_of, find_passages, regions_of
 from topomerge.extraction.plans.plan import columns_of, storey_plan
@@ -42,7 +44,9 @@ class StoreyRooms:
     door_probability: dict[Pair, float]
 
 
-def cut_storey(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, door: float, narrow: float) -> StoreyRooms:
+def cut_storey(
+    grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, door: float, narrow: float, parts: Sequence[PartRooms] = ()
+) -> StoreyRooms:
     """Cut storey `k` into rooms: regions between all narrowings, merged until only likely doors part them.
 
     Args:
@@ -50,16 +54,19 @@ def cut_storey(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, doo
         navigable: the navigable volume.
         storey: (m,) storey of each of its cells.
         door, narrow: probabilities of a door from which on a narrowing parts rooms, and areas of a room.
+        parts: rooms of the maps that these cells were joined of.
     """
     plan = storey_plan(grid, navigable, storey, k)
     probability = column_probabilities(plan)
     plan = without_furniture(plan, probability)
     clearance = clearance_of(plan)
-    region = regions_of(plan, probability)
+    others = laid_rooms(plan, parts)
+    region = regions_of(plan, probability, parted_columns(others) if others else None)
     if k > 0:
         region = without_upper_sides(grid, plan, region)
     passages = find_passages(plan, clearance, region, probability)
-    partition = merge_regions(region, clearance, passages, plan.edge, door_probability, door, narrow, ROOM_LEAST_AREA)
+    log_odds = door_log_odds(region, plan.edge, passages, others)
+    partition = merge_regions(region, clearance, passages, plan.edge, door_probability, door, narrow, ROOM_LEAST_AREA, log_odds)
     low, base = columns_of(plan, grid)
     corner = grid.origin + np.append(low, np.median(base)) * plan.edge
     classes = ClassifiedStorey(probability, corner[:2], plan.edge, float(corner[2]))
