@@ -14,13 +14,11 @@ Seconds in the rows are of the processor. Both maps are cells of 0.1 m; bending 
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator
 from functools import partial
 from itertools import chain, zip_longest
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +31,7 @@ from benchmarks.merging.bending_poses import judged, marked, stranger_pairs, wro
 from benchmarks.merging.cached_pairs import PAIRS_CACHE, buildings_of, pair_files, places_of
 from benchmarks.merging.register import real_pairs
 from benchmarks.merging.tables import RESULTS_CACHE, rows_of
+from benchmarks.real_data import real_data
 from topomerge.code_digest import code_digest
 from topomerge.fusion.bend.bend import bend
 from topomerge.fusion.bend.drift import Drift, sensor_drift
@@ -83,8 +82,7 @@ def simulated_row(bent: BentPair, split: str) -> Row:
 
 def simulated(split: str, pairs: str, done: set[str]) -> Iterator[Row]:
     """Rows of the pairs with drift."""
-    folder = os.environ.get("TOPOMERGE_DATA", "")
-    for bent in bent_pairs(split, folder, int(pairs), PAIRS_CACHE / "bent", partial(print, flush=True)):
+    for bent in bent_pairs(split, str(real_data()), int(pairs), PAIRS_CACHE / "bent", partial(print, flush=True)):
         if bent.pair.name not in done:
             row = simulated_row(bent, split)
             yield from copies(row)  # with any factor the same pair
@@ -99,7 +97,7 @@ def copies(row: Row) -> Iterator[Row]:
 
 def floor(done: set[str]) -> Iterator[Row]:
     """Rows of the office floor."""
-    points = marked(Path(os.environ["TOPOMERGE_DATA"]) / OFFICE)
+    points = marked(real_data() / OFFICE)
     for pair in real_pairs("development"):
         if pair.name in done:
             continue

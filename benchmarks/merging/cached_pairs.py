@@ -17,6 +17,7 @@ from topomerge.datasets.core.physical import physical_building
 from topomerge.datasets.pairs.grid_drawings import build_drawings
 from topomerge.datasets.pairs.grid_pairs import GridPair, build_grids, grid_items
 
+from benchmarks.real_data import real_data
 from topomerge.errors import InputError
 
 PAIRS_CACHE = Path("cache")
@@ -100,11 +101,10 @@ def main(split: str, *words: str) -> None:
     """Make what is missing of a split.
 
     Raises:
-        InputError: nothing tells where the real plans are, of which half of the pairs are; without them others would be made.
+        InputError: nothing tells where the real plans are, of which many pairs are.
     """
+    real_data()
     settings = _settings(split, words)
-    if not settings.data.folder and not any(word.startswith("data.folder=") for word in words):
-        raise InputError("TOPOMERGE_DATA is not set: name the folder of the real plans by it, or data.folder= for none")
     for build in (build_grids, build_drawings):
         print(build(settings.data, settings, lambda text: print(text, flush=True))[1])
 

@@ -15,7 +15,6 @@ point with those nearest to it.
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,6 +28,7 @@ from topomerge.datasets.pairs.items import plans_of
 from topomerge.datasets.real.halmstad import fit_points
 from topomerge.datasets.real.office_floor import OFFICE_PIXEL
 
+from benchmarks.real_data import real_data
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 from topomerge.types import Array
@@ -165,10 +165,9 @@ def office_floor(folder: Path) -> list[Relative]:
 
 def main(maps: str = "24", target: str = "") -> None:
     """Print the tables, and write the stiffness of each sensor."""
-    folder = os.environ.get("TOPOMERGE_DATA", "")
-    measured = simulated(int(maps), folder)
-    if folder:
-        measured[UNKNOWN] = office_floor(Path(folder) / "halmstad_office_f5")
+    folder = real_data()
+    measured = simulated(int(maps), str(folder))
+    measured[UNKNOWN] = office_floor(folder / "halmstad_office_f5")
     out: dict[str, dict[str, float]] = {DRAWING: {"shift": 0.0, "turn": 0.0}}
     for sensor, pairs in measured.items():
         rows = classes(pairs)

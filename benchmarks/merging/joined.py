@@ -11,7 +11,6 @@ does, rigid and bent. Resumable: a line of JSON a pair in ``cache/merge/joined_<
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -26,6 +25,7 @@ from topomerge.datasets.simulation.joined_truth import joined_truth
 
 import topomerge
 from benchmarks.merging.tables import RESULTS_CACHE, put, table
+from benchmarks.real_data import real_data
 from topomerge.errors import InputError
 from topomerge.evaluation.doubled_walls import doubled_walls
 from topomerge.fusion.bend.bend import bend
@@ -91,7 +91,7 @@ def row_of(maker: BentMaker, name: str, factor: float) -> Row:
 
 def rows(split: str, pairs: int, done: set[str], factor: float = 1.0) -> Iterator[Row]:
     """Rows of the pairs that are not done."""
-    items, plans = bent_items(split, os.environ.get("TOPOMERGE_DATA", ""), pairs)
+    items, plans = bent_items(split, str(real_data()), pairs)
     for item in items:
         if item.name in done or DRAWING in item.sensors:
             continue

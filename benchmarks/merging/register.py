@@ -12,7 +12,6 @@ and on the right storey. Seconds are of the processor, so that other jobs on the
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -25,6 +24,7 @@ from topomerge.datasets.real.cached_grids import real_grid_pairs
 from topomerge.datasets.real.sources import DEVELOPMENT_FOLDERS
 
 from benchmarks.merging.cached_pairs import buildings_of, hard_of, pair_files, places_of
+from benchmarks.real_data import real_data
 from topomerge.fusion.registration import Registration, register
 from topomerge.metrics import on_storey
 from topomerge.training.belief_hypotheses import error, kind_of, right
@@ -61,7 +61,7 @@ def upright(matrix: Array, pair: GridPair) -> Sim3 | None:
 
 def real_pairs(split: str = "real") -> Iterator[GridPair]:
     """The real pairs, at 0.1 m; of split ``development`` those that one may choose by."""
-    return real_grid_pairs(os.environ["TOPOMERGE_DATA"], REAL_SPLITS[split])
+    return real_grid_pairs(str(real_data()), REAL_SPLITS[split])
 
 
 def simulated_pairs(split: str, limit: int, skip: set[str]) -> Iterator[GridPair]:

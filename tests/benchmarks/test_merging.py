@@ -73,9 +73,21 @@ def test_where_both_maps_are_from(module, monkeypatch) -> None:
 
 
 def test_pairs_of_the_tables_are_not_made_without_the_real_plans(module, monkeypatch) -> None:
-    """Half of them are drawn from these; without them the same command would make other pairs."""
+    """Many are drawn from these; without them the same commands would measure other pairs."""
     monkeypatch.delenv("TOPOMERGE_DATA", raising=False)
-    with pytest.raises(InputError, match="TOPOMERGE_DATA is not set: name the folder of the real plans by it, or data.folder="):
+    said = r"TOPOMERGE_DATA must name the folder of the real data \(it is not set\)"
+    for command in (
+        lambda: module("cached_pairs").main("test", "jobs=1"),
+        lambda: next(module("joined").rows("test", 1, set())),
+        lambda: next(module("bending").simulated("test", "1", set())),
+        lambda: next(module("bending").floor(set())),
+        lambda: module("drift").main("1"),
+        lambda: module("register").real_pairs(),
+    ):
+        with pytest.raises(InputError, match=said):
+            command()
+    monkeypatch.setenv("TOPOMERGE_DATA", "nowhere")
+    with pytest.raises(InputError, match="it is nowhere"):
         module("cached_pairs").main("test", "jobs=1")
 
 
