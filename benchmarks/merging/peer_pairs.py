@@ -33,7 +33,9 @@ ORDINARY = PAIR_CLASSES[0]
 MOST_AREA = tuple(AREA_BINS)[-1]
 COMMON_TURN = 4  # ordinary pairs with the largest area in a turn, where other cells have one
 FIRST_PAIRS, RAW_PAIRS = 30, 30  # test pairs of that cell before all others; pairs with all their points
-PEER_SPLITS = {"train": "train", "test": "test", "raw": "test", "real": "real"}  # sets whose buildings `register` can tell
+PEER_SPLITS = {  # sets whose buildings `register` can tell
+    "train": "train", "test": "test", "raw": "test", "thinned": "test", "real": "real",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ def cells(paths: Sequence[Path]) -> dict[tuple[str, str], list[Path]]:
 
 
 def cached_order(what: str) -> list[Path]:
-    """Files of ``train``, ``test`` or ``raw`` in their order; of a manifest of pairs of the same format, cells in turn.
+    """Files of ``train``, ``test``, ``raw`` or ``thinned`` in their order; of a manifest of pairs of the same format, cells in turn.
 
     Ordinary scans that share most are four in each turn; in the test set thirty of them come first.
     """
@@ -93,7 +95,7 @@ def cached_order(what: str) -> list[Path]:
         return list(in_turn(cells(scaled_too), lambda key: 1))
     most = (ORDINARY, MOST_AREA)
     often = lambda key: COMMON_TURN if key == most else 1  # noqa: E731
-    if what == "raw":
+    if what in ("raw", "thinned"):
         groups = {k: v for k, v in cells(pair_files("test")).items() if k[0] == ORDINARY and k[1] in AREA_BINS}
         return list(in_turn(groups, often))[:RAW_PAIRS]
     groups = cells([*pair_files(what), *_drawings(what)])

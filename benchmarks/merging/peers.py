@@ -1,11 +1,12 @@
 """Ours, KISS-Matcher (0.2 and 0.3 m), FPFH + RANSAC and FGR on the same pairs: poses, scores, and the time they take.
 
-``python -m benchmarks.merging.peers SECONDS [train|test|raw|real|heldout|MANIFEST]`` works through pairs (`peer_pairs.py`) for
-so many seconds of processor: ``train`` for the thresholds of the verdicts (`peer_thresholds.py`), ``test`` for the tables
-(`peers_table.py`), ``raw`` with all simulated points instead of the means of 0.1 m cells; the real pairs of TOPOMERGE_DATA; the
-maps that `evaluate.py data=heldout` kept, with the learned embedder's merge among the methods; or any manifest of pairs of the
-same format, e.g. of look-alikes. Resumable: a line of JSON a pair with all methods in ``cache/merge/peers_*.jsonl``. After a
-change of ours, ``python -m benchmarks.merging.peers again [test|real|MANIFEST]`` measures ours alone on the pairs that are there.
+``python -m benchmarks.merging.peers SECONDS [train|test|raw|thinned|real|heldout|MANIFEST]`` works through pairs
+(`peer_pairs.py`) for so many seconds of processor: ``train`` for the thresholds of the verdicts (`peer_thresholds.py`),
+``test`` for the tables (`peers_table.py`), ``raw`` with all simulated points instead of the means of 0.1 m cells,
+``thinned`` the same pairs with these; the real pairs of TOPOMERGE_DATA; the maps that `evaluate.py data=heldout` kept, with
+the learned embedder's merge among the methods; or any manifest of pairs of the same format, e.g. of look-alikes. Resumable:
+a line of JSON a pair with all methods in ``cache/merge/peers_*.jsonl``. After a change of ours, ``python -m
+benchmarks.merging.peers again [test|real|MANIFEST]`` measures ours alone on the pairs that are there.
 
 All on one core, in seconds of processor from points in memory to the pose; ours also from them to the joined map with its rooms
 (``extract`` of both, ``merge``). Peers run in processes of their own; what takes longer than a minute of processor, or dies, is

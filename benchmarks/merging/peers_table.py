@@ -34,6 +34,7 @@ LOOKALIKE_PAIRS = "lookalikes_heldout.jsonl"
 PEERS_COMMANDS = (
     "`python -m benchmarks.merging.cached_pairs test jobs=2; python -m benchmarks.merging.cached_pairs train jobs=2; "
     f"{THRESHOLDS_COMMAND}; python -m benchmarks.merging.peers 3600 test; python -m benchmarks.merging.peers 900 raw; "
+    "python -m benchmarks.merging.peers 900 thinned; "
     "python -m benchmarks.merging.peers 1800 real; python -m benchmarks.merging.peers_table docs/results/peers.md`"
 )
 PEERS_SETUP = (
@@ -64,7 +65,7 @@ def verdicts_table(verdicts: Mapping[str, PeerVerdict]) -> str:
 
 def raw_table(verdicts: Mapping[str, PeerVerdict]) -> str:
     """The same pairs with all points and thinned."""
-    thin, raw = answers_of("test", verdicts), answers_of("raw", verdicts)
+    thin, raw = answers_of("thinned", verdicts), answers_of("raw", verdicts)
     both = {r["name"] for r in thin} & {r["name"] for r in raw}
     out = []
     for method in methods_of(raw):

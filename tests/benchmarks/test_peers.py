@@ -260,7 +260,7 @@ def test_thirty_ordinary_pairs_come_first_and_unknown_scales_not_at_all(module, 
     assert test[:30] == [f"a{k:02d}" for k in range(30)] and len(test) == 44 == len(set(test)) and "d1" not in test
     assert sorted(test[30:37]) == ["a30", "a31", "a32", "a33", "d0", "s0", "x"]
     assert sorted(train[:7]) == ["a00", "a01", "a02", "a03", "d0", "s0", "x"]
-    assert raw == [f"a{k:02d}" for k in range(30)]
+    assert raw == [f"a{k:02d}" for k in range(30)] == [path.stem for path in pairs.cached_order("thinned")]
 
 
 def test_poses_are_judged_upright_and_misses_are_told(module, monkeypatch) -> None:
