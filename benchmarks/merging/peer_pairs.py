@@ -85,7 +85,7 @@ def cells(paths: Sequence[Path]) -> dict[tuple[str, str], list[Path]]:
 
 
 def cached_order(what: str) -> list[Path]:
-    """Files of ``train``, ``test``, ``raw`` or ``thinned`` in their order; of a manifest of pairs of the same format, cells in turn.
+    """Files of ``train``, ``test``, ``raw`` or ``thinned`` in their order; of a manifest of such pairs, cells in turn.
 
     Ordinary scans that share most are four in each turn; in the test set thirty of them come first.
     """
