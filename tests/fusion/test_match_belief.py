@@ -17,7 +17,7 @@ from topomerge.fusion.match_belief import (
     BELIEF_FILE,
     BELIEF_NAMES,
     BELIEVED_METHODS,
-    NEAR_FLOOR,
+    SHARED_FLOOR,
     belief_features,
     belief_weights,
     believed_matches,
@@ -72,8 +72,8 @@ def test_how_rooms_lie_on_each_other_by_hand(halves):
     assert floor_shared(same, a, a).tolist() == [1.0]
     (share,) = floor_shared(replace(same, transform=Sim3(translation=(0.8, 0.0, 0.0))), a, a)
     width = float(np.ptp(a.navigable.centroids()[a.navigable_room == 0, 0]))
-    assert share == pytest.approx(1 - (0.8 - NEAR_FLOOR) / width, abs=0.1)
-    for away in ((width + NEAR_FLOOR + 0.2, 0.0, 0.0), (0.0, 0.0, 4.0)):
+    assert share == pytest.approx(1 - (0.8 - SHARED_FLOOR) / width, abs=0.1)
+    for away in ((width + SHARED_FLOOR + 0.2, 0.0, 0.0), (0.0, 0.0, 4.0)):
         assert floor_shared(replace(same, transform=Sim3(translation=away)), a, a).tolist() == [0.0]
     bare = replace(a, navigable_room=np.where(a.navigable_room == 0, -1, a.navigable_room))
     assert floor_shared(same, a, bare).tolist() == [0.0] == floor_shared(same, bare, a).tolist()

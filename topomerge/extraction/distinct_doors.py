@@ -14,7 +14,7 @@ from topomerge.types import Array, TopometricMap
 
 LEVEL_KINDS = ("door", "opening")
 ONE_DOORWAY = 0.5  # m between the centres of what is one doorway
-ACROSS = (0.4, 0.6, 0.8)  # m before and behind a door, where its rooms are looked for
+SIDES_AT = (0.4, 0.6, 0.8)  # m before and behind a door, where its rooms are looked for
 
 
 def distinct_doors(map: TopometricMap) -> TopometricMap:
@@ -22,19 +22,19 @@ def distinct_doors(map: TopometricMap) -> TopometricMap:
     level = np.flatnonzero(np.isin(map.edges["kind"], LEVEL_KINDS))
     doors = map.edges[level]
     apart = np.linalg.norm(doors["centre"][:, None] - doors["centre"], axis=2)
-    kept = np.ones(len(map.edges), bool)
+    single = np.ones(len(map.edges), bool)
     taken: list[int] = []
     for k in np.lexsort((-doors["confidence"], ~_between_its_rooms(map, doors))).tolist():
-        kept[level[k]] = not taken or apart[k, taken].min() >= ONE_DOORWAY
-        taken += [k] if kept[level[k]] else []
-    return map if kept.all() else replace(map, edges=map.edges[kept])
+        single[level[k]] = not taken or apart[k, taken].min() >= ONE_DOORWAY
+        taken += [k] if single[level[k]] else []
+    return map if single.all() else replace(map, edges=map.edges[single])
 
 
 def _between_its_rooms(map: TopometricMap, doors: Array) -> Array:
     """(n,) bool: do the rooms of each door lie before and behind it?"""
     normal = np.column_stack([np.cos(doors["direction"]), np.sin(doors["direction"]), np.zeros(len(doors))])
     wanted, out = np.sort(doors["rooms"], axis=1), np.zeros(len(doors), bool)
-    for reach in ACROSS:
+    for reach in SIDES_AT:
         sides = [rooms_at(map, doors["centre"] + way * reach * normal) for way in (1, -1)]
         out |= (np.sort(np.column_stack(sides), axis=1) == wanted).all(axis=1)
     return out

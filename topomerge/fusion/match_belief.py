@@ -27,7 +27,7 @@ BELIEF_NAMES = ("constant", "matching", "places", "room", "overlap")
 SUREST = 1e-3  # probabilities of matching are that far from 0 and 1 at least
 ROOM_RIM = 1.5  # m around a room from which places speak for it, too: a tile is wider than most walls are apart
 SAME_FLOOR = 1.0  # m
-NEAR_FLOOR = 0.3  # m: floor of one room that is this close to floor of the other is shared
+SHARED_FLOOR = 0.3  # m: floor of one room that is this close to floor of the other is shared
 FLOOR_PLACES = 500  # of a room, that are looked at
 
 
@@ -85,7 +85,7 @@ def floor_shared(matching: Matching, a: TopometricMap, b: TopometricMap) -> Arra
     for k, (i, j) in enumerate(matching.rooms.tolist()):
         small, large = sorted((floors[0][i], floors[1][j]), key=len)
         if len(small):
-            apart, _ = cKDTree(large).query(small[:: -(-len(small) // FLOOR_PLACES)], distance_upper_bound=NEAR_FLOOR)
+            apart, _ = cKDTree(large).query(small[:: -(-len(small) // FLOOR_PLACES)], distance_upper_bound=SHARED_FLOOR)
             out[k] = np.isfinite(apart).mean()
     return out
 

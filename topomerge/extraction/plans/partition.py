@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from types import MappingProxyType
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from topomerge.types import Array
 
 DoorClassifier = Callable[[Array], Array]  # (n, 17) features -> (n,) probability that a door parts the two
 Pair = tuple[int, int]
-SUREST = 1e-6  # probabilities are that far from 0 and 1 at least where other maps are weighed
+SUREST_DOOR = 1e-6  # probabilities are that far from 0 and 1 at least where other maps are weighed
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,6 @@ def merge_regions(
     door: float,
     narrow: float,
     least_area: float,
-    log_odds: Mapping[Pair, float] = MappingProxyType({}),
 ) -> Partition:
     """Merge neighbouring regions, the least likely door first; each merger changes the features of the next ones.
 
@@ -55,9 +53,8 @@ def merge_regions(
         door: probability from which on two rooms stay apart.
         narrow: the lower one from which on two areas of a room do.
         least_area: m2, smaller rooms are given to the neighbour from which the least likely door parts them.
-        log_odds: what is added to the log odds of a door in each passage (`part_rooms`).
     """
-    rooms = _GrowingRooms(region, clearance, passages, edge, classify, log_odds)
+    rooms = _GrowingRooms(region, clearance, passages, edge, classify)
     area: Array | None = None
     while rooms.door_probability:
         pair = rooms.weakest()
@@ -82,13 +79,7 @@ class _GrowingRooms:
     """Rooms that grow by merging and how likely doors part them; a room is named by one of its regions."""
 
     def __init__(
-        self,
-        region: Array,
-        clearance: Array,
-        passages: dict[Pair, Passage],
-        edge: float,
-        classify: DoorClassifier,
-        log_odds: Mapping[Pair, float],
+        self, region: Array, clearance: Array, passages: dict[Pair, Passage], edge: float, classify: DoorClassifier
     ) -> None:
         count = int(region.max(initial=-1)) + 1
         in_region = region >= 0
@@ -97,7 +88,6 @@ class _GrowingRooms:
         self.peak = np.zeros(count)
         np.maximum.at(self.peak, region[in_region], clearance[in_region])
         self.passages = dict(passages)
-        self.log_odds = dict(log_odds)
         self.classify = classify
         self.door_probability: dict[Pair, float] = {}
         self.queue: list[tuple[float, Pair]] = []  # holds outdated probabilities, too
@@ -115,10 +105,10 @@ class _GrowingRooms:
                 heappush(self.queue, (probability, pair))
 
     def _probability(self, pairs: list[Pair], x: Array) -> Array:
-        """(n,) of doors, from their features (n, 17) and the log odds that are added."""
+        """(n,) of doors, from their features (n, 17) and what other maps say of them."""
         probability = self.classify(x)
-        added = np.array([self.log_odds.get(pair, 0.0) for pair in pairs])
-        sure = np.clip(probability, SUREST, 1 - SUREST)
+        added = np.array([self.passages[pair].log_odds for pair in pairs])
+        sure = np.clip(probability, SUREST_DOOR, 1 - SUREST_DOOR)
         return np.where(added == 0, probability, sigmoid(np.log(sure / (1 - sure)) + added))
 
     def weakest(self) -> Pair:
@@ -140,10 +130,10 @@ class _GrowingRooms:
             self.neighbours[other].discard(absorbed)
             self.neighbours[other].add(room)
             self.neighbours[room].add(other)
-            passage, log_odds = self.passages.pop(old), self.log_odds.pop(old, 0.0)
+            passage = self.passages.pop(old)
             del self.door_probability[old]
             if new not in self.passages or passage.width > self.passages[new].width:
-                self.passages[new], self.log_odds[new] = passage, log_odds
+                self.passages[new] = passage
         self._score(sorted(_pair(room, other) for other in self.neighbours[room]))
 
 

@@ -53,6 +53,7 @@ class Passage:
     width: float  # m
     across: tuple[float, float]  # unit vector from jamb to jamb
     measured: tuple[float, ...]  # the features 3 to 14
+    log_odds: float = 0.0  # of a door, by the maps that were joined (`part_rooms`): added to what the classifier says
 
 
 def clearance_of(plan: StoreyPlan) -> Array:

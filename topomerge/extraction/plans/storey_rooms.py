@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -66,7 +66,8 @@ def cut_storey(
         region = without_upper_sides(grid, plan, region)
     passages = find_passages(plan, clearance, region, probability)
     log_odds = door_log_odds(region, plan.edge, passages, others)
-    partition = merge_regions(region, clearance, passages, plan.edge, door_probability, door, narrow, ROOM_LEAST_AREA, log_odds)
+    passages = {pair: replace(passage, log_odds=log_odds[pair]) for pair, passage in passages.items()}
+    partition = merge_regions(region, clearance, passages, plan.edge, door_probability, door, narrow, ROOM_LEAST_AREA)
     low, base = columns_of(plan, grid)
     corner = grid.origin + np.append(low, np.median(base)) * plan.edge
     classes = ClassifiedStorey(probability, corner[:2], plan.edge, float(corner[2]))
