@@ -17,7 +17,6 @@ from topomerge.fusion.match_belief import (
     BELIEF_FILE,
     BELIEF_NAMES,
     BELIEVED_METHODS,
-    SHARED_FLOOR,
     belief_features,
     belief_weights,
     believed_matches,
@@ -69,14 +68,14 @@ def test_how_rooms_lie_on_each_other_by_hand(halves):
     """A map on itself; moved by 0.8 m and by more than it is wide; on another storey; a room without floor."""
     a = halves[0]
     same = Matching(np.array([[0, 0]]), np.array([0.8]), Sim3())
-    assert floor_shared(same, a, a).tolist() == [1.0]
+    assert floor_shared(same, a, a) == pytest.approx([1.0], abs=0.02)
     (share,) = floor_shared(replace(same, transform=Sim3(translation=(0.8, 0.0, 0.0))), a, a)
-    width = float(np.ptp(a.navigable.centroids()[a.navigable_room == 0, 0]))
-    assert share == pytest.approx(1 - (0.8 - SHARED_FLOOR) / width, abs=0.1)
-    for away in ((width + SHARED_FLOOR + 0.2, 0.0, 0.0), (0.0, 0.0, 4.0)):
+    width = float(a.rooms["hi"][0, 0] - a.rooms["lo"][0, 0])
+    assert share == pytest.approx(1 - 0.8 / width, abs=0.1)
+    for away in ((width + 0.4, 0.0, 0.0), (0.0, 0.0, 4.0)):
         assert floor_shared(replace(same, transform=Sim3(translation=away)), a, a).tolist() == [0.0]
-    bare = replace(a, navigable_room=np.where(a.navigable_room == 0, -1, a.navigable_room))
-    assert floor_shared(same, a, bare).tolist() == [0.0] == floor_shared(same, bare, a).tolist()
+    half = replace(same, transform=Sim3(scale=0.5, translation=0.25 * (a.rooms["lo"][0] + a.rooms["hi"][0]) * (1, 1, 0)))
+    assert floor_shared(half, a, a) == pytest.approx([1.0], abs=0.1)
 
 
 def test_the_probability_is_that_of_the_model(halves, matching):

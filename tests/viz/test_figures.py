@@ -13,6 +13,7 @@ from PIL import Image
 
 from tests.scenes_map import building
 from topomerge.errors import InputError
+from topomerge.io.listing import map_to_text
 from topomerge.io.palette import beside, colour_numbers, room_colours
 from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, TopometricMap, VoxelGrid
 from topomerge.viz.figures import plan_figure, save_figure
@@ -44,6 +45,17 @@ def test_title_and_legend_tell_what_is_drawn() -> None:
     assert "building.ply: 10 rooms, 2 storeys" in words
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == ["door", "opening", "stairs", "wall", "no room"]
+
+
+def test_ramps_are_drawn_and_listed_as_ramps() -> None:
+    scene = building(2, 2)
+    edges = scene.edges.copy()
+    edges["kind"][edges["kind"] == "stairs"] = "ramp"
+    sloped = replace(scene, edges=edges)
+    legend = [text.get_text() for text in plan_figure(sloped).legends[0].get_texts()]
+    assert legend == ["door", "opening", "ramp", "wall", "no room"]
+    text = map_to_text(sloped)
+    assert " 0 stairs, 1 ramp;" in text and "(ramp)" in text and "(stairs)" not in text
 
 
 def test_every_room_has_its_number_inside_it() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from topomerge.types import Array, TopometricMap
 
@@ -21,12 +22,11 @@ def distinct_doors(map: TopometricMap) -> TopometricMap:
     """The map with each doorway once: of edges in one place the one whose rooms lie across it, of these the surest."""
     level = np.flatnonzero(np.isin(map.edges["kind"], LEVEL_KINDS))
     doors = map.edges[level]
-    apart = np.linalg.norm(doors["centre"][:, None] - doors["centre"], axis=2)
+    same = cKDTree(doors["centre"]).query_ball_point(doors["centre"], ONE_DOORWAY) if len(doors) else ()
     single = np.ones(len(map.edges), bool)
-    taken: list[int] = []
+    single[level] = False
     for k in np.lexsort((-doors["confidence"], ~_between_its_rooms(map, doors))).tolist():
-        single[level[k]] = not taken or apart[k, taken].min() >= ONE_DOORWAY
-        taken += [k] if single[level[k]] else []
+        single[level[k]] = not single[level[same[k]]].any()
     return map if single.all() else replace(map, edges=map.edges[single])
 
 

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from topomerge.extraction.distinct_doors import LEVEL_KINDS, distinct_doors, rooms_at
+from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.fusion.resampling import Laying
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
 
@@ -23,14 +25,34 @@ ONE_DOOR = 1.2  # m: doors of two maps that are this close are one
 SEEN_BY_A_PART = ("centre", "lower", "upper", "direction", "width", "height", "kind", "open")  # of a door
 
 
-def with_doors(joined: TopometricMap, parts: Iterable[tuple[TopometricMap, Laying]]) -> TopometricMap:
+class LaidPart(NamedTuple):
+    """What of a part is needed once it is joined: its rooms, and its doors and openings as they lie in the joined map, EDGE_DTYPE
+    with the part's rooms."""
+
+    rooms: PartRooms
+    doors: Array
+
+
+def laid_part(part: TopometricMap, laying: Laying) -> LaidPart:
+    """A part as it lies in the joined map."""
+    doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)].copy()
+    for name in ("centre", "lower", "upper"):
+        doors[name] = laying.apply(doors[name])
+    doors["direction"] = (doors["direction"] + laying.pose.yaw) % np.pi
+    for name in ("width", "height"):
+        doors[name] *= laying.pose.scale
+    area = (laying.pose.scale * part.navigable.edge) ** 2
+    return LaidPart(PartRooms(*laid_floor(part, laying), part.rooms["entered"], area), doors)
+
+
+def with_doors(joined: TopometricMap, parts: Iterable[LaidPart]) -> TopometricMap:
     """The joined map with those doors and openings of its parts that it lacks, without those that its parts deny, and each as the
     part saw it that is surest of it.
 
     Args:
-        parts: maps, one at a time, and how each is laid into the joined one.
+        parts: as they lie in it.
     """
-    laid = [_LaidFloor.of(part, joined, laying) for part, laying in parts]
+    laid = [_LaidFloor.of(part, joined) for part in parts]
     level = np.isin(joined.edges["kind"], LEVEL_KINDS)
     edges = joined.edges[[not level[k] or _confirmed(edge, laid) for k, edge in enumerate(joined.edges)]]
     edges = _as_seen(edges, np.concatenate([np.zeros(0, EDGE_DTYPE), *(part.doors for part in laid)]))
@@ -63,16 +85,9 @@ class _LaidFloor:
     doors: Array
 
     @classmethod
-    def of(cls, part: TopometricMap, joined: TopometricMap, laying: Laying) -> _LaidFloor:
-        floor, part_room = laid_floor(part, laying)
-        room = rooms_at(joined, floor)
-        doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)].copy()
-        for name in ("centre", "lower", "upper"):
-            doors[name] = laying.apply(doors[name])
-        doors["direction"] = (doors["direction"] + laying.pose.yaw) % np.pi
-        for name in ("width", "height"):
-            doors[name] *= laying.pose.scale
-        tree = cKDTree(floor)
+    def of(cls, part: LaidPart, joined: TopometricMap) -> _LaidFloor:
+        part_room, doors = part.rooms.room, part.doors.copy()
+        room, tree = rooms_at(joined, part.rooms.places), cKDTree(part.rooms.places)
         pairs = np.full((len(doors), 2), -1, np.int64)
         for k, near in enumerate(tree.query_ball_point(doors["centre"], DOOR_SIDE)):
             there, own = room[near], part_room[near]

@@ -10,16 +10,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from topomerge.errors import InputError
 from topomerge.fusion.evidence.places import MOST_ODDS, Places, places
 from topomerge.fusion.storey_plan import plans
 from topomerge.fusion.verify import PLACE_AREA
 from topomerge.io.weight_files import read_weights_json
+from topomerge.matching.consistency import common_floor
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.result import Matching
-from topomerge.types import Array, Sim3, TopometricMap
+from topomerge.matching.room_plans import room_plans
+from topomerge.types import Array, TopometricMap
 
 BELIEF_FILE = "match_belief.json"
 BELIEVED_METHODS = ("attention",)  # that are told better so; walls decide for "consistent", whose odds are as good without
@@ -27,8 +28,6 @@ BELIEF_NAMES = ("constant", "matching", "places", "room", "overlap")
 SUREST = 1e-3  # probabilities of matching are that far from 0 and 1 at least
 ROOM_RIM = 1.5  # m around a room from which places speak for it, too: a tile is wider than most walls are apart
 SAME_FLOOR = 1.0  # m
-SHARED_FLOOR = 0.3  # m: floor of one room that is this close to floor of the other is shared
-FLOOR_PLACES = 500  # of a room, that are looked at
 
 
 def believed_matches(matching: Matching, a: TopometricMap, b: TopometricMap, method: str) -> Matching:
@@ -78,22 +77,12 @@ def belief_features(matching: Matching, a: TopometricMap, b: TopometricMap, seen
 
 
 def floor_shared(matching: Matching, a: TopometricMap, b: TopometricMap) -> Array:
-    """(M,) share 0..1 of the floor of the smaller room of each match that lies on the other's under the pose; 0 without floor."""
+    """(M,) share 0..1 of the floor of the smaller room of each match that lies on the other's under the pose."""
     assert matching.transform is not None
-    floors = [_floors(a, Sim3()), _floors(b, matching.transform)]
-    out = np.zeros(len(matching.rooms))
-    for k, (i, j) in enumerate(matching.rooms.tolist()):
-        small, large = sorted((floors[0][i], floors[1][j]), key=len)
-        if len(small):
-            apart, _ = cKDTree(large).query(small[:: -(-len(small) // FLOOR_PLACES)], distance_upper_bound=SHARED_FLOOR)
-            out[k] = np.isfinite(apart).mean()
-    return out
-
-
-def _floors(map: TopometricMap, pose: Sim3) -> list[Array]:
-    """(k, 3) m under a pose: where one can stand in each room."""
-    places = pose.apply(map.navigable.centroids())
-    return [places[map.navigable_room == room] for room in range(len(map.rooms))]
+    plans, (i, j) = (room_plans(a), room_plans(b)), matching.rooms.T
+    area = np.minimum(plans[0].areas[i], plans[1].areas[j] * matching.transform.scale**2)
+    common = common_floor(matching.transform, plans)[i, j]
+    return np.asarray(np.clip(common / np.maximum(area, 1e-9), 0, 1))
 
 
 def room_places(seen: Places, a: TopometricMap, room: int) -> float:

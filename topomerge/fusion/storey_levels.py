@@ -11,7 +11,7 @@ STOREY_GAP = 1.9  # m of empty height between a floor and its ceiling
 STOREY_LEAST_AREA = 3.0  # m2
 STOREY_LEAST_SHARE = 0.08  # of the largest storey's area
 SLICE_HEIGHT = 0.6  # m; a map that is not higher is a slice
-EXTRUDED_HEIGHT = 1.2  # m, of levels of one size: a map of lines that were given walls has walls that high, at least
+LOWEST_EXTRUDED = 1.2  # m, of levels of one size: a map of lines that were given walls has walls that high, at least
 LAYER_SHARE = 0.1  # of the cells that a layer of a map of slices holds at least
 
 
@@ -21,7 +21,7 @@ def extruded(grid: VoxelGrid) -> bool:
         return False
     level = grid.cells[:, 2] - grid.cells[:, 2].min()
     counts = np.bincount(level)[1:]
-    if len(counts) * grid.edge < EXTRUDED_HEIGHT or (counts != counts[0]).any():
+    if len(counts) * grid.edge < LOWEST_EXTRUDED or (counts != counts[0]).any():
         return False
     first = grid.cells[level == 1, :2]
     return all(np.array_equal(grid.cells[level == k, :2], first) for k in range(2, len(counts) + 1))

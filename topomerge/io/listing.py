@@ -152,7 +152,7 @@ def _neighbours(map: TopometricMap) -> list[list[str]]:
     beside: list[dict[int, str]] = [{} for _ in map.rooms]
     for edge in map.edges:
         a, b = edge["rooms"].tolist()
-        mark = " (stairs)" if edge["kind"] == "stairs" else ""
+        mark = f" ({edge['kind']})" if edge["kind"] in ("stairs", "ramp") else ""
         beside[a].setdefault(b, mark)
         beside[b].setdefault(a, mark)
     return [[f"{room}{rooms[room]}" for room in sorted(rooms)] for rooms in beside]
@@ -184,6 +184,7 @@ def map_to_text(map: TopometricMap) -> str:
     kinds = Counter(map.edges["kind"].tolist())
     counts = [_plural(len(map.rooms), "room"), _plural(len(map.storeys), "storey")]
     counts += [_plural(kinds[kind], kind) for kind in ("door", "opening", "stairs")]
+    counts += [_plural(kinds["ramp"], "ramp")] if kinds["ramp"] else []
     counts += [_plural(len(map.windows), "window")] if len(map.windows) else []
     steps = [(f"{s:.2f}", step) for step, s in map.seconds.items()]
     steps.append((f"{sum(map.seconds.values()):.2f}", "all"))

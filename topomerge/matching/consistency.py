@@ -192,6 +192,15 @@ def matches_under(
     Args:
         lay: where the points (n, 3) of b lie in a, if not exactly where the transform puts them.
     """
+    return by_overlap(common_floor(transform, plans, lay), plans[0].areas, plans[1].areas * transform.scale**2)
+
+
+def common_floor(transform: Sim3, plans: tuple[RoomPlans, RoomPlans], lay: Callable[[Array], Array] | None = None) -> Array:
+    """(R_a, R_b) m2 in a of the floor that each room of a shares with each of b under a transform T_ab.
+
+    Args:
+        lay: as of `matches_under`.
+    """
     a, b = plans
     storeys = storey_map(PoseArrays.of([transform]), a.floors, b.floors)[0]
     storey, x, y = np.nonzero(b.footprint >= 0)
@@ -207,4 +216,4 @@ def matches_under(
     hit = other >= 0
     common = np.zeros((len(a.areas), len(b.areas)))
     np.add.at(common, (other[hit], room[inside][hit]), step * (transform.scale * b.edge) ** 2)
-    return by_overlap(common, a.areas, b.areas * transform.scale**2)
+    return common

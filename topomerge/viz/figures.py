@@ -24,6 +24,7 @@ EDGE_LINES: dict[str, dict[str, Any]] = {
     "door": {"color": "#1b1b1b", "linestyle": "-", "marker": "s"},
     "opening": {"color": "#1b1b1b", "linestyle": (0, (4, 2)), "marker": "o"},
     "stairs": {"color": "#a00060", "linestyle": (0, (1, 1.2)), "marker": "^"},
+    "ramp": {"color": "#a00060", "linestyle": (0, (4, 2)), "marker": "v"},
 }
 PAGE = (15.0, 10.0)  # inches: panels are arranged to fill this
 LARGEST_FIGURE = 24.0  # inches along an axis, of a figure that needs more for its room numbers to be read
