@@ -47,6 +47,12 @@ def test_title_and_legend_tell_what_is_drawn() -> None:
     assert legend == ["door", "opening", "stairs", "wall", "no room"]
 
 
+def test_a_joined_map_has_the_names_of_all_its_files() -> None:
+    scene = replace(building(2, 2), source="house/a.tmap + other house/b.ply + ")
+    assert scene.title == "a.tmap + b.ply + map"
+    assert "a.tmap + b.ply + map: 10 rooms, 2 storeys" in [text.get_text() for text in plan_figure(scene).texts]
+
+
 def test_ramps_are_drawn_and_listed_as_ramps() -> None:
     scene = building(2, 2)
     edges = scene.edges.copy()

@@ -34,7 +34,7 @@ from topomerge.fusion.storey_levels import extruded
 from topomerge.kernels.voxelise import OFFSET_STEPS
 from topomerge.matching.consistency import matches_under
 from topomerge.matching.room_plans import room_plans
-from topomerge.types import Array, Sim3, TopometricMap, VoxelGrid
+from topomerge.types import JOINED, Array, Sim3, TopometricMap, VoxelGrid
 
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
 PROVENANCE_BITS = 32  # maps that one bit set tells apart
@@ -77,7 +77,7 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
         cells.add_map(map, layings[n], int(first_bits[n]), parts[n].assumed and n != order[0])
         windows.append(laid_windows(map, layings[n]))
         laid.append(laid_part(map, layings[n]))
-    name = " + ".join(maps[k].source or "map" for k, _ in poses)
+    name = JOINED.join(maps[k].source or "map" for k, _ in poses)
     rooms = [part.rooms for part in laid]
     joined = _extracted(cells, min(part.neighbours for part in parts), name, rooms)
     return with_joined_windows(with_doors(with_part_odds(joined, rooms), laid), windows)

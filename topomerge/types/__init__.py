@@ -11,6 +11,7 @@ from topomerge.types.similarity import Sim3
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
     EDGE_DTYPE,
+    JOINED,
     ROOM_DTYPE,
     ROOM_ODDS,
     STOREY_DTYPE,
@@ -23,6 +24,7 @@ from topomerge.types.topometric_map import (
 __all__ = [
     "AREA_DTYPE",
     "EDGE_DTYPE",
+    "JOINED",
     "ROOM_DTYPE",
     "ROOM_ODDS",
     "STOREY_DTYPE",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from topomerge.types.arrays import Array, require
 from topomerge.types.grid import VoxelGrid
 
+JOINED = " + "  # between the sources of a joined map
 ROOM_DTYPE = np.dtype(
     [
         ("storey", "i4"),
@@ -108,7 +110,7 @@ class TopometricMap:
         windows: (W,) WINDOW_DTYPE, those that the walls show.
         free: cells known to be empty (rays crossed them), of the same origin but perhaps another edge length; or None.
         provenance: (n,) uint32 bit set of the maps that saw each cell, or None for a map of one source.
-        source: the file it was made from.
+        source: the file it was made from; of a joined map those of all, with `JOINED` between them.
         parameters: what it was extracted with.
         seconds: step -> s.
         warnings: what the user should know.
@@ -162,6 +164,11 @@ class TopometricMap:
         storey = self.rooms["storey"]
         require(not len(storey) or (storey.min() >= 0 and storey.max() < len(self.storeys)), "a room's storey is missing")
         require(self.provenance is None or len(self.provenance) == len(self.grid), "provenance: one value a cell")
+
+    @property
+    def title(self) -> str:
+        """Names of the files that it was made from, without their folders."""
+        return JOINED.join(Path(source).name or "map" for source in self.source.split(JOINED))
 
     @property
     def open_edges(self) -> Array:

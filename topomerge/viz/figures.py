@@ -192,7 +192,7 @@ def _title(figure: Figure, map: TopometricMap) -> None:
     rooms, storeys = len(map.rooms), len(map.storeys)
     counts = f"{rooms} room{'' if rooms == 1 else 's'}, {storeys} storey{'' if storeys == 1 else 's'}"
     high = figure.get_size_inches()[1]
-    name = Path(map.source).name or "map"
+    name = map.title
     text = f"{name}: {counts}".replace("$", r"\$")  # a dollar would start a formula
     figure.text(0.5, 1 - 0.3 / high, text, ha="center", va="center", fontsize=13, color=TEXT_INK, weight="bold")
     kinds = [kind for kind in EDGE_LINES if kind in set(map.edges["kind"].tolist())]

@@ -45,7 +45,7 @@ def match_html(matching: Matching, a: TopometricMap, b: TopometricMap) -> str:
     shades = [_shades(m, matching.rooms[:, k], matching.probability) for k, m in enumerate((a, b))]
     views = []
     for name, m, (sheet, plans), colours in zip("ab", (a, b), drawn, shades, strict=True):
-        head = element("h3", f"{name}: {Path(m.source).name or 'map'} ", element("small", f"{len(m.rooms)} rooms"))
+        head = element("h3", f"{name}: {m.title} ", element("small", f"{len(m.rooms)} rooms"))
         views.append(element("div", head, plan_view(m, sheet, plans, colours)))
     words = "Green rooms have a match (greener: more probable), grey ones none. Click a room to compare the surroundings."
     compared = [
@@ -64,7 +64,7 @@ def match_html(matching: Matching, a: TopometricMap, b: TopometricMap) -> str:
         section("Matched rooms", scroller(_table(matches, a, b)), "matches"),
         section("How it was made", _made(matching, a, b), "made"),
     ]
-    names = " + ".join(Path(m.source).name or "map" for m in (a, b))
+    names = " + ".join(m.title for m in (a, b))
     return page(names, "Rooms of two maps", sections, {"mates": _mates(matches)})
 
 

@@ -77,7 +77,7 @@ def _write(text: str, path: Path) -> None:
 def merge_html(result: MergeResult) -> str:
     """The report as HTML. A result that is not believed shows its best hypothesis, and says so."""
     if result.atlas is not None:
-        names = " + ".join(Path(m.source).name or "map" for m in result.maps)
+        names = " + ".join(m.title for m in result.maps)
         joined = {} if result.map is None else {result.atlas.component_of(0): result.map}
         return atlas_html(result.atlas, joined, names, _bends(result))
     a, b = result.maps
@@ -99,7 +99,7 @@ def merge_html(result: MergeResult) -> str:
         if registration.places is not None and len(registration.places):
             sections.append(places_section(a, drawn[0], registration.places))
     sections.append(_made(result))
-    names = " + ".join(Path(m.source).name or "map" for m in result.maps)
+    names = " + ".join(m.title for m in result.maps)
     return page(names, "Merge of two maps", sections, data)
 
 
@@ -142,7 +142,7 @@ def _maps(result: MergeResult, drawn: tuple[Drawn, Drawn]) -> Markup:
     colours = _colours(result) if result.map is not None else (None, None)
     views = []
     for name, m, (sheet, plans), shades in zip("ab", result.maps, drawn, colours, strict=True):
-        head = element("h3", f"{name}: {Path(m.source).name or 'map'} ", element("small", f"{len(m.rooms)} rooms"))
+        head = element("h3", f"{name}: {m.title} ", element("small", f"{len(m.rooms)} rooms"))
         views.append(element("div", head, plan_view(m, sheet, plans, shades)))
     parts: list[Markup] = []
     if result.map is not None:

@@ -45,7 +45,7 @@ def save_report(map: TopometricMap, path: str | Path) -> None:
 
 def report_html(map: TopometricMap) -> str:
     """The report of one map as HTML: plans and rooms, 3D, doors, and what it was made with."""
-    title = Path(map.source).name or "map"
+    title = map.title
     sheet, plans = lay_out(map)
     rooms = element("div", plan_view(map, sheet, plans), scroller(rooms_table(map)), class_="beside")
     origin = element("div", storeys_table(map), seconds_table(map), parameters(map), class_="facts-row")
