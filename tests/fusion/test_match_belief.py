@@ -59,7 +59,8 @@ def test_features_by_hand(halves):
     middle = [*(a.rooms["lo"][0] + a.rooms["hi"][0])[:2] / 2, a.storeys["floor"][0]]
     pair = Matching(np.array([[0, 1]]), np.array([0.8]), Sim3())
     x = belief_features(pair, a, b, seen_at([middle, [500.0, 0.0, 0.0]], [2.0, -1.0]))
-    assert x[0] == pytest.approx([1.0, np.log(4.0), 0.5 * np.log1p(20 / PLACE_AREA), 2.0, *floor_shared(pair, a, b)])
+    whole, (shared,) = 0.5 * np.log1p(20 / PLACE_AREA), floor_shared(pair, a, b)
+    assert x[0] == pytest.approx([1.0, np.log(4.0), whole, 2.0, shared, shared / (1 + np.exp(-whole))])
     above = belief_features(pair, a, b, seen_at([np.add(middle, (0, 0, 3.0))], [2.0]))
     assert above[0, 3] == 0.0 and belief_features(pair, a, b, seen_at([], []))[0, 2:4].tolist() == [0.0, 0.0]
 

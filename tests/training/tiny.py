@@ -178,7 +178,7 @@ def match_rows(*_: Any) -> list[MatchRows]:
     for k in range(12):
         sure, right = rng.random(6), np.full(6, k % 2 > 0)
         places = np.full(6, 9.0 if k % 2 else -9.0)
-        x = np.column_stack([np.ones(6), np.log(sure / (1 - sure)), places, rng.random(6), np.full(6, 0.5)])
+        x = np.column_stack([np.ones(6), np.log(sure / (1 - sure)), places, rng.random(6), *np.full((2, 6), 0.5)])
         rows.append(MatchRows(f"b{k}", k % 2 > 0, *(dict.fromkeys(BELIEVED_METHODS, v) for v in (x, sure, right))))
     return rows
 

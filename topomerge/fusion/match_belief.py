@@ -20,11 +20,12 @@ from topomerge.matching.consistency import common_floor
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.result import Matching
 from topomerge.matching.room_plans import room_plans
+from topomerge.numpy_nn import sigmoid
 from topomerge.types import Array, TopometricMap
 
 BELIEF_FILE = "match_belief.json"
 BELIEVED_METHODS = ("attention",)  # that are told better so; walls decide for "consistent", whose odds are as good without
-BELIEF_NAMES = ("constant", "matching", "places", "room", "overlap")
+BELIEF_NAMES = ("constant", "matching", "places", "room", "overlap", "overlap_placed")
 SUREST = 1e-3  # probabilities of matching are that far from 0 and 1 at least
 ROOM_RIM = 1.5  # m around a room from which places speak for it, too: a tile is wider than most walls are apart
 SAME_FLOOR = 1.0  # m
@@ -54,7 +55,7 @@ def places_of(matching: Matching, a: TopometricMap, b: TopometricMap) -> Places:
 
 
 def belief_weights(method: str) -> Array:
-    """(5,) weights of `BELIEF_NAMES` for one of `BELIEVED_METHODS`.
+    """(6,) weights of `BELIEF_NAMES` for one of `BELIEVED_METHODS`.
 
     Raises:
         InputError: the file holds none of that length.
@@ -67,13 +68,15 @@ def belief_weights(method: str) -> Array:
 
 
 def belief_features(matching: Matching, a: TopometricMap, b: TopometricMap, seen: Places) -> Array:
-    """(M, 5) of each match: 1, log odds by matching, what all places say, what those around the room of a say (mean log odds;
-    0 of none), and share 0..1 of the floor of the smaller room that lies on the other."""
+    """(M, 6) of each match: 1, log odds by matching, what all places say, what those around the room of a say (mean log odds;
+    0 of none), share 0..1 of the floor of the smaller room that lies on the other, and that share times the probability of all
+    places: rooms lie on each other under many a wrong pose."""
     whole_features = seen.features
     p = np.clip(matching.probability, SUREST, 1 - SUREST)
     whole = np.full(len(p), whole_features["place_mean"] * np.log1p(whole_features["place_area"] / PLACE_AREA))
     around = np.array([room_places(seen, a, room) for room in matching.rooms[:, 0].tolist()])
-    return np.column_stack([np.ones(len(p)), np.log(p / (1 - p)), whole, around, floor_shared(matching, a, b)])
+    shared = floor_shared(matching, a, b)
+    return np.column_stack([np.ones(len(p)), np.log(p / (1 - p)), whole, around, shared, shared * sigmoid(whole)])
 
 
 def floor_shared(matching: Matching, a: TopometricMap, b: TopometricMap) -> Array:

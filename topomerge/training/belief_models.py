@@ -14,6 +14,7 @@ from topomerge.numpy_nn import softmax
 from topomerge.training.belief_hypotheses import kind_of
 from topomerge.types import Array
 
+LEAST_SPREAD = 1e-4  # the file of weights holds five decimals: less would be 0 there
 THRESHOLDS = [round(0.5 + 0.01 * k, 2) for k in range(50)]
 SIGN = {
     "ratio": 1, "walls": 1, "conflict": -1, "worst": -1, "free": 1, "opposed": -1, "lift": 1, "met": 1, "missed": -1, "share": 1,
@@ -23,9 +24,15 @@ SIGN = {
 }  # fmt: skip
 
 
+def spread(x: Array) -> Array:
+    """(k,) standard deviation of each column of (n, k); 1 of one that is the same throughout."""
+    deviation: Array = x.std(axis=0)
+    return np.where(deviation > LEAST_SPREAD, deviation, 1.0)
+
+
 def fitted(x: Array, y: Array, names: Sequence[str], strength: float, weight: Array | None = None) -> dict[str, Any]:
     """Standardised logistic regression as plain numbers, in which what speaks for a merge never counts against it (`SIGN`)."""
-    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-6)
+    mean, scale = x.mean(axis=0), spread(x)
     z, sign = (x - mean) / scale, np.where(y, 1.0, -1.0)
     weight = np.ones(len(y)) if weight is None else weight
 
@@ -91,7 +98,7 @@ def risk_curve(believed: Array, true: Array, truth: Array, weight: Array) -> lis
 
 def fitted_kinds(x: Array, truth: Array, weight: Array, strength: float) -> dict[str, Any]:
     """Standardised multinomial logistic regression: what it is (`WRONG`) where the best hypothesis is wrong."""
-    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-6)
+    mean, scale = x.mean(axis=0), spread(x)
     z = np.column_stack([(x - mean) / scale, np.ones(len(x))])
     one = (truth[:, None] == np.array(WRONG)).astype(float)
 

@@ -34,7 +34,7 @@ BEFORE, AFTER = "before", "after"  # places were compared
 
 
 class MatchRows(NamedTuple):
-    """Of a pair of maps: its building, do both show it, and of each method the features of its matches (M, 5), their
+    """Of a pair of maps: its building, do both show it, and of each method the features of its matches (M, 6), their
     probabilities by matching alone (M,) and which are right (M,)."""
 
     building: str
@@ -98,7 +98,7 @@ def rows_of(path: Path, other: Path | None = None) -> dict[str, Array]:
 
 
 def fitted_weights(rows: Sequence[MatchRows], method: str, pull: float) -> Array:
-    """(5,) weights of the most likely logistic model, pulled to what matching says. None but the constant is below 0: what speaks
+    """(6,) weights of the most likely logistic model, pulled to what matching says. None but the constant is below 0: what speaks
     for a match never lowers it.
 
     Raises:
