@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 # Lower may not import higher. Names of the same rank may import each other within their package only.
 RANKS = {
+    "blas": 0,
     "errors": 0,
     "code_digest": 0,
     "writers": 0,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from topomerge import numpy_nn
+from topomerge.kernels.convolve import STRETCH
 from topomerge.types import Array
 
 RANDOM = np.random.default_rng(0)
@@ -51,14 +52,24 @@ def test_a_perceptron_is_rectified_between_its_layers_only(torch):
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-@pytest.mark.parametrize("rows", [16, numpy_nn.CONVOLVED_PIXELS])  # the larger one takes several rounds
-def test_a_convolution(torch, stride, rows):
-    x, weight, bias = normal(rows, 8, 3).astype(np.float32), normal(27, 4).astype(np.float32), normal(4).astype(np.float32)
-    kernel = torch.from_numpy(weight.reshape(3, 3, 3, 4).transpose(3, 2, 0, 1).copy())
-    image = torch.from_numpy(x.transpose(2, 0, 1)[None].copy())
-    wanted = torch.nn.functional.conv2d(image, kernel, torch.from_numpy(bias), stride, 1).relu()[0].permute(1, 2, 0)
+@pytest.mark.parametrize("shape", [(3, 16, 8), (5, 2, 2), (1, 2, 60), (2, 3 * STRETCH, 4), (4, 3, 10, 6), (0, 3, 4, 4)])
+@pytest.mark.parametrize("wide", [4, 7])  # the loop computes four channels at a time
+def test_a_convolution(torch, stride, shape, wide):
+    x, channels = normal(*shape).astype(np.float32), shape[-3]
+    weight, bias = normal(9 * channels, wide).astype(np.float32), normal(wide).astype(np.float32)
+    kernel = torch.from_numpy(weight.reshape(3, 3, channels, wide).transpose(3, 2, 0, 1).copy())
+    wanted = torch.nn.functional.conv2d(torch.from_numpy(x), kernel, torch.from_numpy(bias), stride, 1).relu()
     out = numpy_nn.convolution(x, weight, bias, stride)
     assert out.dtype == np.float32 and out.shape == wanted.shape and np.allclose(out, wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_convolution_of_an_image_in_any_memory_order(stride):
+    x, weight, bias = normal(6, 8, 3).astype(np.float32), normal(27, 4).astype(np.float32), normal(4).astype(np.float32)
+    turned = np.rot90(np.moveaxis(x, -1, 0), 1, (1, 2))
+    assert np.array_equal(
+        numpy_nn.convolution(turned, weight, bias, stride), numpy_nn.convolution(turned.copy(), weight, bias, stride)
+    )
 
 
 def test_segments(torch):

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from topomerge.kernels.convolve import rectified
 from topomerge.types import Array
 
 LEAKY_SLOPE = 0.2  # of the leaky rectifier below 0 (Velickovic et al. 2018)
 LAYER_NORM_EPSILON = 1e-5  # added to the variance, as torch does
-CONVOLVED_PIXELS = 1 << 11  # at a time: their windows, nine times as large, stay in the processor's cache
 
 
 def linear(x: Array, weight: Array, bias: Array | None = None) -> Array:
@@ -59,7 +59,7 @@ def perceptron(x: Array, layers: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def convolution(x: Array, weight: Array, bias: Array, stride: int = 1) -> Array:
-    """An image (nx, ny, c) float32 -> (nx / stride, ny / stride, k) float32, or several (n, nx, ny, c) at once: 3 x 3, rectified,
+    """An image (c, nx, ny) float32 -> (k, nx / stride, ny / stride) float32, or several (n, c, nx, ny) at once: 3 x 3, rectified,
     with zeros around.
 
     Args:
@@ -68,19 +68,8 @@ def convolution(x: Array, weight: Array, bias: Array, stride: int = 1) -> Array:
         stride: divides both sides.
     """
     images = x[None] if x.ndim == 3 else x
-    n, nx, ny = len(images), images.shape[1] // stride, images.shape[2] // stride
-    images = np.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
-    out = np.empty((n, nx, ny, weight.shape[1]), np.float32)
-    rows = min(max(CONVOLVED_PIXELS // max(ny, 1), 1), max(nx, 1))
-    step = max(CONVOLVED_PIXELS // max(rows * ny, 1), 1)
-    for i in range(0, n, step):
-        for row in range(0, nx, rows):
-            some = images[i : i + step, stride * row : stride * (row + rows) + 2]
-            count = min(rows, nx - row)
-            taps = [some[:, u : u + stride * count : stride, v : v + stride * ny : stride] for u in range(3) for v in range(3)]
-            columns = np.concatenate(taps, axis=-1).reshape(-1, weight.shape[0])
-            out[i : i + step, row : row + count] = (columns @ weight + bias).reshape(len(some), count, ny, -1)
-    np.maximum(out, 0.0, out=out)
+    kernel = weight.reshape(3, 3, images.shape[1], -1).transpose(3, 2, 0, 1)
+    out = rectified(images, kernel, bias, stride)
     return out[0] if x.ndim == 3 else out
 
 

@@ -84,17 +84,17 @@ class Forward:
 
     def _crops(self, name: str, crops: Array) -> Array:
         """`models.surroundings.SurroundingsEncoder`, in float32: the norms are part of the convolutions."""
-        x = crops.astype(np.float32) / FULL_VALUE
+        x = np.moveaxis(crops, -1, 1).astype(np.float32) / FULL_VALUE
         for k, wide in enumerate(CROP_CHANNELS):
             norm = f"{name}.norms.{k}"
             weight, bias, mean, variance = (
                 self._get(f"{norm}.{which}", (wide,)) for which in ("weight", "bias", "running_mean", "running_var")
             )
             factor = weight / np.sqrt(np.maximum(variance, 0) + NORM_EPSILON)
-            kernel = self._get(f"{name}.convolutions.{k}.weight", (wide, x.shape[-1], 3, 3)) * factor[:, None, None, None]
+            kernel = self._get(f"{name}.convolutions.{k}.weight", (wide, x.shape[1], 3, 3)) * factor[:, None, None, None]
             rows = kernel.transpose(2, 3, 1, 0).reshape(-1, wide).astype(np.float32)
             x = nn.convolution(x, rows, (bias - factor * mean).astype(np.float32), stride=2)
-        flat = x.transpose(0, 3, 1, 2).reshape(len(x), -1).astype(np.float64)
+        flat = x.reshape(len(x), -1).astype(np.float64)
         return self._linear(f"{name}.out", flat)
 
     def _edges(self, graph: Mapping[str, Array]) -> Array | None:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+from topomerge.blas import one_blas_thread
 from topomerge.extraction.distinct_doors import distinct_doors
 from topomerge.extraction.elevations.doorways import place_classes
 from topomerge.extraction.elevations.elevation import wall_elevations
@@ -29,6 +30,7 @@ from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid, with_ou
 COARSE_CELL = 0.15  # m: in larger ones, the walls beside a door leave too little of it
 
 
+@one_blas_thread
 def extract(
     source: PointCloud | VoxelGrid | Array | Iterable[PointCloud],
     *,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.blas import one_blas_thread
 from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
@@ -34,6 +35,7 @@ from topomerge.matching.result import Matching
 from topomerge.types import Sim3, TopometricMap
 
 
+@one_blas_thread
 def merge(
     maps: Sequence[TopometricMap | str | Path],
     *,

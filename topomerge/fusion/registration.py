@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from topomerge.blas import one_blas_thread
 from topomerge.errors import InputError
 from topomerge.fusion.bend.bend import Bend
 from topomerge.fusion.candidates import Candidate, candidates
@@ -59,6 +60,7 @@ class Registration:
     posterior: dict[str, float] = field(default_factory=dict)
 
 
+@one_blas_thread
 def register(
     a: Map | Prepared,
     b: Map | Prepared,

@@ -25,21 +25,22 @@ ALONG_LAYERS = ("along1", "along2", "along3")
 
 
 def place_probabilities(strip: Array, network: dict[str, Array] | None = None) -> Array:
-    """(n / 2, 4) float32 probability of each of `WALL_CLASSES` along a strip (n, 32, 14), by the weights that ship or others."""
+    """(n / 2, 4) float32 probability of each of `WALL_CLASSES` along a strip (n, 32, 14), or of several of one length at once
+    (k, n, 32, 14); by the weights that ship or others."""
     w = weights() if network is None else network
-    x = convolution(strip.astype(np.float32), w["a.w"], w["a.b"], PLACES)
-    x = convolution(x, w["b.w"], w["b.b"])
-    x = relu(linear(x.reshape(len(x), -1), w["depths.w"], w["depths.b"]))
+    x = convolution(np.moveaxis(strip, -1, -3).astype(np.float32), w["a.w"], w["a.b"], PLACES)
+    x = np.moveaxis(convolution(x, w["b.w"], w["b.b"]), -3, -1)
+    x = relu(linear(x.reshape(*x.shape[:-2], -1), w["depths.w"], w["depths.b"]))
     for name, dilation in zip(ALONG_LAYERS, DILATIONS, strict=True):
         x = relu(linear(_neighbours(x, dilation), w[f"{name}.w"], w[f"{name}.b"]))
     return softmax(linear(x, w["out.w"], w["out.b"]))
 
 
 def _neighbours(x: Array, dilation: int) -> Array:
-    """(n, 5 c) of each row (n, c) those around it, `dilation` apart; zeros past the ends."""
-    reach = TAPS // 2 * dilation
-    padded = np.pad(x, ((reach, reach), (0, 0)))
-    return np.concatenate([padded[k * dilation : k * dilation + len(x)] for k in range(TAPS)], axis=1)
+    """(..., n, 5 c) of each row (..., n, c) those around it, `dilation` apart; zeros past the ends."""
+    reach, count = TAPS // 2 * dilation, x.shape[-2]
+    padded = np.pad(x, [(0, 0)] * (x.ndim - 2) + [(reach, reach), (0, 0)])
+    return np.concatenate([padded[..., k * dilation : k * dilation + count, :] for k in range(TAPS)], axis=-1)
 
 
 def weights() -> dict[str, Array]:

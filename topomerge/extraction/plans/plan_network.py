@@ -18,7 +18,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.classified_storey import COLUMN_CLASSES, INSIDE_CLASS
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.io.weight_files import read_layers, weights_file
-from topomerge.numpy_nn import convolution, linear, softmax
+from topomerge.numpy_nn import convolution, softmax
 from topomerge.types import Array
 
 PLAN_NETWORK_FILE = "plan_network.npz"
@@ -53,11 +53,11 @@ def column_probabilities(plan: StoreyPlan, network: dict[str, Array] | None = No
     The mean over the plan turned by quarters: what the network says of a door hangs on how its walls lie on the columns, and
     where they do by chance, four looks err less than one (docs/adr/0005).
     """
-    x, margin = evidence(plan), COARSEST_STRIDE
-    nx, ny = x.shape[:2]
-    x = np.pad(x, ((margin, -nx % margin + margin), (margin, -ny % margin + margin), (0, 0)))
+    x, margin = np.moveaxis(evidence(plan), -1, 0), COARSEST_STRIDE
+    nx, ny = plan.wall.shape
+    x = np.pad(x, ((0, 0), (margin, -nx % margin + margin), (margin, -ny % margin + margin)))
     w = weights() if network is None else network
-    turned = (softmax(forward(np.ascontiguousarray(np.rot90(x, k)), w)) for k in range(4))
+    turned = (softmax(np.moveaxis(forward(np.rot90(x, k, (1, 2)), w), 0, -1)) for k in range(4))
     mean: Array = np.mean([np.rot90(probability, -k) for k, probability in enumerate(turned)], axis=0)
     return np.ascontiguousarray(mean[margin : margin + nx, margin : margin + ny])
 
@@ -77,7 +77,7 @@ def without_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:
 
 
 def forward(x: Array, w: dict[str, Array]) -> Array:
-    """(nx, ny, 5) float32 scores from (nx, ny, 11) evidence; both sides are multiples of 16."""
+    """(5, nx, ny) float32 scores from (11, nx, ny) evidence; both sides are multiples of 16."""
     skips = [x]
     for name in DOWN_LEVELS:
         x = convolution(x, w[f"{name}1.w"], w[f"{name}1.b"], 2)
@@ -85,9 +85,18 @@ def forward(x: Array, w: dict[str, Array]) -> Array:
         skips.append(x)
     x = skips.pop()
     for name in UP_LEVELS:
-        x = np.concatenate([x.repeat(2, axis=0).repeat(2, axis=1), skips.pop()], axis=-1)
-        x = convolution(x, w[f"{name}1.w"], w[f"{name}1.b"])
-    return linear(x, w["out.w"], w["out.b"])
+        x = convolution(_beside(x, skips.pop()), w[f"{name}1.w"], w[f"{name}1.b"])
+    scores: Array = np.tensordot(w["out.w"], x, (0, 0)) + w["out.b"][:, None, None]
+    return scores
+
+
+def _beside(coarse: Array, fine: Array) -> Array:
+    """(c + d, nx, ny) of coarse (c, nx / 2, ny / 2), each element four times, and fine (d, nx, ny)."""
+    channels, nx, ny = coarse.shape
+    out = np.empty((channels + len(fine), *fine.shape[1:]), np.float32)
+    out[:channels].reshape(channels, nx, 2, ny, 2)[:] = coarse[:, :, None, :, None]
+    out[channels:] = fine
+    return out
 
 
 def weights() -> dict[str, Array]:

@@ -103,10 +103,10 @@ def place_log_odds(crops: Crops, network: Mapping[str, Array] | None = None) -> 
 def network_log_odds(seen: Array, w: Mapping[str, Array]) -> Array:
     """(k,) log odds of planes (k, side, side, PLANES)."""
     out = np.zeros(len(seen))
-    for i, x in enumerate(seen.astype(np.float32)):
+    for i, x in enumerate(np.moveaxis(seen, -1, 1).astype(np.float32)):
         for name, stride in CONVOLUTIONS.items():
             x = convolution(x, w[f"{name}.w"], w[f"{name}.b"], stride)
-        pooled = np.concatenate([x.mean(axis=(0, 1)), x.max(axis=(0, 1))])
+        pooled = np.concatenate([x.mean(axis=(1, 2)), x.max(axis=(1, 2))])
         out[i] = linear(relu(linear(pooled, w["f.w"], w["f.b"])), w["out.w"], w["out.b"])[0]
     return out
 
