@@ -6,7 +6,8 @@
 ``thinned`` the same pairs with these; the real pairs of TOPOMERGE_DATA; the maps that `evaluate.py data=heldout` kept, with
 the learned embedder's merge among the methods; or any manifest of pairs of the same format, e.g. of look-alikes. Resumable:
 a line of JSON a pair with all methods in ``cache/merge/peers_*.jsonl``. After a change of ours, ``python -m
-benchmarks.merging.peers again [test|real|MANIFEST]`` measures ours alone on the pairs that are there.
+benchmarks.merging.peers again [test|real|MANIFEST]`` measures ours alone on the pairs that are there; ``python -m
+benchmarks.merging.peers whole [9]`` only the whole way of so many of the first test pairs, beside the pose of KISS-Matcher.
 
 All on one core, in seconds of processor from points in memory to the pose; ours also from them to the joined map with its rooms
 (``extract`` of both, ``merge``). Peers run in processes of their own; what takes longer than a minute of processor, or dies, is
@@ -23,6 +24,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -190,6 +192,23 @@ def run(seconds: float, what: str = "test") -> None:
             return
 
 
+def whole_ways(pairs: str = "9") -> None:
+    """Of the first test pairs, which share most: seconds from two clouds to the joined map, over those that KISS-Matcher (0.2 m)
+    takes to the refined pose. The first pair is run twice, as compiled code is loaded."""
+    check_peers()
+    os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})
+    os.environ["OMP_NUM_THREADS"] = "1"
+    ratios: list[float] = []
+    for given in islice(peer_pairs("test", set()), int(pairs)):
+        if not ratios:
+            whole(given.pair)
+        seconds = whole(given.pair)
+        answer = peers(given, PEER_CALLS[:1])[0][PEER_CALLS[0][1][0]]
+        ratios.append((seconds["extract"] + seconds["merge"]) / (answer["seconds"] + answer.get("refinement_seconds", 0.0)))
+        print(given.pair.name, {k: round(v, 1) for k, v in seconds.items()}, f"{ratios[-1]:.2f}", flush=True)
+    print(f"{len(ratios)} pairs: median {np.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}")
+
+
 def again(what: str = "test") -> None:
     """Ours alone, measured anew on the pairs that a file has lines of; what the peers answered stays."""
     target = target_of(what)
@@ -205,5 +224,7 @@ def again(what: str = "test") -> None:
 if __name__ == "__main__":
     if sys.argv[1] == "again":
         again(*sys.argv[2:])
+    elif sys.argv[1] == "whole":
+        whole_ways(*sys.argv[2:])
     else:
         run(float(sys.argv[1]), *sys.argv[2:])

@@ -9,7 +9,7 @@ from tests.extraction.elevations.doors import SHUT_DOOR, extracted, niche, three
 from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.doorways import OPEN, SHUT, doorways, read_both_ways
+from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE, OPEN, SHUT, doorways, joined_openings, read_both_ways
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
 from topomerge.extraction.elevations.wall_network import read_network
@@ -41,6 +41,41 @@ def test_a_stretch_is_a_doorway_in_its_middle_and_as_wide():
     assert door["centre"][0] == pytest.approx(2.45) and 0 < door["centre"][1] < 0.15 and door["centre"][2] == 0
     assert door["width"] == pytest.approx(0.9 * 0.95) and door["open"] == pytest.approx(0.9 / 0.95)
     assert door["rooms"].tolist() == [0, -1] and door["faces"] == 1 and door["probability"] == pytest.approx(0.95)
+
+
+def way(rooms=(0, 1), at=0.0, width=1.1, out=(0.0, 1.0), probability=0.9, level=0.0, off=0.0):
+    return (rooms, (at * out[1] - off * out[0], -at * out[0] + off * out[1], level), out, width, probability, 0.8, 0.9, 1)
+
+
+@pytest.mark.parametrize("out", [(0.0, 1.0), (0.6, 0.8)])
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_two_doorways_that_meet_are_one_wide_opening(out, order):
+    halves = [way(at=-0.6, out=out, width=1.2), way((1, 0), at=0.55, out=tuple(-v for v in out), width=1.1, probability=0.95)]
+    halves[1] = (halves[1][0], way(at=0.55, out=out)[1], *halves[1][2:])
+    rows = np.array([halves[k] for k in order], DOORWAY_DTYPE)
+    (opening,), (shown,) = joined_openings(rows)
+    middle = (-1.2 + 1.1) / 2
+    assert opening["width"] == pytest.approx(2.3) and shown == 1.1 and opening["probability"] == 0.95
+    assert opening["centre"][:2] == pytest.approx([middle * out[1], -middle * out[0]])
+
+
+@pytest.mark.parametrize(
+    "other",
+    [way(at=1.7), way((0, 2), at=1.0), way(at=1.0, out=(1.0, 0.0)), way(at=1.0, level=3.0), way(at=1.0, off=0.9)],
+    ids=["far", "other room", "other wall", "other storey", "beside"],
+)
+def test_other_doorways_stay_what_they_are(other):
+    rows = np.array([way(), other], DOORWAY_DTYPE)
+    ways, shown = joined_openings(rows)
+    assert np.array_equal(ways, rows) and shown.tolist() == [1.1, 1.1]
+
+
+def test_three_parts_in_a_row_are_one_and_none_are_none():
+    rows = np.array([way(at=k) for k in (2.4, 0.0, 1.2)], DOORWAY_DTYPE)
+    (opening,), _ = joined_openings(rows)
+    assert opening["width"] == pytest.approx(3.5) and opening["centre"][0] == pytest.approx(1.2)
+    ways, shown = joined_openings(rows[:0])
+    assert not len(ways) and ways.dtype == DOORWAY_DTYPE and not len(shown)
 
 
 def test_what_is_narrow_or_unlikely_is_none():

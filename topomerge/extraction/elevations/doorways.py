@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.sparse.csgraph import connected_components
 
 from topomerge.extraction.elevations.elevation import ALONG, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities
@@ -20,6 +21,7 @@ HALF_WALL = 0.06  # m from the face of a wall to its middle, where one face was 
 SAME_DOORWAY = 0.45  # m between what two faces show of one doorway
 STOOD = 0.12  # m from the middle of a cell of a floor: a place this near is on it
 DOORWAY_LEVEL = 0.5  # m between their floors
+STRAIGHT = 0.95  # cosine between two parts of one opening
 OPEN, SHUT = WALL_CLASSES.index("open"), WALL_CLASSES.index("shut")
 DOORWAY_DTYPE = np.dtype(
     [
@@ -74,6 +76,37 @@ def doorways(walls: Elevations, doors: Array) -> Array:
         each = doors[low // PLACES : high // PLACES]
         rows += [_doorway(face, each, start, stop) for start, stop in _runs(each.sum(axis=1))]
     return _joined(np.array(rows, DOORWAY_DTYPE))
+
+
+def joined_openings(ways: Array) -> tuple[Array, Array]:
+    """Doorways (D,) DOORWAY_DTYPE without those that are parts of one wide opening, and the width (D,) m of the surest part.
+
+    Of an opening wider than doors are, a wall shows where it begins and where it ends: two doorways of the same two rooms that
+    meet end to end.
+    """
+    rooms = np.sort(ways["rooms"], axis=1)
+    along = np.column_stack([-ways["out"][:, 1], ways["out"][:, 0]])
+    apart = ways["centre"][None] - ways["centre"][:, None]
+    gap = np.abs((apart[..., :2] * along[:, None]).sum(axis=2)) - (ways["width"][:, None] + ways["width"]) / 2
+    off = np.abs((apart[..., :2] * ways["out"][:, None]).sum(axis=2))
+    meet = (gap < SAME_DOORWAY) & (off < SAME_DOORWAY) & (np.abs(along @ along.T) > STRAIGHT)
+    meet &= (rooms[:, None] == rooms).all(axis=2) & (np.abs(apart[..., 2]) < DOORWAY_LEVEL)
+    count, part = connected_components(meet, directed=False)
+    whole = [ways[part == k] for k in range(count)]
+    out = np.array([tuple(_whole(parts)) for parts in whole], DOORWAY_DTYPE)
+    return out, np.array([parts["width"][parts["probability"].argmax()] for parts in whole], float)
+
+
+def _whole(parts: Array) -> Array:
+    """The opening from the first end of its parts to the last one."""
+    out = parts[parts["probability"].argmax()].copy()
+    along = np.array([-out["out"][1], out["out"][0]])
+    at = (parts["centre"] - out["centre"])[:, :2] @ along
+    first, last = (at - parts["width"] / 2).min(), (at + parts["width"] / 2).max()
+    if len(parts) > 1:
+        out["centre"][:2] += along * (first + last) / 2
+        out["width"] = last - first
+    return out
 
 
 def _runs(chance: Array) -> Iterator[tuple[int, int]]:

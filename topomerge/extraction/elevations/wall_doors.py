@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
-from topomerge.extraction.elevations.doorways import STOOD, door_places, doorways
+from topomerge.extraction.elevations.doorways import STOOD, door_places, doorways, joined_openings
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.io.weight_files import read_weights_json
@@ -112,7 +112,7 @@ def door_candidates(
     if walls is None or classes is None:
         return _flat_candidates(map, storeys, level)
     doors = door_places(walls, classes)
-    ways = _with_other_room(map, doorways(walls, doors))
+    ways, shown = joined_openings(_with_other_room(map, doorways(walls, doors)))
     partner = _partners(level, ways)
     edges, features, source = [], [], []
     for edge, i in zip(level, partner, strict=True):
@@ -121,7 +121,7 @@ def door_candidates(
             way = ways[i]
             apart = float(np.hypot(*(way["centre"] - edge["centre"])[:2]))
             edges.append(_moved(edge, way))
-            features.append([*_seen(way), float(edge["confidence"]), 0, 1, *_size(way["width"], complete, apart)])
+            features.append([*_seen(way), float(edge["confidence"]), 0, 1, *_size(shown[i], complete, apart)])
         else:
             near, covered = _near(walls, doors, edge)
             edges.append(edge)
@@ -132,7 +132,7 @@ def door_candidates(
         if way["rooms"][1] >= 0:
             complete = float(map.rooms["completeness"][way["rooms"]].min())
             edges.append(_edge(way))
-            features.append([*_seen(way), 0, 0, 1, *_size(way["width"], complete, 0)])
+            features.append([*_seen(way), 0, 0, 1, *_size(shown[i], complete, 0)])
             source.append(SOURCES.index("wall"))
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
     seen = walls.strips[..., :BANDS] > 0
