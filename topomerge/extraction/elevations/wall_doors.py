@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
-from topomerge.extraction.elevations.doorways import STOOD, door_places, doorways, joined_openings
+from topomerge.extraction.elevations.doorways import STOOD, STRAIGHT, door_places, doorways, joined_openings
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.io.weight_files import read_weights_json
@@ -42,6 +42,7 @@ SOURCES = ("both", "plan", "wall", "flat")  # what shows a door, flat: the plan 
 WALL_DOOR_REACH = 1.0  # m between a door of the plan and the same one on the wall
 BEYOND = (0.1, 1.0)  # m from a wall: there the other room begins
 NEAR = 0.3  # m around a door of the plan
+PART_OFF = 0.5  # m between the middle of an opening of the plan and the wall that shows a part of it
 SUREST = 0.0005  # probability: what walls show is not taken for surer
 LEAST_FILL = 0.01  # share of the elements
 
@@ -113,14 +114,16 @@ def door_candidates(
         return _flat_candidates(map, storeys, level)
     doors = door_places(walls, classes)
     ways, shown = joined_openings(_with_other_room(map, doorways(walls, doors)))
-    partner = _partners(level, ways)
+    whole = _opening_of(level, ways)
+    partner = _partners(level, ways, whole)
     edges, features, source = [], [], []
     for edge, i in zip(level, partner, strict=True):
         complete = float(map.rooms["completeness"][edge["rooms"]].min())
         if i >= 0:
             way = ways[i]
-            apart = float(np.hypot(*(way["centre"] - edge["centre"])[:2]))
-            edges.append(_moved(edge, way))
+            part = whole[i] >= 0
+            apart = 0.0 if part else float(np.hypot(*(way["centre"] - edge["centre"])[:2]))
+            edges.append(edge if part else _moved(edge, way))
             features.append([*_seen(way), float(edge["confidence"]), 0, 1, *_size(shown[i], complete, apart)])
         else:
             near, covered = _near(walls, doors, edge)
@@ -129,7 +132,7 @@ def door_candidates(
         source.append(SOURCES.index("both" if i >= 0 else "plan"))
     for i in np.setdiff1d(np.arange(len(ways)), partner).tolist():
         way = ways[i]
-        if way["rooms"][1] >= 0:
+        if way["rooms"][1] >= 0 and whole[i] < 0:
             complete = float(map.rooms["completeness"][way["rooms"]].min())
             edges.append(_edge(way))
             features.append([*_seen(way), 0, 0, 1, *_size(shown[i], complete, 0)])
@@ -204,8 +207,25 @@ def _with_other_room(map: TopometricMap, ways: Array) -> Array:
     return ways
 
 
-def _partners(edges: Array, ways: Array) -> Array:
-    """(E,) the doorway that each door of the plan is, -1 none: the nearest first, each once."""
+def _opening_of(edges: Array, ways: Array) -> Array:
+    """(W,) the opening of the plan, wider than doors are, of which each doorway is a part, -1 none: walls show where it begins
+    and where it ends. A doorway on one side only may be a door in a wall that the plan lacks, of glass for example."""
+    out = np.full(len(ways), -1)
+    for k in np.flatnonzero(edges["width"] > DOOR_MOST_WIDTH).tolist():
+        edge = edges[k]
+        normal = np.array([np.cos(edge["direction"]), np.sin(edge["direction"])])
+        apart = ways["centre"] - edge["centre"]
+        along, off = apart[:, :2] @ (-normal[1], normal[0]), np.abs(apart[:, :2] @ normal)
+        inside = (np.abs(along) < edge["width"] / 2) & (off < PART_OFF) & (ways["width"] < edge["width"])
+        inside &= (np.abs(ways["out"] @ normal) > STRAIGHT) & (np.abs(apart[:, 2]) < WALL_DOOR_REACH)
+        inside &= np.isin(ways["rooms"], edge["rooms"]).any(axis=1)
+        if along[inside].min(initial=0) < 0 < along[inside].max(initial=0):
+            out[inside] = k
+    return out
+
+
+def _partners(edges: Array, ways: Array, whole: Array) -> Array:
+    """(E,) the doorway that each door of the plan is, -1 none: the nearest first, each once. A part of an opening is no other."""
     partner = np.full(len(edges), -1)
     if not len(edges) or not len(ways):
         return partner
@@ -214,7 +234,7 @@ def _partners(edges: Array, ways: Array) -> Array:
     first, second = ways["rooms"].T
     pair = edges["rooms"][:, None]
     fits = (pair == first[:, None]).any(axis=2) & ((second < 0) | (pair == second[:, None]).any(axis=2))
-    apart = np.where(fits & level, apart, np.inf)
+    apart = np.where(fits & level & ((whole < 0) | (whole == np.arange(len(edges))[:, None])), apart, np.inf)
     for i, j in np.column_stack(np.unravel_index(np.argsort(apart, axis=None, kind="stable"), apart.shape)).tolist():
         reach = max(WALL_DOOR_REACH, float(edges["width"][i]) / 2 + NEAR)
         if apart[i, j] < reach and partner[i] < 0 and j not in partner:
