@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.scenes import DOOR, Scene, rectangle
+from tests.scenes import DOOR, HEIGHT, THICK, Scene, rectangle
 from topomerge.extraction.extract import extract
 from topomerge.types import Sim3, TopometricMap
 
@@ -28,6 +28,15 @@ def niche(scene: Scene) -> Scene:
     """A cupboard against the wall between the rooms, and a board on it."""
     scene.box(3.4, 0.2, 0.0, 3.9, 1.1, 1.9)
     scene.parts.append(rectangle((4.09, 2.6, 1.0), (0, 0.8, 0), (0, 0, 0.9)))
+    return scene
+
+
+def wide_opening(width: float) -> Scene:
+    """Two rooms of 7 m, one 5 m deep and one 2.5 m, with an opening as wide around (3.5, 5), 2.3 m high."""
+    first, last = 3.5 - width / 2, 3.5 + width / 2
+    scene = Scene().shell(0, 0, 7, 7.5).wall((0, 5), (first, 5)).wall((last, 5), (7, 5))
+    scene.parts += [rectangle((first, y, 2.3), (width, 0, 0), (0, 0, HEIGHT - 2.3)) for y in (5 - THICK / 2, 5 + THICK / 2)]
+    scene.parts += [rectangle((x, 5 - THICK / 2, 0), (0, THICK, 0), (0, 0, 2.3)) for x in (first, last)]
     return scene
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.extraction.elevations.doors import SHUT_DOOR, extracted, niche, three_doors
+from tests.extraction.elevations.doors import SHUT_DOOR, extracted, niche, three_doors, wide_opening
 from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
 from topomerge.errors import InputError
@@ -76,6 +76,15 @@ def test_three_parts_in_a_row_are_one_and_none_are_none():
     assert opening["width"] == pytest.approx(3.5) and opening["centre"][0] == pytest.approx(1.2)
     ways, shown = joined_openings(rows[:0])
     assert not len(ways) and ways.dtype == DOORWAY_DTYPE and not len(shown)
+
+
+@pytest.mark.parametrize(("width", "turn"), [(2.0, 0.0), (2.4, 1.0), (3.0, 0.3)])
+def test_an_opening_wider_than_doors_is_one(width, turn):
+    map = extracted(wide_opening(width).points(), turn)
+    (edge,) = map.edges
+    assert len(map.rooms) == 2 and edge["kind"] == "opening" and edge["confidence"] > 0.8
+    assert Sim3(-turn).apply(edge["centre"][None])[0, :2] == pytest.approx([3.5, 5.0], abs=0.12)
+    assert edge["width"] == pytest.approx(width, abs=0.2)
 
 
 def test_what_is_narrow_or_unlikely_is_none():
