@@ -5,7 +5,7 @@ A wall between two rooms has a face on either side; what is seen on both is one 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
@@ -78,26 +78,19 @@ def doorways(walls: Elevations, doors: Array) -> Array:
     return _joined(np.array(rows, DOORWAY_DTYPE))
 
 
-def joined_openings(ways: Array, on_floor: Callable[[Array], Array]) -> tuple[Array, Array]:
+def joined_openings(ways: Array) -> tuple[Array, Array]:
     """Doorways (D,) DOORWAY_DTYPE without those that are parts of one wide opening, and the width (D,) m of the surest part.
 
     Of an opening wider than doors are, a wall shows where it begins and where it ends: two doorways of the same two rooms that
-    meet end to end, or between which the floor goes on in the line of the wall.
-
-    Args:
-        on_floor: (n, 3) places, m -> (n,) bool, is there floor?
+    meet end to end.
     """
     rooms = np.sort(ways["rooms"], axis=1)
     along = np.column_stack([-ways["out"][:, 1], ways["out"][:, 0]])
     apart = ways["centre"][None] - ways["centre"][:, None]
     gap = np.abs((apart[..., :2] * along[:, None]).sum(axis=2)) - (ways["width"][:, None] + ways["width"]) / 2
     off = np.abs((apart[..., :2] * ways["out"][:, None]).sum(axis=2))
-    meet = (off < SAME_DOORWAY) & (np.abs(along @ along.T) > STRAIGHT)
+    meet = (gap < SAME_DOORWAY) & (off < SAME_DOORWAY) & (np.abs(along @ along.T) > STRAIGHT)
     meet &= (rooms[:, None] == rooms).all(axis=2) & (np.abs(apart[..., 2]) < DOORWAY_LEVEL)
-    for i, j in np.argwhere(np.triu(meet & (gap >= SAME_DOORWAY), 1)).tolist():
-        steps = int(np.ceil(float(np.linalg.norm(apart[i, j])) / STOOD))
-        places = ways["centre"][i] + np.linspace(0, 1, steps + 1)[:, None] * apart[i, j]
-        meet[i, j] = meet[j, i] = bool(on_floor(places).all())
     count, part = connected_components(meet, directed=False)
     whole = [ways[part == k] for k in range(count)]
     out = np.array([tuple(_whole(parts)) for parts in whole], DOORWAY_DTYPE)

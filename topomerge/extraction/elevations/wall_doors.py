@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
-from topomerge.extraction.distinct_doors import rooms_at
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
 from topomerge.extraction.elevations.doorways import STOOD, STRAIGHT, door_places, doorways, joined_openings
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
@@ -114,7 +113,7 @@ def door_candidates(
     if walls is None or classes is None:
         return _flat_candidates(map, storeys, level)
     doors = door_places(walls, classes)
-    ways, shown = joined_openings(_with_other_room(map, doorways(walls, doors)), lambda places: rooms_at(map, places) >= 0)
+    ways, shown = joined_openings(_with_other_room(map, doorways(walls, doors)))
     whole = _opening_of(level, ways)
     partner = _partners(level, ways, whole)
     edges, features, source = [], [], []
