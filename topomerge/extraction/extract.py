@@ -21,6 +21,7 @@ from topomerge.extraction.plans.plan_rooms import rooms_of_plans
 from topomerge.extraction.room_odds import with_room_odds
 from topomerge.extraction.scan import Scan, read_scan
 from topomerge.extraction.slices import is_slice, with_raised_slice
+from topomerge.extraction.small_rooms import without_small_rooms
 from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.views.view_rooms import rooms_of_views
@@ -110,7 +111,11 @@ def rooms_and_passages(
         floor = rooms_of_plans(scan.grid, navigable, door, p.narrow, p.standing_height, parts)
 
     watch.begin("topology", 0.85)
-    return scan, navigable, floor, topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+    map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+    if flat and p.walls and floor.classified_storeys and not parts:  # rooms of joined maps are what their parts say
+        floor = without_small_rooms(floor, map)
+        map = topometric_map(scan.grid, floor, p.standing_height)
+    return scan, navigable, floor, map
 
 
 def _with_odds_and_openings(map: TopometricMap, scan: Scan, floor: Floor, p: Parameters) -> tuple[TopometricMap, list[str]]:

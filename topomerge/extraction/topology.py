@@ -23,10 +23,9 @@ def topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> Topomet
         floor: of all storeys, cut into rooms.
         body_height: m, whatever is lower than this above the floor is no ceiling.
     """
-    lowest = floor.room[lowest_of_column(floor.cells)]
-    used = np.bincount(lowest[lowest >= 0], minlength=int(max(floor.label.max(initial=-1), lowest.max(initial=-1))) + 1) > 0
-    old_number = np.flatnonzero(used)
-    number = np.append(np.where(used, np.cumsum(used) - 1, -1), -1).astype(np.int32)
+    old_number = rooms_with_floor(floor)
+    number = np.full(int(max(floor.label.max(initial=-1), floor.room.max(initial=-1))) + 2, -1, np.int32)
+    number[old_number] = np.arange(len(old_number))
     room, label = number[floor.label], number[floor.room]
     above = floor_to_ceiling(grid, floor.cells, body_height)
     rooms = _measured_rooms(grid, room, floor, label, above, old_number)
@@ -39,6 +38,12 @@ def topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> Topomet
     areas, area = _areas(floor, label, area)
     narrows = find_edges(floor, area, rooms["storey"][areas["room"]], above, areas["room"])
     return TopometricMap(grid, room, floor.cells, label, rooms, edges, floor.storeys, areas, area, narrows)
+
+
+def rooms_with_floor(floor: Floor) -> Array:
+    """(R,) numbers of those rooms of a floor that are rooms of its map, in its order."""
+    lowest = floor.room[lowest_of_column(floor.cells)]
+    return np.unique(lowest[lowest >= 0])
 
 
 def _leads_through_wall(floor: Floor, edges: Array) -> Array:

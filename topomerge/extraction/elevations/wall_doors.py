@@ -143,6 +143,11 @@ def door_candidates(
     return _candidates(table, features, fill, storeys, np.array(source, np.int8))
 
 
+def flat_door_chance(map: TopometricMap, storeys: Sequence[ClassifiedStorey], edges: Array) -> Array:
+    """(E,) probability that each passage (E,) EDGE_DTYPE of a map without walls is a door."""
+    return door_chance(_flat_candidates(map, storeys, edges))
+
+
 def _only_ways(candidates: DoorCandidates, chance: Array, rooms: int) -> Array:
     """(n,) bool: passages of a map without walls by which alone one walks from some rooms to others, the likeliest: what parts a
     room wrongly must not part the graph."""
