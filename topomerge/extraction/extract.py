@@ -112,7 +112,7 @@ def rooms_and_passages(
 
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
-    if flat and p.walls and floor.classified_storeys and not parts:  # rooms of joined maps are what their parts say
+    if flat and not isinstance(p, ThesisParameters) and p.walls and not parts:  # rooms of joined maps are what their parts say
         floor = without_small_rooms(floor, map)
         map = topometric_map(scan.grid, floor, p.standing_height)
     return scan, navigable, floor, map
