@@ -12,7 +12,7 @@ from topomerge.models.plan_unet import PlanUNet, exported_weights
 from benchmarks.speed.bench import best, line
 from topomerge.extraction.plans.plan_network import EVIDENCE_CHANNELS, forward
 
-WIDTHS = (16, 32, 40, 40, 40, 32, 16, 12)  # of configs/task/plan_segmentation.yaml
+NETWORK_WIDTHS = (16, 32, 40, 40, 40, 32, 16, 12)  # of configs/task/plan_segmentation.yaml
 AGREE = 1e-4  # of scores
 
 
@@ -26,7 +26,7 @@ def main(sides: tuple[int, ...] = (256, 512, 1024)) -> None:
 
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    network = PlanUNet(WIDTHS).eval()
+    network = PlanUNet(NETWORK_WIDTHS).eval()
     weights = exported_weights(network)
     for side in sides:
         x = np.random.default_rng(0).random((EVIDENCE_CHANNELS, side, side)).astype(np.float32)
