@@ -166,6 +166,11 @@ def check_peers() -> None:
         raise InputError(f"{', '.join(missing)}: not installed, so nothing can be compared; pip install {' '.join(missing)}")
 
 
+def _one_core() -> None:
+    os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})  # KISS-Matcher takes all cores otherwise
+    os.environ["OMP_NUM_THREADS"] = "1"  # in the processes of the peers: two threads on one core wait for each other
+
+
 def run(seconds: float, what: str = "test") -> None:
     """Measure what is missing, until the seconds of processor, simulation included, are used up.
 
@@ -173,8 +178,7 @@ def run(seconds: float, what: str = "test") -> None:
         InputError: a peer is not installed.
     """
     check_peers()
-    os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})  # KISS-Matcher takes all cores otherwise
-    os.environ["OMP_NUM_THREADS"] = "1"  # in the processes of the peers: two threads on one core wait for each other
+    _one_core()
     target = target_of(what)
     target.parent.mkdir(parents=True, exist_ok=True)
     done, of_peers = done_of(target), 0.0
@@ -196,8 +200,7 @@ def whole_ways(pairs: str = "9") -> None:
     """Of the first test pairs, which share most: seconds from two clouds to the joined map, over those that KISS-Matcher (0.2 m)
     takes to the refined pose. The first pair is run twice, as compiled code is loaded."""
     check_peers()
-    os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})
-    os.environ["OMP_NUM_THREADS"] = "1"
+    _one_core()
     ratios: list[float] = []
     for given in islice(peer_pairs("test", set()), int(pairs)):
         if not ratios:

@@ -7,6 +7,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from topomerge.blas import one_blas_thread
 from topomerge.kernels.voronoi import voronoi_weights
 from topomerge.types import Array, VoxelGrid
 
@@ -52,6 +53,7 @@ def _stiffness(first: Array, second: Array, weight: Array | None, count: int) ->
     return sparse.diags(np.asarray(both.sum(axis=1)).ravel()) - both
 
 
+@one_blas_thread
 def smallest_eigenvalues(laplacian: Laplacian, number: int) -> Array:
     """Up to `number` smallest eigenvalues above 0, ascending, of the largest connected part. Needs memory for n times `number`.
 
@@ -59,7 +61,6 @@ def smallest_eigenvalues(laplacian: Laplacian, number: int) -> Array:
     other's way here.
     """
     from scipy.sparse.linalg import eigsh
-    from threadpoolctl import threadpool_limits
 
     stiffness, mass = laplacian
     _, part = connected_components(stiffness, directed=False)
@@ -68,11 +69,10 @@ def smallest_eigenvalues(laplacian: Laplacian, number: int) -> Array:
     root = 1 / np.sqrt(mass)
     matrix = sparse.csc_matrix(sparse.diags(root) @ stiffness @ sparse.diags(root))
     wanted = min(number + 1, len(part_rows))
-    with threadpool_limits(1):
-        if len(part_rows) <= max(DENSE_UNKNOWNS, 2 * wanted + 1):
-            values = np.linalg.eigvalsh(matrix.toarray())[:wanted]
-        else:
-            usual = float(matrix.diagonal().mean()) / len(part_rows)  # of the order of the first eigenvalues
-            start = np.random.default_rng(0).standard_normal(len(part_rows))
-            values = np.sort(eigsh(matrix, wanted, sigma=-usual, v0=start, return_eigenvectors=False, tol=1e-10))
+    if len(part_rows) <= max(DENSE_UNKNOWNS, 2 * wanted + 1):
+        values = np.linalg.eigvalsh(matrix.toarray())[:wanted]
+    else:
+        usual = float(matrix.diagonal().mean()) / len(part_rows)  # of the order of the first eigenvalues
+        start = np.random.default_rng(0).standard_normal(len(part_rows))
+        values = np.sort(eigsh(matrix, wanted, sigma=-usual, v0=start, return_eigenvectors=False, tol=1e-10))
     return np.maximum(values[1:], 0.0)

@@ -113,8 +113,9 @@ def rooms_and_passages(
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
     if flat and not isinstance(p, ThesisParameters) and p.walls and not parts:  # rooms of joined maps are what their parts say
-        floor = without_small_rooms(floor, map)
-        map = topometric_map(scan.grid, floor, p.standing_height)
+        gathered = without_small_rooms(floor, map)
+        if gathered is not floor:
+            floor, map = gathered, topometric_map(scan.grid, gathered, p.standing_height)
     return scan, navigable, floor, map
 
 

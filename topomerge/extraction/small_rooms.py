@@ -14,17 +14,18 @@ import numpy as np
 
 from topomerge.extraction.elevations.wall_doors import flat_door_chance
 from topomerge.extraction.floor import Floor
+from topomerge.extraction.plans.partition import Pair, pair_of
 from topomerge.extraction.topology import rooms_with_floor
 from topomerge.types import Array, TopometricMap
 
 SMALL_AREA = 6.0  # m2: larger rooms stay what they are
 NO_DOOR = 0.3  # probability of a door below which the likeliest passage of two rooms is none
 LIKELY_DOOR = 0.5  # two rooms that such a door parts stay two
-Pair = tuple[int, int]
 
 
 def without_small_rooms(floor: Floor, map: TopometricMap) -> Floor:
-    """The floor of a slice or a grid map, in which small rooms are parts of the neighbours that no door parts them from.
+    """The floor of a slice or a grid map, in which small rooms are parts of the neighbours that no door parts them from; itself
+    where there are none.
 
     Args:
         map: of the floor.
@@ -33,14 +34,14 @@ def without_small_rooms(floor: Floor, map: TopometricMap) -> Floor:
     number = rooms_with_floor(floor)
     chance: dict[Pair, float] = {}
     for edge, likely in zip(level, flat_door_chance(map, floor.classified_storeys, level).tolist(), strict=True):
-        pair = _pair(*number[edge["rooms"]].tolist())
+        pair = pair_of(*number[edge["rooms"]].tolist())
         chance[pair] = max(chance.get(pair, 0.0), likely)
     area = dict(zip(number.tolist(), map.rooms["area"].tolist(), strict=True))
     group = np.arange(int(number.max(initial=-1)) + 1)
     for likely, (a, b) in sorted((likely, pair) for pair, likely in chance.items()):
         if likely < NO_DOOR and min(area[a], area[b]) < SMALL_AREA and not _parted(chance, group, a, b):
             group[group == group[b]] = group[a]
-    return _gathered(floor, group)
+    return floor if (group == np.arange(len(group))).all() else _gathered(floor, group)
 
 
 def _parted(chance: Mapping[Pair, float], group: Array, a: int, b: int) -> bool:
@@ -51,16 +52,18 @@ def _parted(chance: Mapping[Pair, float], group: Array, a: int, b: int) -> bool:
 
 def _gathered(floor: Floor, group: Array) -> Floor:
     """The floor whose rooms are those of each group."""
-    count = int(max(floor.room.max(initial=-1), floor.label.max(initial=-1), floor.room_of_area.max(initial=-1))) + 1
+    named = [room for pair in floor.door_probability for room in pair]
+    largest = max(int(rooms.max(initial=-1)) for rooms in (floor.room, floor.label, floor.room_of_area, np.array(named, int)))
+    complete = floor.completeness
+    count = max(largest + 1, 0 if complete is None else len(complete))
     whole = np.arange(count)
     whole[: len(group)] = group
     number = np.append(whole, -1).astype(np.int32)
     doors: dict[Pair, float] = {}
     for (a, b), likely in floor.door_probability.items():
-        pair = _pair(int(whole[a]), int(whole[b]))
+        pair = pair_of(int(whole[a]), int(whole[b]))
         if pair[0] != pair[1]:
             doors[pair] = max(doors.get(pair, 0.0), likely)
-    complete = floor.completeness
     if complete is not None:
         size = np.bincount(floor.room[floor.room >= 0], minlength=len(complete)) + 1e-9
         of = whole[: len(complete)]
@@ -74,7 +77,3 @@ def _gathered(floor: Floor, group: Array) -> Floor:
         door_probability=doors,
         completeness=complete,
     )
-
-
-def _pair(a: int, b: int) -> Pair:
-    return (a, b) if a < b else (b, a)

@@ -126,7 +126,7 @@ class _GrowingRooms:
         self.area[room] += self.area[absorbed]
         self.neighbours[room].discard(absorbed)
         for other in self.neighbours[absorbed] - {room}:
-            old, new = _pair(absorbed, other), _pair(room, other)
+            old, new = pair_of(absorbed, other), pair_of(room, other)
             self.neighbours[other].discard(absorbed)
             self.neighbours[other].add(room)
             self.neighbours[room].add(other)
@@ -134,8 +134,9 @@ class _GrowingRooms:
             del self.door_probability[old]
             if new not in self.passages or passage.width > self.passages[new].width:
                 self.passages[new] = passage
-        self._score(sorted(_pair(room, other) for other in self.neighbours[room]))
+        self._score(sorted(pair_of(room, other) for other in self.neighbours[room]))
 
 
-def _pair(a: int, b: int) -> Pair:
+def pair_of(a: int, b: int) -> Pair:
+    """Two rooms, the smaller number first."""
     return (a, b) if a < b else (b, a)
