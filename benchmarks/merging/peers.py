@@ -7,7 +7,9 @@
 the learned embedder's merge among the methods; or any manifest of pairs of the same format, e.g. of look-alikes. Resumable:
 a line of JSON a pair with all methods in ``cache/merge/peers_*.jsonl``. After a change of ours, ``python -m
 benchmarks.merging.peers again [test|real|MANIFEST]`` measures ours alone on the pairs that are there; ``python -m
-benchmarks.merging.peers whole [9]`` only the whole way of so many of the first test pairs, beside the pose of KISS-Matcher.
+benchmarks.merging.peers whole [9]`` only the whole way of so many of the first test pairs, beside the pose of KISS-Matcher;
+``python -m benchmarks.merging.peers files FOLDER ...`` that of a.ply and b.ply in each folder (`topomerge simulate`), from the
+files to the report, by the command.
 
 All on one core, in seconds of processor from points in memory to the pose; ours also from them to the joined map with its rooms
 (``extract`` of both, ``merge``). Peers run in processes of their own; what takes longer than a minute of processor, or dies, is
@@ -19,6 +21,8 @@ from __future__ import annotations
 
 import json
 import os
+import resource
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -26,6 +30,7 @@ from functools import partial
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -212,6 +217,36 @@ def whole_ways(pairs: str = "9") -> None:
     print(f"{len(ratios)} pairs: median {np.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}")
 
 
+def whole_ways_of_files(*folders: str) -> None:
+    """Seconds of `topomerge merge` from two files to the report, start of Python included, over those that KISS-Matcher (0.2 m)
+    takes from points in memory to the refined pose. The first pair is merged twice, as compiled code is kept."""
+    from topomerge.io.points import read_points
+
+    check_peers()
+    _one_core()
+    ratios: list[float] = []
+    for folder in folders:
+        command = [sys.executable, "-m", "topomerge", "merge", f"{folder}/a.ply", f"{folder}/b.ply", "--force", "--quiet"]
+        for _ in range(1 if ratios else 2):
+            with TemporaryDirectory() as out:
+                begun = resource.getrusage(resource.RUSAGE_CHILDREN)
+                status = subprocess.run([*command, "-o", f"{out}/merged"], capture_output=True, check=False).returncode
+                ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds = ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime
+        a, b = (read_points(f"{folder}/{name}.ply").points.astype(float) for name in "ab")
+        answers, why, _ = PEER_CALLS[0][0](b, a)
+        answer = answers.get(PEER_CALLS[0][1][0])
+        peer = CALL_SECONDS if answer is None else answer.seconds + answer.refinement_seconds
+        ratios.append(seconds / peer)
+        count = (len(a) + len(b)) / 1e6
+        print(
+            folder,
+            f"{count:.1f} M points, status {status}, {seconds:.1f} s, peer {peer:.1f} s {why} {ratios[-1]:.2f}",
+            flush=True,
+        )
+    print(f"{len(ratios)} pairs: median {np.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}")
+
+
 def again(what: str = "test") -> None:
     """Ours alone, measured anew on the pairs that a file has lines of; what the peers answered stays."""
     target = target_of(what)
@@ -229,5 +264,7 @@ if __name__ == "__main__":
         again(*sys.argv[2:])
     elif sys.argv[1] == "whole":
         whole_ways(*sys.argv[2:])
+    elif sys.argv[1] == "files":
+        whole_ways_of_files(*sys.argv[2:])
     else:
         run(float(sys.argv[1]), *sys.argv[2:])
