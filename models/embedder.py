@@ -9,14 +9,14 @@ import torch
 from topomerge.models.layers import Standardise, mlp
 from topomerge.models.nodes import NodeEncoder
 from topomerge.models.pointnet import LocalPointNet, PointNet
-from topomerge.models.surroundings import SurroundingsEncoder
+from topomerge.models.surroundings import DoorsEncoder, SurroundingsEncoder
 from topomerge.models.voxelcnn import VoxelCNN
 from topomerge.models.yaw import Turned
 from torch import Tensor, nn
 
 from topomerge.embedding.network import GRAPH, TABLE_PARTS, Network, check, needed, pair_tensors, tensors
 from topomerge.embedding.schema import width
-from topomerge.embedding.surroundings import CROP_PART
+from topomerge.embedding.surroundings import CROP_SHAPES, DOOR_PART
 
 QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # cosine and sine of 0 to 3 quarter turns
 POINT_ENCODERS = {"pointnet": PointNet, "pointnet_local": LocalPointNet, "voxelcnn": VoxelCNN}
@@ -45,8 +45,10 @@ class GeometryEncoder(nn.Module):
         for part in geometry.parts:
             if part in POINT_ENCODERS:
                 self.parts[part] = Turned(POINT_ENCODERS[part](self.width), geometry.yaws, geometry.canonical)
-            elif part == CROP_PART:
-                self.parts[part] = SurroundingsEncoder(self.width, network.dropout)
+            elif part == DOOR_PART:
+                self.parts[part] = DoorsEncoder(self.width, network.dropout)
+            elif part in CROP_SHAPES:
+                self.parts[part] = SurroundingsEncoder(part, self.width, network.dropout)
             else:
                 self.parts[part] = Table(width(TABLE_PARTS[part]), self.width, network.dropout)
         self.join = nn.Sequential(nn.LayerNorm(len(self.parts) * self.width), nn.ReLU(), nn.Dropout(network.dropout))
@@ -119,8 +121,8 @@ class Embedder(nn.Module):
 def quarter_turned(tensors: Mapping[str, Tensor], turns: int) -> dict[str, Tensor]:
     """A map turned by so many quarter turns, counter-clockwise seen from above."""
     out = dict(tensors)
-    if CROP_PART in out:
-        out[CROP_PART] = out[CROP_PART].rot90(turns, (1, 2))
+    for part in CROP_SHAPES.keys() & out.keys():
+        out[part] = out[part].rot90(turns, (out[part].dim() - 3, out[part].dim() - 2))
     if "edge_way" in out:
         c, s = QUARTERS[turns % 4]
         x, y = out["edge_way"].reshape(-1, 2, 2).unbind(dim=2)

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 from topomerge.embedding.graph import POINTS_PER_ROOM
 from topomerge.embedding.schema import TABLES
-from topomerge.embedding.surroundings import CROP, CROP_PART, CROP_PLANES
+from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 
 SHAPES: dict[str, tuple[int, ...]] = {name: (len(columns),) for name, columns in TABLES.items()}  # of each row
-SHAPES |= {"room_points": (POINTS_PER_ROOM, 3), CROP_PART: (CROP, CROP, len(CROP_PLANES))}
+SHAPES |= {"room_points": (POINTS_PER_ROOM, 3), **CROP_SHAPES}
 ONNX_OPSET = 18
 
 
@@ -41,7 +41,7 @@ def sample(network: Embedder, rooms: int = 6, edges: int = 10, doors: int = 12, 
     for name in network.tensors:
         if name in SHAPES:
             out[name] = torch.rand((count.get(name, rooms), *SHAPES[name]), generator=generator) * 3
-            out[name] = (80 * out[name]).to(torch.uint8) if name == CROP_PART else out[name]
+            out[name] = (80 * out[name]).to(torch.uint8) if name in CROP_SHAPES else out[name]
         else:
             most, number = (rooms, edges) if name == "edge_index" else (edges, doors)
             out[name] = torch.randint(0, max(most, 1), (2, number), generator=generator)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from topomerge.embedding.network import CROP_CHANNELS
-from topomerge.embedding.surroundings import CROP, CROP_PLANES
+from topomerge.embedding.surroundings import CROP_PLANES, CROP_SHAPES, DOOR_PART
 
 FULL_VALUE = 255.0  # of a pixel
 
@@ -34,20 +34,47 @@ class BatchNorm(nn.Module):
 
 
 class SurroundingsEncoder(nn.Module):
-    """Crops (R, CROP, CROP, len(CROP_PLANES)) uint8 -> (R, width)."""
+    """Crops (n, side, side, len(CROP_PLANES)) uint8 -> (n, width).
 
-    def __init__(self, width: int, dropout: float) -> None:
+    Args:
+        part: which crops they are, of `CROP_SHAPES`.
+    """
+
+    def __init__(self, part: str, width: int, dropout: float) -> None:
         super().__init__()
-        channels = list(pairwise((len(CROP_PLANES), *CROP_CHANNELS)))
+        channels = list(pairwise((len(CROP_PLANES), *CROP_CHANNELS[part])))
         self.convolutions = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1, bias=False) for a, b in channels)
         self.norms = nn.ModuleList(BatchNorm(b) for _, b in channels)
         self.drop = nn.Dropout(dropout)
-        left = CROP >> len(channels)
-        self.out = nn.Linear(left * left * CROP_CHANNELS[-1], width)
+        left = CROP_SHAPES[part][-2] >> len(channels)
+        self.out = nn.Linear(left * left * CROP_CHANNELS[part][-1], width)
 
     def forward(self, crops: Tensor) -> Tensor:
         x = crops.permute(0, 3, 1, 2).float() / FULL_VALUE
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             x = norm(convolution(x)).relu()
         out: Tensor = self.out(self.drop(x.flatten(1)))
+        return out
+
+
+class DoorsEncoder(nn.Module):
+    """Crops of doors (R, DOOR_CROPS, side, side, len(CROP_PLANES)) uint8 -> (R, width): mean and maximum over the doors that a
+    room has, of which those without a crop are none."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        self.each = SurroundingsEncoder(DOOR_PART, width, dropout)
+        self.out = nn.Linear(2 * width, width)
+
+    def forward(self, crops: Tensor) -> Tensor:
+        count, doors = crops.shape[:2]
+        there = crops.flatten(2).amax(dim=2) > 0
+        if self.training:  # only those that are there: two of three are not
+            rows = crops.new_zeros((count * doors, self.out.in_features // 2), dtype=torch.float32)
+            rows = rows.masked_scatter(there.flatten()[:, None], self.each(crops[there]).relu())
+        else:  # one shape for all maps, as other runtimes need it
+            rows = self.each(crops.flatten(0, 1)).relu() * there.flatten()[:, None]
+        rows = rows.unflatten(0, (count, doors))
+        mean = rows.sum(dim=1) / there.sum(dim=1, keepdim=True).clamp(min=1)
+        out: Tensor = self.out(torch.cat([mean, rows.amax(dim=1)], dim=1))
         return out

@@ -10,13 +10,13 @@ import torch
 
 from topomerge.embedding.door_layout import door_layout
 from topomerge.embedding.schema import width
-from topomerge.embedding.surroundings import CROP, SHEET_PLANES
+from topomerge.embedding.surroundings import CROP, CROP_SHAPES, SHEET_PLANES
 from topomerge.io import archive
 from topomerge.training.packed import GraphPair
 from topomerge.training.turned_views import with_views
 
-LATER = ("engineered", "shapedna", "near_index", "near_attr", "surroundings", "edge_way")  # reckoned when a set is read
-VIEWS = ("surroundings", "edge_way")
+LATER = ("engineered", "shapedna", "near_index", "near_attr", *CROP_SHAPES, "edge_way")  # reckoned when a set is read
+VIEWS = (*CROP_SHAPES, "edge_way")
 
 
 def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Tensor]:
@@ -36,6 +36,7 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
         "sheet": torch.randint(0, 256, (*columns.shape[:2], len(SHEET_PLANES)), generator=g, dtype=torch.uint8),
         "sheet_room": (columns[:, :, None] - anchor).norm(dim=3).argmin(dim=2).to(torch.int16),
         "anchor": anchor,
+        "door_anchor": _doors(anchor),
         "turn": torch.zeros(1, dtype=torch.float64),
     }
     tensors = {
@@ -55,6 +56,14 @@ def graph(rooms: int = 7, seed: int = 0, points: int = 64) -> dict[str, torch.Te
     return with_views({**tensors, **views}, VIEWS)
 
 
+def _doors(anchor: torch.Tensor) -> torch.Tensor:
+    """(R, 4, 2) places of no door, one, two or three, and so on."""
+    number = torch.arange(4)
+    doors = anchor[:, None] + 3.0 * number[None, :, None]
+    doors[number[None] >= torch.arange(len(anchor))[:, None] % 4] = torch.nan
+    return doors
+
+
 def turned(tensors: dict[str, torch.Tensor], angle: float) -> dict[str, torch.Tensor]:
     """The same map in a frame turned about the vertical: all but the points stays."""
     c, s = np.cos(angle), np.sin(angle)
@@ -68,7 +77,7 @@ def shuffled(tensors: dict[str, torch.Tensor], seed: int = 0) -> tuple[dict[str,
     rooms, edges = torch.randperm(len(tensors["x"]), generator=g), torch.randperm(len(tensors["edge_attr"]) // 2, generator=g)
     edges = torch.cat([edges, edges + len(edges)])  # an edge and its way back stand half of all apart
     new_room, new_edge = rooms.argsort(), edges.argsort()
-    out = {name: tensors[name][rooms] for name in ("x", "engineered", "shapedna", "room_points", "pos", "anchor")}
+    out = {name: tensors[name][rooms] for name in ("x", "engineered", "shapedna", "room_points", "pos", "anchor", "door_anchor")}
     out |= {"sheet": tensors["sheet"], "sheet_room": new_room[tensors["sheet_room"].long()].to(torch.int16)}
     out["turn"] = tensors["turn"]
     out |= {"edge_index": new_room[tensors["edge_index"][:, edges]], "edge_attr": tensors["edge_attr"][edges]}

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.difficulty import Difficulty
+from topomerge.datasets.pairs.drawing import architects_drawing
+from topomerge.datasets.pairs.flat import storey_of
 from topomerge.datasets.pairs.pairs import ROOMS_A_MAP, Atlas, draw_frames, seen_by_both
 from topomerge.datasets.pairs.parts import room_graph
+from topomerge.datasets.pairs.robot_grid import robot_grid
 from topomerge.datasets.simulation.scanner import scan
 from topomerge.datasets.simulation.session import session
+from topomerge.datasets.simulation.spoils import drifting
 from topomerge.datasets.simulation.walk import part
 
 from topomerge.errors import InputError
+from topomerge.types import Array, PointCloud, Sim3
+
+READ_SCALE = 0.03  # standard deviation of the logarithm of a drawing's scale, as it is read off it
+FLAT_KINDS = ("grid", "drawing")  # maps of one storey, seen from above
 
 
 def make_atlas(
@@ -24,14 +33,16 @@ def make_atlas(
     scale: bool = False,
     difficulty: Difficulty | None = None,
     source: str = "procedural",
+    drifts: Sequence[float] = (),
 ) -> Atlas:
     """One session and one walk for each sensor; each walk starts in a room that an earlier one visited.
 
     Args:
-        sensors: names, two or more; they set the number of maps.
+        sensors: names, two or more, also of `FLAT_KINDS`; they set the number of maps.
         rng: generator or seed; the same seed gives the same points.
         rooms: of each map, at most.
         scale: the scales of all maps but the first are unknown.
+        drifts: of each map, times the usual drift of its sensor; empty: the usual one.
 
     Raises:
         InputError: fewer than two sensors, or a room can't be reached.
@@ -39,14 +50,18 @@ def make_atlas(
     if len(sensors) < 2:
         raise InputError(f"an atlas needs two or more sensors, not {len(sensors)}")
     rng, difficulty = np.random.default_rng(rng), difficulty or Difficulty()
-    frames = draw_frames(len(sensors), scale, rng)
+    frames = [
+        replace(frame, scale=frame.scale * float(np.exp(rng.normal(0, READ_SCALE)))) if sensor == "drawing" else frame
+        for frame, sensor in zip(draw_frames(len(sensors), scale, rng), sensors, strict=True)
+    ]
     reachable = sorted(room_graph(building))
     maps, visited = [], set[int]()
-    for sensor, frame in zip(sensors, frames, strict=True):
+    for k, (sensor, frame) in enumerate(zip(sensors, frames, strict=True)):
         start = int(rng.choice(sorted(visited) or reachable))
         walked = part(building, rooms, rng, start=start)
         visited |= set(walked.tolist())
-        maps.append(scan(session(building, difficulty, rng), sensor, walked, rng, frame=frame))
+        drift = drifts[k] if len(drifts) else 1.0
+        maps.append(partial_map(session(building, difficulty, rng), sensor, walked, rng, frame, drift))
     return Atlas(
         name=f"{building.name}:{'-'.join(sensors)}",
         maps=tuple(maps),
@@ -56,3 +71,26 @@ def make_atlas(
         source=source,
         building=building.name,
     )
+
+
+def partial_map(
+    building: Building, sensor: str, rooms: Array, rng: np.random.Generator, frame: Sim3, drift: float = 1.0
+) -> PointCloud:
+    """Rooms of a building as a sensor, a robot with a 2D laser ("grid") or an architect ("drawing") maps them.
+
+    Args:
+        sensor: its name, or one of `FLAT_KINDS`: these show one storey, that of most of the rooms; a drawing shows also what lies
+            about them.
+        frame: of the map.
+        drift: times the usual one of the sensor.
+
+    Raises:
+        InputError: an unknown name, or a room can't be reached.
+    """
+    if sensor == "drawing":
+        return architects_drawing(building, rooms, storey_of(building, rooms), rng, frame)
+    if sensor == "grid":
+        storey = storey_of(building, rooms)
+        level = np.array([i for i in rooms.tolist() if building.rooms[i].storey == storey])
+        return robot_grid(building, drifting("laser2d", drift), level, rng, frame)
+    return scan(building, drifting(sensor, drift), rooms, rng, frame=frame)

@@ -41,7 +41,7 @@ from topomerge.datasets.pairs.recipe import Library, Recipe, library
 from topomerge.datasets.simulation.scanner import moved, scan
 from topomerge.datasets.simulation.sensors import Sensor, get_sensor
 from topomerge.datasets.simulation.session import session
-from topomerge.datasets.simulation.spoils import DRIFT_SPACING, drift_between, exact_sensor
+from topomerge.datasets.simulation.spoils import DRIFT_SPACING, drift_between, drifting, exact_sensor
 
 from topomerge.errors import InputError
 from topomerge.io import archive
@@ -94,12 +94,6 @@ class BentPair:
     frames: tuple[Sim3, Sim3]
     shared: Array
     factor: float
-
-
-def drifting(sensor: Sensor | str, factor: float) -> Sensor:
-    """The sensor with a multiple of its drift."""
-    usual = get_sensor(sensor)
-    return replace(usual, drift=factor * usual.drift, tilt=min(factor, 1.0) * usual.tilt)
 
 
 def drifted_scan(

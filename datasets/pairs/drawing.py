@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
+import shapely
 from scipy import ndimage
 from topomerge.datasets.core.building import Building
-from topomerge.datasets.pairs.flat import Flat, from_masks, raise_flat
+from topomerge.datasets.pairs.flat import Flat, from_masks, labelled, moved_room, raise_flat
 from topomerge.datasets.pairs.pairs import Pair, seen_by_both
 from topomerge.datasets.pairs.parts import share
+from topomerge.datasets.pairs.plan_truth import HUNG_KINDS, footprints
 from topomerge.datasets.simulation.floors import draw_floors
 
 from topomerge.errors import InputError
-from topomerge.types import Array
+from topomerge.types import Array, PointCloud, Sim3
 
 DRAWING_CELL = 0.05  # m
 DRAWN_WALL = 0.2  # m beside a room that is drawn as wall
+SYMBOLS_SHARES = (0.5, 0.2, 0.5)  # of the drawings have arcs of doors, outlines of furniture, names of rooms
+DRAWN_AROUND = 8.0  # m about the rooms that are asked for
+LETTER_SIZES = (0.25, 0.5)  # m
 SAME_LEVEL = 1.0  # m between a door and the floor of its storey, at most
 
 
@@ -44,16 +50,91 @@ def with_plan(pair: Pair, building: Building) -> Pair:
 
 def draw(building: Building, storey: int = 0) -> Flat:
     """Walls and floor of a storey; inner doors are open, outer ones shut."""
-    floors = draw_floors(building, DRAWING_CELL)
-    room = floors.room[storey] >= 0
-    door = np.zeros(room.shape, bool)
-    level = np.abs(building.doors["centre"][:, 2] - building.storeys["floor"][storey]) < SAME_LEVEL
-    for one in building.doors[level & (building.doors["rooms"] >= 0).all(axis=1)]:
-        _open(one, door, floors.origin)
+    room = draw_floors(building, DRAWING_CELL).room[storey] >= 0
+    return _flat(building, inner_doors(building, storey), room, np.zeros(room.shape, bool))
+
+
+def _flat(building: Building, doors: Array, room: Array, ink: Array) -> Flat:
+    """The drawing of the cells (rows, columns) bool of rooms, with doors, and with lines that are no walls."""
+    door, origin = np.zeros(room.shape, bool), draw_floors(building, DRAWING_CELL).origin
+    for one in doors:
+        _open(one, door, origin)
     walls = ~room & ~door & (ndimage.distance_transform_edt(~room) * DRAWING_CELL <= DRAWN_WALL)
+    walls, floor = walls | ink, (room | door) & ~ink
     source = f"{building.name}:drawing"
-    flat = from_masks(walls[::-1], (room | door)[::-1], DRAWING_CELL, (*floors.origin.tolist(), 0.0), rays=False, source=source)
+    flat = from_masks(walls[::-1], floor[::-1], DRAWING_CELL, (*origin.tolist(), 0.0), rays=False, source=source)
     return replace(flat, rooms=tuple(replace(r, floor=0.0, ceiling=r.ceiling - r.floor) for r in building.rooms))
+
+
+def architects_drawing(building: Building, rooms: Array, storey: int, rng: np.random.Generator, frame: Sim3) -> PointCloud:
+    """The drawing of rooms and of what lies about them on a storey as an architect leaves it, in a frame, with the true rooms of
+    its points: leaves and arcs of doors, outlines of what stands there, and names of rooms, each on some of the drawings."""
+    arcs, outlines, names = (rng.random(3) < SYMBOLS_SHARES).tolist()
+    floors = draw_floors(building, DRAWING_CELL)
+    visited = shapely.union_all([shapely.Polygon(building.rooms[i].polygon) for i in rooms.tolist()])
+    shown = np.array([visited.distance(shapely.Polygon(room.polygon)) < DRAWN_AROUND for room in building.rooms])
+    sheet = np.isin(floors.room[storey], np.flatnonzero(shown))
+    doors = inner_doors(building, storey)
+    doors = doors[shown[doors["rooms"]].all(axis=1)]
+    lines = []
+    if arcs:
+        lines += [line for door in doors for line in _leaf_and_arc(door, rng)]
+    if outlines:
+        lines += [box[[0, 1, 2, 3, 0]] for box in _standing(building, storey)]
+    if names:
+        lines += [line for room in building.rooms if room.storey == storey for line in _name(room.polygon, rng)]
+    ink = np.zeros(sheet.shape, bool)
+    for line in lines:
+        row, column = floors.cells(_along(line)).T
+        ink[row, column] = True
+    flat = _flat(building, doors, sheet, ink & sheet).moved(replace(frame, translation=(*frame.translation[:2], 0.0)))
+    height = frame.translation[2] + frame.scale * float(building.storeys["floor"][storey])
+    outlined = tuple(moved_room(room, frame) for room in building.rooms)
+    return labelled(raise_flat(replace(flat, rooms=()), height), outlined, storey)
+
+
+def inner_doors(building: Building, storey: int) -> Array:
+    """The doors of a storey that lead from room to room."""
+    level = np.abs(building.doors["centre"][:, 2] - building.storeys["floor"][storey]) < SAME_LEVEL
+    doors: Array = building.doors[level & (building.doors["rooms"] >= 0).all(axis=1)]
+    return doors
+
+
+def _leaf_and_arc(door: Array, rng: np.random.Generator) -> list[Array]:
+    """Lines (k, 2), m, of an open leaf and of the way that it swings; none of an opening without a leaf."""
+    if door["state"] == "none":
+        return []
+    normal = np.array([np.cos(door["direction"]), np.sin(door["direction"])]) * rng.choice([-1.0, 1.0])
+    along = np.array([-normal[1], normal[0]]) * rng.choice([-1.0, 1.0])
+    hinge = door["centre"][:2] - along * door["width"] / 2 + normal * door["thickness"] / 2
+    angle = np.linspace(0, np.pi / 2, 12)[:, None]
+    arc = hinge + door["width"] * (np.cos(angle) * along + np.sin(angle) * normal)
+    return [np.stack([hinge, arc[-1]]), arc]
+
+
+def _standing(building: Building, storey: int) -> list[Array]:
+    """(4, 2) m, footprints of what stands in the rooms of a storey."""
+    things = building.things[~np.isin(building.things["kind"], HUNG_KINDS) & (building.things["room"] >= 0)]
+    here = [t for t in things if building.rooms[t["room"]].storey == storey]
+    return [box for thing in here for box in footprints(thing, legs=False)]
+
+
+def _name(polygon: Array, rng: np.random.Generator) -> list[Array]:
+    """Lines (k, 2), m, of letters in a room, two to eight of them, of strokes at random."""
+    place = np.asarray(shapely.Polygon(polygon).representative_point().coords)[0]
+    size, count = rng.uniform(*LETTER_SIZES), int(rng.integers(2, 9))
+    starts = place + np.column_stack([(np.arange(count) - count / 2) * size * 0.8, np.zeros(count)])
+    strokes = rng.uniform(0, 1, (count, 3, 2)) * [0.6 * size, size]
+    return [start + stroke for start, stroke in zip(starts, strokes, strict=True)]
+
+
+def _along(line: Array) -> Array:
+    """(n, 2) points on a line through (k, 2) corners, no farther apart than half a cell."""
+    parts = []
+    for start, end in itertools.pairwise(line):
+        count = int(np.hypot(*(end - start)) / (DRAWING_CELL / 2)) + 2
+        parts.append(np.linspace(start, end, count))
+    return np.concatenate(parts)
 
 
 def _open(door: Array, image: Array, origin: Array) -> None:

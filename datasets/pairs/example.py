@@ -91,7 +91,9 @@ def several_maps(item: Item, plans: Sequence[Sequence[Plan]]) -> dict[str, Array
     sensors, sides = (*item.sensors, *item.more), SIDES[: 2 + len(item.more)]
 
     def make(k: int, rng: np.random.Generator) -> Atlas:
-        return make_atlas(candidate(item, k, plans)[0], sensors, rng, item.rooms, False, difficulty_of(item), item.source)
+        return make_atlas(
+            candidate(item, k, plans)[0], sensors, rng, item.rooms, False, difficulty_of(item), item.source, item.drifts
+        )
 
     atlas = _first(item, make)
     maps = extracted(atlas.maps, item)
@@ -147,6 +149,8 @@ def entries_of(item: Item) -> dict[str, Any]:
         del entries["maps"]
     if not item.more:
         del entries["more"]
+    if not item.drifts:
+        del entries["drifts"]
     return {**entries, "file": f"{item.name}.npz", "asked_overlap": item.overlap, "points_per_room": item.points_per_room}
 
 

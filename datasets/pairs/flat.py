@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
+from topomerge.datasets.core.building import Building
 from topomerge.datasets.pairs.pairs import Pair, draw_frames, seen_by_both
 from topomerge.datasets.plans.sealed import refuse_file
 from topomerge.datasets.simulation.floors import fill
@@ -165,6 +166,22 @@ def rooms_at(points: Array, rooms: Sequence[TrueRoom]) -> Array:
     out = np.full(len(points), -1, np.int32)
     out[inside] = raster[cells[inside, 1], cells[inside, 0]]
     return out
+
+
+def storey_of(building: Building, rooms: Array) -> int:
+    """The storey on which most of the rooms are."""
+    return int(np.bincount([building.rooms[i].storey for i in np.asarray(rooms).tolist()]).argmax())
+
+
+def labelled(cloud: PointCloud, rooms: Sequence[TrueRoom], storey: int) -> PointCloud:
+    """The cloud of a storey with the true rooms of its points.
+
+    Args:
+        rooms: of the whole building, in the frame of the cloud; those of other storeys lie over or under it.
+    """
+    here = np.array([i for i, room in enumerate(rooms) if room.storey == storey], np.int32)
+    label = rooms_at(cloud.points[:, :2], [rooms[i] for i in here.tolist()])
+    return replace(cloud, labels=np.where(label >= 0, here[label], -1).astype(np.int32), rooms=tuple(rooms))
 
 
 def floor_overlap(a: Array, b: Array, cell: float = 0.2) -> float:

@@ -22,7 +22,7 @@ from topomerge.embedding import graph
 from topomerge.io.listing import plain
 
 # Raise it when the same item gives other bytes, by whatever step: simulation, extraction, truth. It is part of the files' names.
-PAIR_FORMAT = 8
+PAIR_FORMAT = 9
 EXTRACTION = "topomerge.extraction.extract"
 MAKER = "topomerge.datasets.pairs.example"  # what makes the files
 CANDIDATES = 4  # buildings tried for an item: not every one has two parts with the overlap that is wanted
@@ -42,6 +42,7 @@ class Item:
         maps: are the extracted maps kept beside the pair?
         change: what is done to the clouds before they are extracted, and how much (`degrade`).
         more: sensors of further maps of the building, in the same file (`several_maps`).
+        drifts: of all its maps, times the usual drift; empty: the usual one.
     """
 
     source: str
@@ -63,6 +64,7 @@ class Item:
     maps: bool = False
     change: tuple[str, float] = UNCHANGED
     more: tuple[str, ...] = ()
+    drifts: tuple[float, ...] = ()
 
     @property
     def pair_settings(self) -> PairSettings:
@@ -79,7 +81,8 @@ class Item:
         results raises, and the digest of the weights that the extraction reads, which change by training alone.
         """
         values = asdict(self)
-        later = {"maps": False, "change": UNCHANGED, "more": ()}  # these came later: at their defaults older names hold
+        # These came later: at their defaults older names hold.
+        later = {"maps": False, "change": UNCHANGED, "more": (), "drifts": ()}
         values = {key: value for key, value in values.items() if key not in later or value != later[key]}
         maker = code_digest(MAKER) if self.maps else data_digest(EXTRACTION)
         inputs = [PAIR_FORMAT, graph.GRAPH_FORMAT, maker, plain(values)]
@@ -140,6 +143,7 @@ def _draw(recipe: Recipe, shelves: Mapping[str, _Shelf], i: int) -> Item:
     storeys = storeys if source == "procedural" else 2 if of else 1
     walks = np.random.default_rng([recipe.seed, i, 2])
     further = tuple(_pick(recipe.sensors, walks) for _ in range(recipe.walks - 2)) if not hard and overlap > 0 else ()
+    drifts = tuple(walks.choice(recipe.drifts, size=recipe.walks).tolist()) if recipe.drifts and further else ()
     first, last = splits.seeds(recipe.split)
     names = sorted(digest_of)
     chosen = [names[i] for i in rng.integers(len(names), size=CANDIDATES + 1)] if names else []
@@ -163,6 +167,7 @@ def _draw(recipe: Recipe, shelves: Mapping[str, _Shelf], i: int) -> Item:
         voxel_size=recipe.voxel_size,
         points_per_room=recipe.points_per_room,
         more=further,
+        drifts=drifts,
         over_stairs=bool(more.random() < recipe.over_stairs and not hard and storeys > 1),
     )
 

@@ -11,6 +11,7 @@ import shapely
 from topomerge.datasets.buildings.procedural import PROFILES
 from topomerge.datasets.buildings.stack import Stack, iter_stacks
 from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.pairs.atlases import FLAT_KINDS
 from topomerge.datasets.pairs.degrade import check_change
 from topomerge.datasets.pairs.pairs import HARD
 from topomerge.datasets.plans import splits
@@ -23,6 +24,7 @@ LEAST_PLAN_ROOMS = 5  # of a real plan: fewer have no two parts
 LEAST_PLAN_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told apart
 LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
 PLACES = {**splits.FOLDERS, "ipa": splits.TEST_ONLY["ipa"][0]}  # source -> folder; IPA's are for the test only
+MOST_DRIFT = 10.0  # times the usual one
 SIDES = "abcdef"  # names of the maps of a building in a file
 Library = Mapping[str, Mapping[str, tuple[Plan, ...]]]  # source -> name -> plans of its storeys, lowest first
 
@@ -49,7 +51,8 @@ class Recipe:
         over_stairs: share of the overlapping pairs in buildings of several storeys whose walks lead over stairs.
         maps: keep the extracted maps (`evaluation_pair`), too: for evaluation.
         walks: maps of each building that is no hard negative: of more than two, all pairs are taken (`several_maps`), and the
-            overlaps are as they come.
+            overlaps are as they come. Their sensors may also be those of `atlases.FLAT_KINDS`.
+        drifts: of more than two walks: times the usual drift of a sensor, drawn for each map; empty: the usual one.
         vary: name of a change (`degrade.CHANGES`) -> values; every pair is made once for each of all these.
     """
 
@@ -73,6 +76,7 @@ class Recipe:
     over_stairs: float = 0.0
     maps: bool = False
     walks: int = 2
+    drifts: list[float] = field(default_factory=list)
     vary: dict[str, list[float]] = field(default_factory=dict)
 
 
@@ -84,7 +88,8 @@ def check(recipe: Recipe) -> None:
     """
     splits.seeds(recipe.split)
     for sensor in recipe.sensors:
-        get_sensor(sensor)
+        if sensor not in FLAT_KINDS or recipe.walks == 2:
+            get_sensor(sensor)
     possible = {"sources": ("procedural", *PLACES), "kinds": tuple(PROFILES), "hard": HARD}
     for key in ("sources", "kinds", "sensors", "hard"):
         weights: dict[str, float] = getattr(recipe, key)
@@ -105,6 +110,8 @@ def check(recipe: Recipe) -> None:
         check_change(what, values)
     if recipe.pairs < 1 or not recipe.overlaps or len(recipe.rooms) != 2 or not 3 <= recipe.rooms[0] <= recipe.rooms[1]:
         raise InputError("pairs must be 1 or more, overlaps one or more, rooms [fewest, most] with 3 or more each")
+    if recipe.drifts and (recipe.walks == 2 or not all(0 <= drift <= MOST_DRIFT for drift in recipe.drifts)):
+        raise InputError(f"drifts are of more than two walks, 0 to {MOST_DRIFT:g} each, not {recipe.drifts}")
     if not 2 <= recipe.walks <= len(SIDES) or (recipe.walks > 2 and (recipe.maps or recipe.vary)):
         raise InputError(f"walks must be 2 to {len(SIDES)}, and 2 where maps are kept or changed, not {recipe.walks}")
     if not 0.02 <= recipe.voxel_size <= 1 or recipe.points_per_room < 1:

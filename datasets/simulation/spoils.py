@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from topomerge.datasets.core.building import Building
-from topomerge.datasets.simulation.sensors import Sensor
+from topomerge.datasets.simulation.sensors import Sensor, get_sensor
 
 from topomerge.types import Array, PointCloud
 
@@ -18,6 +18,12 @@ def exact_sensor(sensor: Sensor) -> Sensor:
     """The same sensor, whose poses are known exactly."""
     exact: dict[str, Any] = {"drift": 0.0, "tilt": 0.0, "jitter": (0.0, 0.0)}
     return replace(sensor, **{f.name: exact[f.name] for f in fields(sensor) if f.name in exact})
+
+
+def drifting(sensor: Sensor | str, factor: float) -> Sensor:
+    """The sensor with a multiple of its drift."""
+    usual = get_sensor(sensor)
+    return replace(usual, drift=factor * usual.drift, tilt=min(factor, 1.0) * usual.tilt)
 
 
 def drift_between(cloud: PointCloud, straight: PointCloud) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent.parent.parent
 CONFIGS = ROOT / "configs"
 PRETRAINED = ROOT / "topomerge" / "embedding" / "pretrained"
 GEOMETRIES = ("scalars", "engineered", "shapedna", "scalars_engineered", "scalars_shapedna")
-GEOMETRIES += ("surroundings", "scalars_surroundings")
+GEOMETRIES += ("surroundings", "scalars_surroundings", "scalars_wide", "scalars_doors", "scalars_crops")
 SAGE = Network(Geometry(["scalars"], width=8), Node("sage", 1, width=4), size=8)
 
 

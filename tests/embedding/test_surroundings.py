@@ -11,7 +11,18 @@ from scipy import ndimage
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
 from topomerge.embedding.sheets import sheet, sheet_arrays, wall_direction
-from topomerge.embedding.surroundings import CEILING_UNIT, CROP, CROP_PLANES, SHEET_PIXEL, SHEET_PLANES, crops
+from topomerge.embedding.surroundings import (
+    CEILING_UNIT,
+    CROP,
+    CROP_PART,
+    CROP_PLANES,
+    DOOR_CROP,
+    DOOR_PART,
+    SHEET_PIXEL,
+    SHEET_PLANES,
+    WIDE_PART,
+    crops,
+)
 from topomerge.types import TopometricMap
 
 PLANE = {name: k for k, name in enumerate(CROP_PLANES)}
@@ -107,3 +118,31 @@ def test_the_direction_of_walls_is_that_of_most_of_them(degrees):
 
 def test_no_walls_have_no_direction():
     assert wall_direction(np.zeros((0, 2))) == 0.0
+
+
+def test_a_wide_crop_shows_twice_as_far_in_means_of_pixels():
+    arrays = sheet_arrays(building(3))
+    fine, wide = (crops(arrays, part).astype(float) for part in (CROP_PART, WIDE_PART))
+    inner = wide[:, 8:24, 8:24]  # the 16 m of the finer crop
+    means = fine.reshape(len(fine), 16, 4, 16, 4, -1).mean(axis=(2, 4))
+    assert np.abs(inner - means).max() < 1.0
+    assert wide[..., PLANE["floor"]].sum() * 16 > fine[..., PLANE["floor"]].sum()
+
+
+def test_crops_of_doors_have_the_door_in_their_middle_and_show_which_room_is_meant():
+    arrays = sheet_arrays(building(2))
+    shown, doors = crops(arrays, DOOR_PART), np.isfinite(arrays["door_anchor"]).all(axis=2).sum(axis=1)
+    middle = DOOR_CROP // 2
+    for room, count in zip(shown, doors, strict=True):
+        assert (room[:count, middle - 1 : middle + 1, middle - 1 : middle + 1, PLANE["door"]] > 0).all()
+        assert not room[count:].any() and count
+        assert (room[:count, ..., PLANE["room"]].sum(axis=(1, 2)) > 0).all()
+
+
+def test_doors_stand_in_the_same_place_where_a_room_was_only_looked_into():
+    """Half a room has its middle elsewhere; what is seen about its door is the same."""
+    map = building(2)
+    far = map.navigable.centroids()[:, 1] > np.median(map.navigable.centroids()[map.navigable_room == 0, 1])
+    half = replace(map, navigable_room=np.where((map.navigable_room == 0) & far, -1, map.navigable_room))
+    one, other = (crops(sheet_arrays(m), DOOR_PART)[0, 0, ..., PLANE["wall"]] for m in (map, half))
+    assert np.array_equal(one, other) and one.any()

@@ -25,7 +25,7 @@ from topomerge.embedding.graph import graph_arrays
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import GEOMETRY_PARTS, TABLE_PARTS, Geometry, Network, Node, check, network_from
 from topomerge.embedding.rooms_around import through_doors, with_rooms_around
-from topomerge.embedding.surroundings import CROP_PART
+from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.embedding.turns import quarter_turned as numpy_quarter_turned
 from topomerge.errors import InputError
 
@@ -66,7 +66,7 @@ def test_the_order_of_rooms_does_not_matter(node):
 
 
 def test_a_turned_map_has_the_same_rows_one_place_further():
-    net = network("scalars", "surroundings", node=Node("gat", 2, around=10.0, ways=True))
+    net = network("scalars", *CROP_SHAPES, node=Node("gat", 2, around=10.0, ways=True))
     one = graph()
     with torch.no_grad():
         (rows, bins), (other, other_bins) = net.turned(one), net.turned(quarter_turned(one, 1))
@@ -76,7 +76,7 @@ def test_a_turned_map_has_the_same_rows_one_place_further():
 
 
 def test_four_quarter_turns_are_none_and_numpy_turns_alike():
-    one = {name: tensor for name, tensor in graph().items() if name in ("surroundings", "edge_way")}
+    one = {name: tensor for name, tensor in graph().items() if name in (*CROP_SHAPES, "edge_way")}
     arrays = {name: tensor.numpy() for name, tensor in one.items()}
     for turns in range(5):
         ours, theirs = quarter_turned(one, turns), numpy_quarter_turned(arrays, turns)
@@ -84,7 +84,7 @@ def test_four_quarter_turns_are_none_and_numpy_turns_alike():
     assert all(torch.equal(quarter_turned(one, 4)[name], one[name]) for name in one)
 
 
-@pytest.mark.parametrize("part", [part for part in GEOMETRY_PARTS if part != CROP_PART])
+@pytest.mark.parametrize("part", [part for part in GEOMETRY_PARTS if part not in CROP_SHAPES])
 def test_yaw(part):
     """Numbers: exactly; points about their longest axis: to 1e-3; points as they are: at the turns that are averaged."""
     one = graph(points=200)
@@ -108,7 +108,9 @@ def test_the_scale_matters():
 
 
 @pytest.mark.parametrize("node", NODES, ids=node_name)
-@pytest.mark.parametrize("parts", [("scalars", "engineered", "shapedna"), ("pointnet", "voxelcnn"), ("pointnet_local",)])
+@pytest.mark.parametrize(
+    "parts", [("scalars", "engineered", "shapedna"), ("pointnet", "voxelcnn"), ("pointnet_local",), tuple(CROP_SHAPES)]
+)
 def test_gradients_reach_every_weight(parts, node):
     net = network(*parts, node=node).train()
     embedding, dustbin = net(graph())
@@ -300,6 +302,7 @@ def test_check_takes_the_defaults():
         (("scalars",), Node("gat", doors=1, near=True)),
         (("scalars", "pointnet"), Node("gat", doors=1, near=True)),
         (("scalars", "surroundings"), Node("gat", around=10.0, ways=True)),
+        (("scalars", *CROP_SHAPES), Node("gat", around=10.0, ways=True)),
     ],
 )
 def test_onnx_agrees(parts, node, tmp_path):

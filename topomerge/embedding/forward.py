@@ -24,7 +24,7 @@ from topomerge.embedding.network import (
     tensors,
 )
 from topomerge.embedding.schema import TABLES, column, width
-from topomerge.embedding.surroundings import CROP, CROP_PART, CROP_PLANES
+from topomerge.embedding.surroundings import CROP_SHAPES, DOOR_PART
 from topomerge.types import Array
 
 SCALED_LIMIT = 5.0  # standard deviations beyond which inputs are cut off (`models.layers.Standardise`)
@@ -54,7 +54,7 @@ class Forward:
         """
         graph = {name: np.zeros((2, width(name))) for name in tensors(self.network) if name in TABLES}
         graph |= {name: np.array([[0, 1], [1, 0]]) for name in tensors(self.network) if name not in TABLES}
-        graph |= {CROP_PART: np.zeros((2, CROP, CROP, len(CROP_PLANES)), np.uint8)} if CROP_PART in graph else {}
+        graph |= {part: np.zeros((2, *shape), np.uint8) for part, shape in CROP_SHAPES.items() if part in graph}
         with np.errstate(all="ignore"):
             embedding, _ = self(graph)
         if embedding.shape[1] != self.network.size:
@@ -73,8 +73,8 @@ class Forward:
         parts = []
         for part in self.network.geometry.parts:
             name = f"geometry.parts.{part}"
-            if part == CROP_PART:
-                parts.append(self._crops(name, graph[part]))
+            if part in CROP_SHAPES:
+                parts.append(self._crops(name, part, graph[part]))
                 continue
             parts.append(self._mlp(f"{name}.each", self._scaled(f"{name}.scale", graph[needed(part)])))
         rooms = self._linear("geometry.out", nn.relu(self._norm("geometry.join.0", np.concatenate(parts, axis=1))))
@@ -82,10 +82,19 @@ class Forward:
             raise ValueError(f"rooms are {rooms.shape[1]} wide, not {self.network.geometry.width}")
         return rooms
 
-    def _crops(self, name: str, crops: Array) -> Array:
-        """`models.surroundings.SurroundingsEncoder`, in float32: the norms are part of the convolutions."""
+    def _crops(self, name: str, part: str, crops: Array) -> Array:
+        """`models.surroundings.SurroundingsEncoder` and `DoorsEncoder`."""
+        if part != DOOR_PART:
+            return self._encoded(name, part, crops)
+        there = crops.any(axis=(2, 3, 4))
+        rows, of = nn.relu(self._encoded(f"{name}.each", part, crops[there])), np.nonzero(there)[0]
+        both = [nn.segment_mean(rows, of, len(crops)), nn.segment_max(rows, of, len(crops))]
+        return self._linear(f"{name}.out", np.concatenate(both, axis=1))
+
+    def _encoded(self, name: str, part: str, crops: Array) -> Array:
+        """Crops (n, side, side, planes) -> (n, width), in float32: the norms are part of the convolutions."""
         x = np.moveaxis(crops, -1, 1).astype(np.float32) / FULL_VALUE
-        for k, wide in enumerate(CROP_CHANNELS):
+        for k, wide in enumerate(CROP_CHANNELS[part]):
             norm = f"{name}.norms.{k}"
             weight, bias, mean, variance = (
                 self._get(f"{norm}.{which}", (wide,)) for which in ("weight", "bias", "running_mean", "running_var")

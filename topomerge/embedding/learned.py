@@ -21,7 +21,7 @@ from topomerge.embedding.network import TABLE_PARTS, Network, tensors
 from topomerge.embedding.point_features import point_features, point_spectra
 from topomerge.embedding.rooms_around import with_rooms_around
 from topomerge.embedding.sheets import sheet_arrays
-from topomerge.embedding.surroundings import CROP_PART, crops
+from topomerge.embedding.surroundings import CROP_SHAPES, crops
 from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls, edge_ways, quarter_turned, room_facts
 from topomerge.embedding.weights import does_not_fit, embedder_hash, read_weights
 from topomerge.errors import InputError
@@ -45,7 +45,7 @@ def load_embedder(path: str | Path | None = None) -> Learned:
         with resources.as_file(resources.files("topomerge.embedding").joinpath("pretrained")) as folder:
             return load_embedder(folder)
     network, weights, about = read_weights(path)
-    if not set(network.geometry.parts) <= {*TABLE_PARTS, CROP_PART}:
+    if not set(network.geometry.parts) <= {*TABLE_PARTS, *CROP_SHAPES}:
         try:  # the networks of torch stand above this package
             embedder: Learned = import_module("topomerge.models.learned").load_with_torch(path)
         except ModuleNotFoundError as error:
@@ -103,8 +103,7 @@ class Learned:
         if "near_index" in names and "near_index" not in arrays:
             layout = door_layout(*(arrays[n] for n in ("edge_index", "pos", "edge_pos")))
             inputs |= dict(zip(("near_index", "near_attr"), layout, strict=True))
-        if CROP_PART in names and CROP_PART not in inputs:
-            inputs[CROP_PART] = crops(inputs)
+        inputs |= {part: crops(inputs, part) for part in CROP_SHAPES if part in names and part not in inputs}
         if "edge_way" in names:
             inputs["edge_way"] = edge_ways(inputs)
         read = {name: inputs[name] for name in names}
@@ -118,7 +117,7 @@ class Learned:
     @property
     def needs_points(self) -> bool:
         """Does the network read the points of rooms, or what is reckoned from them?"""
-        return bool(set(self.network.geometry.parts) - {"scalars", CROP_PART})
+        return bool(set(self.network.geometry.parts) - {"scalars", *CROP_SHAPES})
 
     def arrays(self, map: TopometricMap) -> dict[str, Array]:
         """What `graph` takes, of a map."""

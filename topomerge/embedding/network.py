@@ -6,13 +6,15 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from topomerge.embedding.surroundings import CROP_PART
+from topomerge.embedding.surroundings import CROP_PART, CROP_SHAPES, DOOR_PART, WIDE_PART
 from topomerge.errors import InputError
 
 TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> table of the graph that it reads
 POINT_PARTS = ("pointnet", "pointnet_local", "voxelcnn")  # these read the points
-GEOMETRY_PARTS = (*TABLE_PARTS, *POINT_PARTS, CROP_PART)
-CROP_CHANNELS = (16, 32, 64, 128)  # of the convolutions of crops, each of which halves the sides
+GEOMETRY_PARTS = (*TABLE_PARTS, *POINT_PARTS, *CROP_SHAPES)
+CROP_CHANNELS = {  # of the convolutions of crops, each of which halves the sides
+    CROP_PART: (16, 32, 64, 128), WIDE_PART: (16, 32, 64), DOOR_PART: (16, 32, 64),
+}  # fmt: skip
 GRAPH = ("edge_index", "edge_attr")
 LARGEST_WIDTH = 4096  # more is a mistake, or a file that was made to take all memory
 FARTHEST_AROUND = 100.0  # m
@@ -87,12 +89,12 @@ class Network:
     @property
     def turns(self) -> int:
         """1, or 4 where what a room gets depends on how the map is turned: it gets a row for each quarter turn then."""
-        return 4 if CROP_PART in self.geometry.parts or (self.node.ways and self.node.kind != "none") else 1
+        return 4 if CROP_SHAPES.keys() & set(self.geometry.parts) or (self.node.ways and self.node.kind != "none") else 1
 
 
 def needed(part: str) -> str:
     """The tensor of the graph that a part of the geometry reads."""
-    return CROP_PART if part == CROP_PART else TABLE_PARTS.get(part, "room_points")
+    return part if part in CROP_SHAPES else TABLE_PARTS.get(part, "room_points")
 
 
 def pair_tensors(node: Node) -> tuple[str, ...]:

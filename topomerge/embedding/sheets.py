@@ -27,6 +27,7 @@ HIGHEST = 5.0  # m over the floor
 BELOW_FLOOR = 0.3  # m
 DOOR_RADIUS = 0.5  # m about a door's middle that is marked
 TURN_STEPS = (np.radians(1.0), np.radians(0.1))  # in which the direction of walls is sought
+MOST_DOORS = 8  # of a room
 MOST_WALLS = 6000  # columns whose direction is taken
 BIN = 0.1  # m, into which walls are projected; columns are laid no farther apart
 
@@ -40,6 +41,7 @@ class Sheet:
             0 where none was seen.
         room: (H, W) int16 room whose floor it is, -1 none.
         anchor: (R, 2) float32 pixels, middle of each room.
+        doors: (R, MOST_DOORS, 2) float32 pixels, doors of each room, those nearest to its middle first; nan where it has fewer.
         turn: (S,) float64 rad, direction of each storey's walls in the map's frame: that of the lowest in [0, pi/2), those of the
             others no more than pi/4 away from it.
     """
@@ -47,6 +49,7 @@ class Sheet:
     planes: Array
     room: Array
     anchor: Array
+    doors: Array
     turn: Array
 
 
@@ -59,19 +62,21 @@ def sheet(map: TopometricMap) -> Sheet:
     width = max((s.room.shape[1] for s in storeys), default=0)
     planes, room = np.zeros((height, width, len(SHEET_PLANES)), np.uint8), np.full((height, width), -1, np.int16)
     anchor, row = np.zeros((len(map.rooms), 2), np.float32), 0
+    doors = np.full((len(map.rooms), MOST_DOORS, 2), np.nan, np.float32)
     for s, storey in enumerate(storeys):
         nx, ny = storey.room.shape
         planes[row : row + nx, :ny], room[row : row + nx, :ny] = storey.planes, storey.room
         of = map.rooms["storey"] == s
-        anchor[of] = storey.anchor[of] + (row, 0)
+        anchor[of], doors[of] = storey.anchor[of] + (row, 0), storey.doors[of] + (row, 0)
         row += nx + GAP
-    return Sheet(planes, room, anchor, np.array([s.turn[0] for s in storeys]))
+    return Sheet(planes, room, anchor, doors, np.array([s.turn[0] for s in storeys]))
 
 
 def sheet_arrays(map: TopometricMap) -> dict[str, Array]:
     """The sheet of a map by the names that it has among the tensors of a graph."""
     drawn = sheet(map)
-    return {"sheet": drawn.planes, "sheet_room": drawn.room, "anchor": drawn.anchor, "turn": drawn.turn}
+    places = {"anchor": drawn.anchor, "door_anchor": drawn.doors, "turn": drawn.turn}
+    return {"sheet": drawn.planes, "sheet_room": drawn.room, **places}
 
 
 def _storey(map: TopometricMap, storey: int, near: float) -> Sheet:
@@ -94,8 +99,9 @@ def _storey(map: TopometricMap, storey: int, near: float) -> Sheet:
     doors = 255 * raster.near(_turned(_doors(map, storey), turn), DOOR_RADIUS)
     planes = np.stack([shares[0], raster.share(ground, _spacing(nav.edge)), *shares[1:], ceilings, doors], axis=-1)
     anchor = (_turned(map.rooms["centroid"][:, :2], turn) - raster.corner) / SHEET_PIXEL
+    doors_of = (_turned(_doors_of_rooms(map).reshape(-1, 2), turn).reshape(-1, MOST_DOORS, 2) - raster.corner) / SHEET_PIXEL
     rooms = raster.label(ground, label, np.column_stack([map.rooms["centroid"], map.rooms["area"]]))
-    return Sheet(planes.astype(np.uint8), rooms, anchor.astype(np.float32), np.array([turn]))
+    return Sheet(planes.astype(np.uint8), rooms, anchor.astype(np.float32), doors_of.astype(np.float32), np.array([turn]))
 
 
 def _columns(map: TopometricMap, storey: int) -> tuple[tuple[Array, ...], Array]:
@@ -133,6 +139,20 @@ def _doors(map: TopometricMap, storey: int) -> Array:
     edges = map.open_edges
     centres: Array = edges["centre"][(map.rooms["storey"][edges["rooms"]] == storey).any(axis=1), :2]
     return centres
+
+
+def _doors_of_rooms(map: TopometricMap) -> Array:
+    """(R, MOST_DOORS, 2) m, doors of each room, those nearest to its middle first; nan where it has fewer."""
+    edges = map.open_edges
+    room, centre = edges["rooms"].T.reshape(-1), np.tile(edges["centre"][:, :2], (2, 1))
+    away = np.hypot(*(centre - map.rooms["centroid"][room, :2]).T).round(3)
+    order = np.lexsort((*centre.T, away, room))
+    room, centre = room[order], centre[order]
+    place = np.arange(len(room)) - np.searchsorted(room, room)
+    out = np.full((len(map.rooms), MOST_DOORS, 2), np.nan)
+    near = place < MOST_DOORS
+    out[room[near], place[near]] = centre[near]
+    return out
 
 
 def wall_direction(walls: Array) -> float:

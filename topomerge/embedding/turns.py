@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from topomerge.embedding.schema import width
-from topomerge.embedding.surroundings import CROP_PART
+from topomerge.embedding.surroundings import CROP_SHAPES, quarter_turned_crops
 from topomerge.types import Array
 
 QUARTERS = 4
@@ -122,8 +122,8 @@ def _complex(places: Array) -> Array:
 def quarter_turned(graph: Mapping[str, Array], turns: int) -> dict[str, Array]:
     """The arrays of a map turned by so many quarter turns."""
     out = dict(graph)
-    if CROP_PART in out:
-        out[CROP_PART] = np.rot90(out[CROP_PART], turns, (1, 2))
+    for part in CROP_SHAPES.keys() & out.keys():
+        out[part] = quarter_turned_crops(part, out[part], turns)
     if "edge_way" in out:
         ways = _complex(out["edge_way"].reshape(len(out["edge_way"]), 2, 2)) * 1j**turns
         out["edge_way"] = np.stack([ways.real, ways.imag], axis=2).reshape(len(ways), 4).astype(np.float32)

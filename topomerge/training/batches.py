@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 from torch_geometric.data import Batch, Data
 
 from topomerge.embedding.schema import column, columns_of_power
-from topomerge.embedding.surroundings import CROP_PART
+from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.models.embedder import quarter_turned
 from topomerge.models.losses import Truth
 from topomerge.models.yaw import turn
@@ -21,7 +21,7 @@ from topomerge.training.settings import Augment
 from topomerge.training.turned_views import changed_sheet, mirrored, quarters_between, with_views
 
 METRES_PER_MILLIMETRE = 0.001
-ORIENTED = {CROP_PART, "edge_way"}  # tensors that depend on how a map is turned
+ORIENTED = {*CROP_SHAPES, "edge_way"}  # tensors that depend on how a map is turned
 DOOR_NOISE = 0.05  # m, of the distance between two doors
 ALIKE_AREAS = 1.5  # areas of two views of a room that both saw most of it differ by less than this factor
 

@@ -25,7 +25,7 @@ from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array
 
-PACKED_FORMAT = 5
+PACKED_FORMAT = 6
 PAIRS_PER_CHUNK = 100  # pairs; descriptors that take long are stored chunk by chunk
 PACKED_TABLES = ("x", "edge_attr", "door_attr", "pos", "edge_pos")  # no network reads positions: they depend on the frame
 INDICES = ("edge_index", "door_index", "near_index")
@@ -38,7 +38,7 @@ ROWS_OF = {
     "door_index": "doors",
 }  # of the others: rooms
 EXTRAS = ("engineered", "shapedna")
-SHEET = ("sheet", "sheet_room", "anchor", "turn")
+SHEET = ("sheet", "sheet_room", "anchor", "door_anchor", "turn")
 Graph = dict[str, Tensor]
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 
 from topomerge.embedding.schema import column
-from topomerge.embedding.surroundings import CROP_PART, SHEET_PLANES, crops
+from topomerge.embedding.surroundings import CROP_SHAPES, SHEET_PLANES, crops
 from topomerge.embedding.turns import edge_ways
 from topomerge.training.packed import Graph, GraphPair
 
@@ -20,6 +20,7 @@ SEEN_AS = (  # planes that a map lacks, and how often: drawings and slices have 
     (("ceiling", "low"), 0.1),
     (("ceiling", "low", "high"), 0.1),
 )
+DOOR_SHIFT = 0.8  # pixels, standard deviation of where a door stands
 PATCHES, PATCH = 3, (4, 24)  # patches that nothing was seen of, at most, and pixels of a side
 
 
@@ -35,9 +36,10 @@ def quarters_between(pair: GraphPair) -> int | None:
 def with_views(graph: Graph, names: Sequence[str]) -> Graph:
     """A graph with the crops and ways that a network reads, of its sheet as it is."""
     out = dict(graph)
-    if CROP_PART in names:
-        arrays = {name: graph[name].numpy() for name in ("sheet", "sheet_room", "anchor")}
-        out[CROP_PART] = torch.from_numpy(crops(arrays))
+    read: tuple[str, ...] = ("sheet", "sheet_room", "anchor", "door_anchor")
+    arrays = {name: graph[name].numpy() for name in read if name in graph}
+    for part in CROP_SHAPES.keys() & set(names):
+        out[part] = torch.from_numpy(crops(arrays, part))
     if "edge_way" in names:
         out["edge_way"] = torch.from_numpy(edge_ways({n: graph[n].numpy() for n in ("pos", "edge_pos", "edge_index", "turn")}))
     return out
@@ -60,14 +62,15 @@ def changed_sheet(graph: Graph, shift: float, generator: torch.Generator) -> Gra
         at = (slice(start[0], start[0] + size[0]), slice(start[1], start[1] + size[1]))
         planes[at], room[at] = 0, -1
     moved = anchor + shift * torch.randn(anchor.shape, generator=generator)
-    return {**graph, "sheet": planes, "sheet_room": room, "anchor": moved}
+    doors = graph["door_anchor"] + DOOR_SHIFT * torch.randn(graph["door_anchor"].shape, generator=generator)
+    return {**graph, "sheet": planes, "sheet_room": room, "anchor": moved, "door_anchor": doors}
 
 
 def mirrored(graph: Graph) -> Graph:
     """A map seen in a mirror that stands along its walls: y changes its sign."""
     out = dict(graph)
-    if CROP_PART in out:
-        out[CROP_PART] = out[CROP_PART].flip(2)
+    for part in CROP_SHAPES.keys() & out.keys():
+        out[part] = out[part].flip(out[part].dim() - 2)
     if "edge_way" in out:
         out["edge_way"] = out["edge_way"] * torch.tensor([1.0, -1.0, 1.0, -1.0])
     for name, feature in MIRRORED_COLUMNS.items():
