@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from topomerge.embedding.turns import FACTS
+from topomerge.errors import InputError
 from topomerge.matching.room_matcher import (
     AGREEMENT,
     ATTENTION_HEADS,
@@ -25,6 +26,13 @@ from topomerge.matching.room_matcher import (
 )
 from topomerge.types import Array
 
+PARTS = {  # that an ablation leaves out, and the layers that tell of them
+    "votes": ("votes", "agree"),
+    "ways": ("way_out",),
+    "facts": ("facts",),
+    "within": ("join_within",),
+    "across": ("join_across",),
+}
 WAY_HIDDEN = 32  # units between the way to a room and what is made of it
 LEAST_SPREAD = 1e-3  # of a fact that says something
 FAR_HEIGHT = 1e4  # m
@@ -94,6 +102,19 @@ class RoomMatcher(nn.Module):
         self.register_buffer("usual", torch.zeros(FACTS))
         self.register_buffer("spread", torch.ones(FACTS))
         self.sharpness, self.likeness = nn.Parameter(torch.tensor(1.0)), nn.Parameter(torch.tensor(0.5))
+
+    def leave_out(self, parts: Sequence[str]) -> None:
+        """Make parts (of `PARTS`) give 0 for good, for ablations: files of weights have the same shape.
+
+        Raises:
+            InputError: an unknown part.
+        """
+        for part in parts:
+            if part not in PARTS:
+                raise InputError(f"without: unknown {part!r}; {', '.join(PARTS)} are possible")
+            for name, weights in self.named_parameters():
+                if set(name.split(".")) & set(PARTS[part]):
+                    torch.nn.init.zeros_(weights).requires_grad_(False)
 
     def fit_facts(self, facts: Array) -> None:
         """Take what is usual from the facts (n, FACTS) of the training set; heights are told by the ways only."""

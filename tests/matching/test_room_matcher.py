@@ -99,6 +99,36 @@ def test_pairs_that_are_moved_alike_agree_and_those_of_another_storey_do_not() -
     assert off[0, 0, 0] == pytest.approx(np.log1p(3 * 2 * 0.75**2)) and off[1, 1, 0] == pytest.approx(np.log1p(3 * (1 + 0.75**2)))
 
 
+def without(*parts: str) -> RoomMatcher:
+    """A network without some parts, after a step of an optimizer."""
+    torch.manual_seed(0)
+    net = RoomMatcher(ROWS, width=16, layers=2, dropout=0.0)
+    net.leave_out(parts)
+    a = rooms(6, 1)
+    optimizer = torch.optim.AdamW(net.parameters(), 0.01)
+    net(a, seen_again(a, 4))[-1].rows[:, 0].sum().backward()
+    optimizer.step()
+    return net.eval()
+
+
+@pytest.mark.parametrize(
+    ("parts", "changed"), [(("votes", "ways"), "places"), (("facts",), "facts"), (("within", "votes", "across"), "places")]
+)
+def test_what_is_left_out_tells_nothing(parts: tuple[str, ...], changed: str) -> None:
+    a = rooms(6, 1)
+    b = seen_again(a, 4)
+    other = replace(b, **{changed: np.random.default_rng(8).normal(size=getattr(b, changed).shape)})
+    for names, same in ((parts, True), ((), False)):
+        weights = exported_matcher(without(*names), "")
+        rows = [odds_of(a, one, weights).rows for one in (b, other)]
+        assert (np.abs(rows[0] - rows[1]).max() < 1e-9) == same
+
+
+def test_a_part_that_does_not_exist_can_not_be_left_out() -> None:
+    with pytest.raises(InputError, match="without: unknown 'layers'"):
+        RoomMatcher(ROWS, width=16).leave_out(["layers"])
+
+
 def test_turns_are_as_likely_as_they_are_sure() -> None:
     sure = room_matcher.RoomOdds(np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]), 2)
     none = room_matcher.RoomOdds(np.array([[0.0, 1.0]]), np.array([[0.0, 1.0]]), 0)

@@ -21,11 +21,12 @@ from topomerge.extraction.plans.plan_rooms import rooms_of_plans
 from topomerge.extraction.room_odds import with_room_odds
 from topomerge.extraction.scan import Scan, read_scan
 from topomerge.extraction.slices import is_slice, with_raised_slice
-from topomerge.extraction.small_rooms import without_small_rooms
+from topomerge.extraction.small_rooms import gathered, without_small_rooms
 from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.views.view_rooms import rooms_of_views
 from topomerge.extraction.walked_doors import with_walked_doors
+from topomerge.extraction.walked_rooms import walked_rooms
 from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid, with_outline_odds
 
 COARSE_CELL = 0.15  # m: in larger ones, the walls beside a door leave too little of it
@@ -63,7 +64,11 @@ def extract(
     scan, navigable, floor, map = rooms_and_passages(source, voxel_size, p, watch, parts)
 
     watch.begin("odds of rooms, doors on walls", 0.87)
-    map, doubts = _with_odds_and_openings(map, scan, floor, p)
+    made, doubts, one = _with_odds_and_openings(map, scan, floor, p)
+    if one is not None and not parts:  # rooms of joined maps are what their parts say
+        floor = gathered(floor, one)
+        made, doubts, _ = _with_odds_and_openings(topometric_map(scan.grid, floor, p.standing_height), scan, floor, p)
+    map = made
 
     watch.begin("free space", 0.9)
     free = free_space(scan, navigable, p.range) if p.carve else scan.free
@@ -113,27 +118,32 @@ def rooms_and_passages(
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
     if flat and not isinstance(p, ThesisParameters) and p.walls and not parts:  # rooms of joined maps are what their parts say
-        gathered = without_small_rooms(floor, map)
-        if gathered is not floor:
-            floor, map = gathered, topometric_map(scan.grid, gathered, p.standing_height)
+        larger = without_small_rooms(floor, map)
+        if larger is not floor:
+            floor, map = larger, topometric_map(scan.grid, larger, p.standing_height)
     return scan, navigable, floor, map
 
 
-def _with_odds_and_openings(map: TopometricMap, scan: Scan, floor: Floor, p: Parameters) -> tuple[TopometricMap, list[str]]:
+def _with_odds_and_openings(
+    map: TopometricMap, scan: Scan, floor: Floor, p: Parameters
+) -> tuple[TopometricMap, list[str], Array | None]:
     """The map with how likely each room is one, with the doors and windows that its walls show, and with the doors that the
-    sensor was carried through; and what is odd about its way."""
+    sensor was carried through; what is odd about its way; and which rooms of the floor it proves to be one (`walked_rooms`)."""
     if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
-        return replace(map, rooms=with_outline_odds(map.rooms)), []
+        return replace(map, rooms=with_outline_odds(map.rooms)), [], None
     map = with_room_odds(map, scan.rays)
     walls = wall_elevations(map, scan.fine) if p.walls and scan.fine is not None and len(map.rooms) else None
     classes = None if walls is None else place_classes(walls)
+    one = None
     if p.walls:
-        map = with_wall_doors(map, floor.classified_storeys, walls, classes)
+        map, likeliest = with_wall_doors(map, floor.classified_storeys, walls, classes)
     map, doubt = with_walked_doors(map, scan.places)
     map = distinct_doors(map)
+    if walls is not None:
+        one = walked_rooms(map, floor, likeliest)
     if walls is not None and classes is not None:
         map = with_windows(map, walls, classes)
-    return map, [doubt] if doubt else []
+    return map, [doubt] if doubt else [], one
 
 
 def _doubts(map: TopometricMap) -> list[str]:

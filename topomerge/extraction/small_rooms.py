@@ -41,7 +41,7 @@ def without_small_rooms(floor: Floor, map: TopometricMap) -> Floor:
     for likely, (a, b) in sorted((likely, pair) for pair, likely in chance.items()):
         if likely < NO_DOOR and min(area[a], area[b]) < SMALL_AREA and not _parted(chance, group, a, b):
             group[group == group[b]] = group[a]
-    return floor if (group == np.arange(len(group))).all() else _gathered(floor, group)
+    return floor if (group == np.arange(len(group))).all() else gathered(floor, group)
 
 
 def _parted(chance: Mapping[Pair, float], group: Array, a: int, b: int) -> bool:
@@ -50,8 +50,12 @@ def _parted(chance: Mapping[Pair, float], group: Array, a: int, b: int) -> bool:
     return any(likely >= LIKELY_DOOR and {int(group[x]), int(group[y])} == ends for (x, y), likely in chance.items())
 
 
-def _gathered(floor: Floor, group: Array) -> Floor:
-    """The floor whose rooms are those of each group."""
+def gathered(floor: Floor, group: Array) -> Floor:
+    """The floor whose rooms are those of each group.
+
+    Args:
+        group: (R,) the room of the floor that each of them is part of.
+    """
     named = [room for pair in floor.door_probability for room in pair]
     largest = max(int(rooms.max(initial=-1)) for rooms in (floor.room, floor.label, floor.room_of_area, np.array(named, int)))
     complete = floor.completeness

@@ -130,6 +130,7 @@ class MatcherJob(NetworkJob):
         }
         rows = int(np.prod(learned[0].a[0].rows.shape[1:]))
         network = RoomMatcher(rows, settings.width, settings.layers, settings.dropout)
+        network.leave_out(settings.without)
         network.fit_facts(np.concatenate([side[0].rows.facts for example in learned for side in (example.a, example.b)]))
         super().__init__(settings, network, origin)
         self.options, self.learned, self.watched, self.embedder = settings, learned, watched, embedder

@@ -18,6 +18,7 @@ from topomerge.extraction.doors import DOOR_MOST_WIDTH
 from topomerge.extraction.elevations.doorways import STOOD, STRAIGHT, door_places, doorways, joined_openings
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES
+from topomerge.extraction.plans.partition import Pair, pair_of
 from topomerge.io.weight_files import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
@@ -64,8 +65,9 @@ class DoorCandidates:
 
 def with_wall_doors(
     map: TopometricMap, storeys: Sequence[ClassifiedStorey], walls: Elevations | None, classes: Array | None
-) -> TopometricMap:
-    """The map with the doors that its plans and walls show.
+) -> tuple[TopometricMap, dict[Pair, float]]:
+    """The map with the doors that its plans and walls show; and how likely the likeliest door of each two rooms is, of all that
+    anything shows.
 
     Args:
         storeys: what probably stands in the columns of its plans.
@@ -79,7 +81,12 @@ def with_wall_doors(
     likely = (chance >= 0.5) | _only_ways(candidates, chance, len(map.rooms))
     flights = map.edges[~np.isin(map.edges["kind"], ("door", "opening"))]
     edges = np.concatenate([edges[likely], flights])
-    return replace(map, edges=edges[np.lexsort((*edges["centre"].T[::-1], edges["rooms"][:, 1], edges["rooms"][:, 0]))])
+    likeliest: dict[Pair, float] = {}
+    for rooms, likely in zip(candidates.edges["rooms"].tolist(), chance.tolist(), strict=True):
+        pair = pair_of(*rooms)
+        likeliest[pair] = max(likeliest.get(pair, 0.0), likely)
+    order = np.lexsort((*edges["centre"].T[::-1], edges["rooms"][:, 1], edges["rooms"][:, 0]))
+    return replace(map, edges=edges[order]), likeliest
 
 
 def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]] | None = None) -> Array:
