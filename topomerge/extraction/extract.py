@@ -13,6 +13,7 @@ from topomerge.extraction.elevations.elevation import wall_elevations
 from topomerge.extraction.elevations.wall_doors import with_wall_doors
 from topomerge.extraction.elevations.windows import with_windows
 from topomerge.extraction.floor import Floor
+from topomerge.extraction.floor_patches import without_patches
 from topomerge.extraction.free_space import free_space
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
@@ -142,7 +143,7 @@ def _with_odds_and_openings(
     if walls is not None:
         one = walked_rooms(map, floor, likeliest)
     if walls is not None and classes is not None:
-        map = with_windows(map, walls, classes)
+        map = without_patches(with_windows(map, walls, classes), scan.places)
     return map, [doubt] if doubt else [], one
 
 
