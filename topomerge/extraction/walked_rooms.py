@@ -18,7 +18,7 @@ from topomerge.extraction.topology import rooms_with_floor
 from topomerge.extraction.walked_doors import ONLY_WALKED_CHANCE
 from topomerge.types import Array, TopometricMap
 
-NO_DOOR_SHOWN = 0.5  # probability below which the likeliest door that plans and walls show together is none
+NO_DOOR_SHOWN = 0.25  # probability below which the likeliest door that plans and walls show together is none
 SURE_CUT = 0.85  # probability that two rooms part where a plan narrows: true doors are surer
 
 
