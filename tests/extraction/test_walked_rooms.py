@@ -23,13 +23,15 @@ from topomerge.types import PointCloud, TopometricMap
 WAY = np.column_stack([np.full(13, 3.0), np.linspace(1.0, 7.0, 13), np.full(13, 1.5)])
 
 
-def passed_on_foot(cut: float) -> tuple[Floor, TopometricMap, Scan]:
+def passed_on_foot(cut: float, part: float = 10.0) -> tuple[Floor, TopometricMap, Scan]:
     """Two rooms that the plan network parts with this probability, of which nothing is known but that somebody went from the one
-    into the other."""
+    into the other; the smaller one has so many m2."""
     scene = Scene().shell(0, 0, 6, 8).wall((0, 4), (2.2, 4)).wall((3.8, 4), (6, 4))
     scan, _, floor, map = rooms_and_passages(scene.points(), 0.1, PRESETS["default"], Stopwatch(None))
     assert len(map.rooms) == 2
-    walked, doubt = with_walked_doors(replace(map, edges=map.edges[:0]), WAY)
+    rooms = map.rooms.copy()
+    rooms["area"] = (part, 20.0)
+    walked, doubt = with_walked_doors(replace(map, rooms=rooms, edges=map.edges[:0]), WAY)
     assert not doubt and walked.edges["confidence"].tolist() == [ONLY_WALKED_CHANCE]
     return replace(floor, door_probability={pair_of(*rooms_with_floor(floor).tolist()): cut}), walked, scan
 
@@ -40,13 +42,18 @@ def test_two_rooms_that_the_plan_hardly_parts_are_one():
     assert group is not None and len(set(group[rooms_with_floor(floor)].tolist())) == 1
     one = topometric_map(scan.grid, gathered(floor, group), PRESETS["default"].standing_height)
     assert len(one.rooms) == 1 and not len(one.edges)
-    assert one.rooms["area"].sum() == pytest.approx(map.rooms["area"].sum(), rel=0.1)
+    assert one.rooms["area"].sum() == pytest.approx(48.0, rel=0.1)
 
 
 def test_rooms_that_the_plan_parts_surely_stay_two():
     floor, map, _ = passed_on_foot(0.99)
     assert walked_rooms(map, floor, {}) is None
     assert walked_rooms(map, replace(floor, door_probability={}), {}) is None
+
+
+def test_two_large_rooms_stay_two():
+    floor, map, _ = passed_on_foot(0.6, part=15.0)
+    assert walked_rooms(map, floor, {}) is None
 
 
 @pytest.mark.parametrize(("likely", "one"), [(0.1, True), (0.4, False)])

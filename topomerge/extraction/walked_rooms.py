@@ -19,6 +19,7 @@ from topomerge.extraction.walked_doors import ONLY_WALKED_CHANCE
 from topomerge.types import Array, TopometricMap
 
 NO_DOOR_SHOWN = 0.25  # probability below which the likeliest door that plans and walls show together is none
+LARGEST_PART = 12.0  # m2 of the smaller one: shelves cut off a part of a room, what is larger is probably a room
 SURE_CUT = 0.85  # probability that two rooms part where a plan narrows: true doors are surer
 
 
@@ -34,7 +35,8 @@ def walked_rooms(map: TopometricMap, floor: Floor, likeliest: Mapping[Pair, floa
     group = np.arange(int(number.max(initial=-1)) + 1)
     for a, b in only_walked["rooms"].tolist():
         cut = floor.door_probability.get(pair_of(int(number[a]), int(number[b])), 1.0)
-        if likeliest.get(pair_of(a, b), 0.0) < NO_DOOR_SHOWN and cut < SURE_CUT:
+        part = float(map.rooms["area"][[a, b]].min())
+        if likeliest.get(pair_of(a, b), 0.0) < NO_DOOR_SHOWN and cut < SURE_CUT and part < LARGEST_PART:
             first, second = sorted(group[number[[a, b]]].tolist())
             group[group == second] = first
     return None if (group == np.arange(len(group))).all() else group
