@@ -26,7 +26,7 @@ from topomerge.matching.room_matcher import (
 )
 from topomerge.types import Array
 
-PARTS = {  # that an ablation leaves out, and the layers that tell of them
+MATCHER_PARTS = {  # that an ablation leaves out, and the layers that tell of them
     "votes": ("votes", "agree"),
     "ways": ("way_out",),
     "facts": ("facts",),
@@ -104,16 +104,16 @@ class RoomMatcher(nn.Module):
         self.sharpness, self.likeness = nn.Parameter(torch.tensor(1.0)), nn.Parameter(torch.tensor(0.5))
 
     def leave_out(self, parts: Sequence[str]) -> None:
-        """Make parts (of `PARTS`) give 0 for good, for ablations: files of weights have the same shape.
+        """Make parts (of `MATCHER_PARTS`) give 0 for good, for ablations: files of weights have the same shape.
 
         Raises:
             InputError: an unknown part.
         """
         for part in parts:
-            if part not in PARTS:
-                raise InputError(f"without: unknown {part!r}; {', '.join(PARTS)} are possible")
+            if part not in MATCHER_PARTS:
+                raise InputError(f"without: unknown {part!r}; {', '.join(MATCHER_PARTS)} are possible")
             for name, weights in self.named_parameters():
-                if set(name.split(".")) & set(PARTS[part]):
+                if set(name.split(".")) & set(MATCHER_PARTS[part]):
                     torch.nn.init.zeros_(weights).requires_grad_(False)
 
     def fit_facts(self, facts: Array) -> None:

@@ -101,7 +101,7 @@ class RoomMatching(NetworkTask):
     data: name of a set of pairs (`cache`/<name>.jsonl) or a manifest, and validation the one that is watched, as of `embedding`.
     views: of each map that are changed, beside the one that is as it is.
     width: numbers of a room within the network; layers: of attention.
-    without: parts that are left out (`models.room_matcher.PARTS`): votes, ways, facts, within, across.
+    without: parts that are left out (`models.room_matcher.MATCHER_PARTS`): votes, ways, facts, within, across.
     wrong_turn: weight of pairs at a wrong turn; turn: of telling it from the right one.
     steps: of an epoch; warmup: those in which the rate rises.
     """
