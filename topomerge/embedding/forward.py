@@ -103,7 +103,7 @@ class Forward:
             kernel = self._get(f"{name}.convolutions.{k}.weight", (wide, x.shape[1], 3, 3)) * factor[:, None, None, None]
             rows = kernel.transpose(2, 3, 1, 0).reshape(-1, wide).astype(np.float32)
             x = nn.convolution(x, rows, (bias - factor * mean).astype(np.float32), stride=2)
-        flat = x.reshape(len(x), -1).astype(np.float64)
+        flat = x.reshape(len(x), int(np.prod(x.shape[1:]))).astype(np.float64)
         return self._linear(f"{name}.out", flat)
 
     def _edges(self, graph: Mapping[str, Array]) -> Array | None:
