@@ -50,13 +50,14 @@ def with_plan(pair: Pair, building: Building) -> Pair:
 
 def draw(building: Building, storey: int = 0) -> Flat:
     """Walls and floor of a storey; inner doors are open, outer ones shut."""
-    room = draw_floors(building, DRAWING_CELL).room[storey] >= 0
-    return _flat(building, inner_doors(building, storey), room, np.zeros(room.shape, bool))
+    floors = draw_floors(building, DRAWING_CELL)
+    room = floors.room[storey] >= 0
+    return _flat(building, floors.origin, inner_doors(building, storey), room, np.zeros(room.shape, bool))
 
 
-def _flat(building: Building, doors: Array, room: Array, ink: Array) -> Flat:
+def _flat(building: Building, origin: Array, doors: Array, room: Array, ink: Array) -> Flat:
     """The drawing of the cells (rows, columns) bool of rooms, with doors, and with lines that are no walls."""
-    door, origin = np.zeros(room.shape, bool), draw_floors(building, DRAWING_CELL).origin
+    door = np.zeros(room.shape, bool)
     for one in doors:
         _open(one, door, origin)
     walls = ~room & ~door & (ndimage.distance_transform_edt(~room) * DRAWING_CELL <= DRAWN_WALL)
@@ -87,7 +88,8 @@ def architects_drawing(building: Building, rooms: Array, storey: int, rng: np.ra
     for line in lines:
         row, column = floors.cells(_along(line)).T
         ink[row, column] = True
-    flat = _flat(building, doors, sheet, ink & sheet).moved(replace(frame, translation=(*frame.translation[:2], 0.0)))
+    flat = _flat(building, floors.origin, doors, sheet, ink & sheet)
+    flat = flat.moved(replace(frame, translation=(*frame.translation[:2], 0.0)))
     height = frame.translation[2] + frame.scale * float(building.storeys["floor"][storey])
     outlined = tuple(moved_room(room, frame) for room in building.rooms)
     return labelled(raise_flat(replace(flat, rooms=()), height), outlined, storey)

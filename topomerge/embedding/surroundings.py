@@ -66,9 +66,9 @@ def _cut(map_sheet: Mapping[str, Array], middles: Array, number: Array, side: in
     planes = _means(planes, step)
     out = np.zeros((len(middles), side, side, len(CROP_PLANES)), np.uint8)
     for k, (x, y) in enumerate(middles):
-        out[k, ..., :-1] = planes[x : x + reach : step, y : y + reach : step][:side, :side]
+        out[k, ..., :-1] = planes[x : x + reach : step, y : y + reach : step]
         own = room[x : x + reach, y : y + reach] == number[k]
-        out[k, ..., -1] = _means(np.where(own, np.uint8(255), np.uint8(0))[..., None], step)[::step, ::step, 0]
+        out[k, ..., -1] = own.reshape(side, step, side, step).sum(axis=(1, 3)) * 255 // step**2
     return out
 
 
