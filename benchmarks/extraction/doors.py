@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.extraction.doors --write docs/results/rooms.md`` scans buildings of the validation list by a laser
 scanner and a depth camera at 2.5 cm (``--dev``: of the training list, to develop on), most doors with frames, and makes a
-map of each with and without `extraction.elevations`. Scans are kept under ``cache/scans/``.
+map of each with and without `extraction.elevations`. With ``--painted`` no door has a frame, and maps are made with the
+colours or intensities of the scan and without. Scans are kept under ``cache/scans/``.
 
 A true door between two visited rooms is there if the map has one within 0.5 m. One that the map calls shut is right where a shut
 door is. Doors of the map that lead to rooms that were only looked into count nowhere, as in the other tables.
@@ -14,6 +15,7 @@ import argparse
 import os
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -30,17 +32,25 @@ from topomerge.extraction.extract import extract
 from topomerge.metrics import match_places
 from topomerge.types import Array, TopometricMap
 
-DOOR_SEEDS, TRAINING = 800_720, 5_700  # first seeds
+DOOR_SEEDS, PAINTED_SEEDS, TRAINING = 800_720, 800_760, 5_700  # first seeds
 FRAMES = 0.7  # share of the doors with frames and handles
 STATES = ("open", "half", "shut")
+SHOWN_BY = PLAN, WALLS, COLOURS = "plan", "plan and walls", "plan, walls and colours"
 
 DOOR_COLUMNS = ("sensor", "doors by", "true doors", *STATES)
 DOOR_COLUMNS += ("precision", "called shut: right", "edges P", "edges R", "rooms IoU", "s")
 Row = dict[str, Any]
 
 
-def cases(development: bool) -> list[Case]:
-    """Every kind of building by both sensors."""
+def cases(development: bool, painted: bool = False) -> list[Case]:
+    """Every kind of building by both sensors; painted: by a laser scanner with colours or intensities, and by a depth camera."""
+    if painted:
+        first = TRAINING + 40 if development else PAINTED_SEEDS
+        shades = [(kind, *s) for s in (("tls", "colour"), ("tls", "intensity"), ("depth", "colour")) for kind in BUILDING_KINDS]
+        return [
+            Case("painted", "procedural", k, s, first + i, rooms=8, difficulty=(("frames", 0.0),), spacing=0.025, shades=shade)
+            for i, (k, s, shade) in enumerate(shades)
+        ]
     first = TRAINING if development else DOOR_SEEDS
     made = [(kind, sensor) for sensor in ("tls", "depth") for kind in BUILDING_KINDS]
     return [
@@ -49,13 +59,14 @@ def cases(development: bool) -> list[Case]:
     ]
 
 
-def judged(case: Case, scan: Scan, walls: bool) -> Row:
-    """Counts of one map."""
+def judged(case: Case, scan: Scan, how: str) -> Row:
+    """Counts of one map, made as one of `SHOWN_BY` says."""
     assert scan.truth is not None
     truth = scan.truth
     began = process_time()
-    map = extract(scan.cloud, walls=walls)
-    row: Row = {"walls": walls, "sensor": case.sensor, "seconds": process_time() - began}
+    map = extract(scan.cloud if how == COLOURS else replace(scan.cloud, colors=None), walls=how != PLAN)
+    sensor = f"{case.sensor}, {case.shades}" if case.shades else case.sensor
+    row: Row = {"how": how, "sensor": sensor, "seconds": process_time() - began}
     verdict = judge(map, truth)
     row |= {"edges": np.array([verdict.edges.precision, verdict.edges.recall]), "iou": verdict.rooms.iou}
     state = make_building(case.building, case.seed, case.storeys, Difficulty(**dict(case.difficulty))).doors["state"]
@@ -89,11 +100,11 @@ def _looked_into(map: TopometricMap, edges: Array) -> Array:
 
 
 def table(rows: list[Row]) -> str:
-    """Sums over all maps of a sensor, with walls looked at and without."""
+    """Sums over all maps of a sensor, by what shows the doors."""
     lines = [f"| {' | '.join(DOOR_COLUMNS)} |", "|" + "---|" * len(DOOR_COLUMNS)]
-    for sensor in ("tls", "depth", "all"):
-        for walls in (False, True):
-            some = [r for r in rows if r["walls"] == walls and sensor in (r["sensor"], "all")]
+    for sensor in (*dict.fromkeys(r["sensor"] for r in rows), "all"):
+        for how in SHOWN_BY:
+            some = [r for r in rows if r["how"] == how and sensor in (r["sensor"], "all")]
             if not some:
                 continue
             total = {name: sum(r[name] for r in some) for name in (*STATES, "right", "said")}
@@ -101,7 +112,6 @@ def table(rows: list[Row]) -> str:
             shares = [share(total[name]) for name in (*STATES, "right", "said")]
             edges = np.nanmean([r["edges"] for r in some], axis=0)
             rest = [*edges, np.mean([r["iou"] for r in some]), np.mean([r["seconds"] for r in some])]
-            how = "plan and walls" if walls else "plan"
             lines.append(f"| {sensor} | {how} | {count} | {' | '.join(shares)} | {' | '.join(f'{v:.2f}' for v in rest)} |")
     return "\n".join(lines)
 
@@ -116,20 +126,23 @@ def main(words: list[str] | None = None) -> int:
     """See the text at the top."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.extraction.doors", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--write", type=Path, help="a document whose section between the marks `doors` is written anew")
+    parser.add_argument("--painted", action="store_true", help="with colours and without; the marks are `colours`")
     parser.add_argument("--dev", action="store_true", help="buildings of the training list")
     parser.add_argument("--scans", type=Path, default=Path("cache/scans"), help="where scans are kept")
     chosen = parser.parse_args(words)
     data = os.environ.get("TOPOMERGE_DATA")
     rows = []
-    for case in cases(chosen.dev):
+    for case in cases(chosen.dev, chosen.painted):
         scan = load(case, chosen.scans, Path(data) if data else None)
-        rows += [judged(case, scan, walls) for walls in (False, True)]
-        print(case.name, {k: v for k, v in rows[-1].items() if k not in ("walls", "sensor")}, file=sys.stderr, flush=True)
+        rows += [judged(case, scan, how) for how in ((WALLS, COLOURS) if chosen.painted else (PLAN, WALLS))]
+        print(case.name, {k: v for k, v in rows[-1].items() if k not in ("how", "sensor")}, file=sys.stderr, flush=True)
     text = table(rows)
     print(text)
     if chosen.write:
-        command = f"`python -m benchmarks.extraction.doors --write {chosen.write}`"
-        replace_section(chosen.write, f"{command}\n\n{len(rows) // 2} maps.\n\n{text}", "doors")
+        painted = "--painted " * chosen.painted
+        command = f"`python -m benchmarks.extraction.doors {painted}--write {chosen.write}`"
+        section = "colours" if chosen.painted else "doors"
+        replace_section(chosen.write, f"{command}\n\n{len(rows) // 2} maps.\n\n{text}", section)
     return 0
 
 

@@ -38,6 +38,7 @@ class Case:
         turn: degrees by which the cloud is turned about the vertical.
         shuffle: are its points given in another order?
         voxel: m, edge of the cells.
+        shades: colour or intensity, of a scan that is painted.
     """
 
     set: str
@@ -55,6 +56,7 @@ class Case:
     turn: float = 0.0
     shuffle: bool = False
     voxel: float = 0.1
+    shades: str = ""
 
     @property
     def place(self) -> str:
@@ -67,7 +69,15 @@ class Case:
         """For people and file names."""
         *above, plan = Path(self.building).parts
         plan = plan if self.source != "r2v" else f"{above[-1][-6:]}_{plan}"
-        words = [self.set, self.source if self.source != "procedural" else "", plan, self.seed or "", self.sensor, self.spoil]
+        words = [
+            self.set,
+            self.source if self.source != "procedural" else "",
+            plan,
+            self.seed or "",
+            self.sensor,
+            self.spoil,
+            self.shades,
+        ]
         words += [f"{k}{getattr(self, k):g}" for k in ("day", "thin", "turn", "shuffle") if getattr(self, k)]
         words += [f"voxel{self.voxel:g}"] if self.voxel != 0.1 else []
         return re.sub(r"[^\w.-]+", "_", "-".join(str(w) for w in words if w))
@@ -77,6 +87,8 @@ class Case:
         """Hash of what the bytes of the scan depend on."""
         same = {"set": "", "thin": 0.0, "turn": 0.0, "shuffle": False, "voxel": 0.0}
         inputs = {**asdict(self), **same, "format": SCAN_FORMAT}
+        if not self.shades:  # files from before there were any
+            del inputs["shades"]
         return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:20]
 
 
@@ -116,7 +128,8 @@ def varied(scan: Scan, case: Case) -> Scan:
         rows = np.random.default_rng(0).permutation(rows)
     if len(rows) < len(cloud) or case.shuffle:
         pose_of = None if cloud.pose_of is None else cloud.pose_of[rows]
-        cloud = replace(cloud, points=cloud.points[rows], pose_of=pose_of)
+        colors = None if cloud.colors is None else cloud.colors[rows]
+        cloud = replace(cloud, points=cloud.points[rows], pose_of=pose_of, colors=colors)
     if case.turn:
         frame = Sim3(float(np.radians(case.turn)))
         cloud, truth = moved(cloud, frame), None if truth is None else in_frame(truth, frame)
@@ -128,6 +141,8 @@ def _arrays(scan: Scan) -> dict[str, Array]:
     out: dict[str, Array] = {"points": cloud.points, "shift": cloud.shift, "source": np.array(cloud.source)}
     if cloud.poses is not None and cloud.pose_of is not None:
         out |= {"poses": cloud.poses, "pose_of": cloud.pose_of}
+    if cloud.colors is not None:
+        out["colors"] = cloud.colors
     if cloud.free is not None:
         out |= {"free": cloud.free.cells, "free_origin": cloud.free.origin, "free_edge": np.array(cloud.free.edge)}
     if truth is not None:
@@ -142,6 +157,7 @@ def _scan(arrays: dict[str, Array]) -> Scan:
         free = VoxelGrid.from_cells(arrays["free"], arrays["free_origin"], float(arrays["free_edge"]))
     cloud = PointCloud(
         arrays["points"],
+        colors=arrays.get("colors"),
         shift=arrays["shift"],
         poses=arrays.get("poses"),
         pose_of=arrays.get("pose_of"),

@@ -114,7 +114,7 @@ def simulated(case: Case, building: Building) -> Scan:
     if case.day:
         building = session(building, Difficulty(**dict(case.difficulty)), rng)
     visited = _visited(case, building)
-    sensor = get_sensor(case.sensor)
+    sensor = replace(get_sensor(case.sensor), shades=case.shades)
     if case.spoil == "drift":
         sensor = replace(sensor, drift=ADRIFT)
     spacing = case.spacing or None

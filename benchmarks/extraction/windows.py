@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 import shapely
+from topomerge.datasets.buildings.panes import glazed
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.core.difficulty import Difficulty
-from topomerge.datasets.pairs.wall_examples import glazed, load_walls
+from topomerge.datasets.pairs.wall_examples import load_walls
 
 from benchmarks.extraction import doors
 from benchmarks.extraction.cases import BUILDING_KINDS

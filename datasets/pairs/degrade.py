@@ -80,7 +80,7 @@ def _holed(cloud: PointCloud, share: float, rng: np.random.Generator) -> PointCl
 
 def taken(cloud: PointCloud, rows: Array) -> PointCloud:
     """Some points of a cloud."""
-    some = {n: v[rows] for n in ("points", "colors", "labels", "pose_of") if (v := getattr(cloud, n)) is not None}
+    some = {n: v[rows] for n in ("points", "colors", "labels", "pose_of", "intensities") if (v := getattr(cloud, n)) is not None}
     return replace(cloud, **some)
 
 

@@ -46,7 +46,8 @@ class PlanRecipe:
         split: train, validation or test: of which real plans, and in which range the seeds lie.
         scans: how many; seed: of the first one, from the beginning of the split's range on.
         folder: of the real data; empty: procedural buildings only.
-        flat: slices and grid maps, where walls are learned from; sparse: share of scans that lose most of their points, there.
+        flat: slices and grid maps, where walls are learned from; sparse: share of scans that lose most of their points, there;
+            painted: share of scans with colours or intensities, there.
     """
 
     name: str = "plan_scans"
@@ -56,6 +57,7 @@ class PlanRecipe:
     folder: str = ""
     flat: bool = False
     sparse: float = 0.0
+    painted: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

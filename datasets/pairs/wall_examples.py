@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 from topomerge.datasets.buildings.erect import erect
+from topomerge.datasets.buildings.panes import panes
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.buildings.profiles import BUILDING_KINDS
 from topomerge.datasets.core.builder import Report, Row, Say, Sharing, make_item
-from topomerge.datasets.core.building import SURFACES, Building
+from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.pairs.degrade import taken
 from topomerge.datasets.pairs.flat import keys, squares
@@ -54,7 +55,7 @@ from topomerge.io import archive
 from topomerge.io.listing import plain
 from topomerge.types import ROOM_DTYPE, Array, PointCloud, Sim3, TopometricMap, VoxelGrid
 
-WALL_FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names
+WALL_FORMAT = 3  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.6, "r2v": 0.25, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.35, "depth": 0.25, "lidar": 0.2, "tablet": 0.12, "mono": 0.08}
 MAP_CELL = 0.1  # m
@@ -63,6 +64,8 @@ FINER = (0.5, 1.0)  # of a sensor's spacing
 COARSE_SHARE = 0.15  # of the scans that are seen in the cells of the map
 DRAWN_EVERY = 8  # seeds: one is a grid map of the plan, as robots and draughtsmen make them
 EXACT_SHARE = 0.5  # of the scans without drift
+INTENSITY_SHARE = 0.35  # of the painted scans: they have no colours
+FRAMES, FRAMES_PAINTED = (0.3, 1.0), (0.0, 0.8)  # share of the doors with a frame and handles; colour helps where there is none
 SLICE_SHARE, POSED_SHARE = 0.6, 0.6  # of flat maps by a 2D laser, and of these with the sensor's places
 LOST_BY_CHANCE, SHARE_LEFT = 0.5, (0.03, 0.3)
 SPACING_LEFT = (0.05, 0.2)  # m
@@ -71,16 +74,17 @@ ASKEW = 0.26  # sine of the angle between a wall and a strip along it
 SAME_FLOOR = 0.6  # m between floors of one storey
 WALL_ARRAYS = ("first", "strips", "truth", "doors", "faces")
 MAP_ARRAYS, ROOMS_HELD = ("edges", "storeys", "navigable_room"), ("storey", "completeness")
-LOW_SILL = 0.3  # m: panes that begin lower are walls of glass
 NO_WALLS = Elevations(np.zeros(0, FACE_DTYPE), np.zeros(1, np.int64), np.zeros((0, DEPTHS, STRIP_CHANNELS), np.float32))
 
 
 @dataclass(frozen=True)
 class WallItem(PlanItem):
-    """As of plans: all that the bytes of one file depend on; is it a slice or a grid map, does it lose most of its points?"""
+    """As of plans: all that the bytes of one file depend on; is it a slice or a grid map, does it lose most of its points,
+    and has it colours or intensities (`paint.SHADES`)?"""
 
     flat: bool = False
     sparse: bool = False
+    shades: str = ""
 
     @property
     def name(self) -> str:
@@ -101,6 +105,7 @@ class WallExample:
         storeys: what probably stands in the columns of its plans.
         faces: (F,) FACE_DTYPE.
         source: sensor/where the building is from.
+        colours: (n, 13, 4) float16, as of `Elevations`; None: it has none.
     """
 
     first: Array
@@ -111,13 +116,14 @@ class WallExample:
     storeys: tuple[ClassifiedStorey, ...]
     faces: Array
     source: str
+    colours: Array | None = None
 
     @property
     def elevations(self) -> Elevations | None:
         """The walls as the extraction has them; None of a flat map."""
         if not len(self.faces):
             return None
-        return Elevations(self.faces, self.first, (self.strips / np.float32(255)).astype(np.float32))
+        return Elevations(self.faces, self.first, (self.strips / np.float32(255)).astype(np.float32), self.colours)
 
 
 def build_walls(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
@@ -128,7 +134,9 @@ def build_walls(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: No
 def draw_wall_item(seed: int, plans: Plans, recipe: PlanRecipe) -> WallItem:
     """The item of a seed; `make_walls` draws the same numbers again."""
     rng = np.random.default_rng([seed, 7])
-    kind = recipe.flat, bool(np.random.default_rng([seed, 9]).random() < recipe.sparse)
+    sparse, painted, bright = (np.random.default_rng([seed, k]).random() for k in (9, 11, 12))
+    shades = "" if painted >= recipe.painted else "intensity" if bright < INTENSITY_SHARE else "colour"
+    kind = recipe.flat, bool(sparse < recipe.sparse), shades
     source = str(rng.choice(list(SOURCE_SHARES), p=list(SOURCE_SHARES.values())))
     entries = plans.get(source, ())
     if not entries:
@@ -148,6 +156,8 @@ def wall_arrays(item: WallItem, example: WallExample) -> dict[str, Array]:
     arrays: dict[str, Any] = {name: getattr(example, name) for name in WALL_ARRAYS}
     arrays |= {f"map.{name}": getattr(example.map, name) for name in MAP_ARRAYS}
     arrays |= {f"rooms.{name}": example.map.rooms[name] for name in ROOMS_HELD}
+    if example.colours is not None:
+        arrays["colours"] = example.colours
     for k, storey in enumerate(example.storeys):
         arrays[f"plan{k}.classes"] = np.rint(255 * storey.probability).astype(np.uint8)
         arrays[f"plan{k}.frame"] = np.array([*storey.origin, storey.edge, storey.height])
@@ -175,25 +185,26 @@ def load_walls(path: Path) -> WallExample:
         x, y, edge, height = arrays[f"plan{k}.frame"].tolist()
         plans.append(ClassifiedStorey(arrays[f"plan{k}.classes"] / np.float32(255), np.array([x, y]), edge, height))
     walls = {name: arrays[name] for name in WALL_ARRAYS}
-    return WallExample(**walls, map=map, storeys=tuple(plans), source=str(arrays["source"]))
+    return WallExample(**walls, map=map, storeys=tuple(plans), source=str(arrays["source"]), colours=arrays.get("colours"))
 
 
 def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     """The walls of one scan."""
     seed = item.seed
     rng = np.random.default_rng([seed, 8])
-    difficulty = replace(draw_difficulty(rng), frames=float(rng.uniform(0.3, 1.0)))
+    frames = FRAMES_PAINTED if item.shades else FRAMES
+    difficulty = replace(draw_difficulty(rng), frames=float(rng.uniform(*frames)))
     if plan is not None:
         building = erect([plan], difficulty, rng, f"{item.source}-{seed}")
     else:
         building = make_building(str(rng.choice(BUILDING_KINDS)), seed, 1, difficulty)
     visited = part(building, int(rng.integers(*ROOMS_VISITED)), rng)
-    name, cloud, shift = _flat(building, visited, seed, rng) if item.flat else _seen(building, visited, seed, rng)
+    name, cloud, shift = _flat(building, visited, seed, rng) if item.flat else _seen(building, visited, item, rng)
     frame = Sim3(float(rng.uniform(-np.pi, np.pi)))
     cloud = replace(moved(thinned(cloud, seed) if item.sparse else cloud, frame), rooms=())
     scan, _, floor, map = rooms_and_passages(cloud, MAP_CELL, PRESETS["default"], Stopwatch())
     cells = scan.grid if rng.random() < COARSE_SHARE else voxelise(cloud, FINE_CELL)
-    walls = NO_WALLS if item.flat else wall_elevations(map, cells)
+    walls = NO_WALLS if item.flat else wall_elevations(map, cells, scan.shades)
     if not item.flat and not len(walls.faces):
         raise InputError(f"{seed}: no wall was seen")
     strips, truth = np.rint(255 * walls.strips).astype(np.uint8), true_classes(building, walls, frame, shift)
@@ -201,7 +212,10 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     if shift is not None:
         doors = doors - shift[1][cKDTree(shift[0] + shift[1]).query(doors)[1]]
     source = f"{name}/{item.source}"
-    return WallExample(walls.first, strips, truth, frame.apply(doors), map, floor.classified_storeys, walls.faces, source)
+    colours = None if walls.colours is None else walls.colours.astype(np.float16)
+    return WallExample(
+        walls.first, strips, truth, frame.apply(doors), map, floor.classified_storeys, walls.faces, source, colours
+    )
 
 
 def _flat(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
@@ -212,9 +226,10 @@ def _flat(building: Building, visited: Array, seed: int, rng: np.random.Generato
     return "laser2d", cloud if rng.random() < POSED_SHARE else replace(cloud, poses=None, pose_of=None), shift
 
 
-def _seen(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
+def _seen(building: Building, visited: Array, item: WallItem, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
     """How a building was seen, its cloud, and places of it with what undoes its drift there (None: it has none)."""
-    sensor = get_sensor(str(rng.choice(list(SENSOR_SHARES), p=list(SENSOR_SHARES.values()))))
+    sensor, seed = get_sensor(str(rng.choice(list(SENSOR_SHARES), p=list(SENSOR_SHARES.values())))), item.seed
+    sensor = replace(sensor, shades=item.shades)
     if seed % DRAWN_EVERY == DRAWN_EVERY - 1:
         return "drawn", drawn_map(building, visited, rng), None
     if rng.random() < EXACT_SHARE:
@@ -266,25 +281,3 @@ def true_classes(building: Building, walls: Elevations, frame: Sim3, shift: tupl
 def _doors(building: Building, shut: bool) -> Sequence[tuple[float, ...]]:
     doors = building.doors[(building.doors["state"] == "shut") == shut]
     return [(*d["centre"].tolist(), *(float(d[k]) for k in ("direction", "width", "thickness"))) for d in doors]
-
-
-def panes(building: Building) -> list[tuple[float, ...]]:
-    """Windows: their middle at the height of the floor, direction of the normal (rad), width and depth of the reveal (m)."""
-    return [(*place, 0.3) for *place, _, _ in glazed(building)]
-
-
-def glazed(building: Building) -> list[tuple[float, ...]]:
-    """Windows: middle at the height of the floor, direction of the normal (rad), width, sill and head above the floor (m)."""
-    glass = building.triangles[building.labels == SURFACES.index("glass")]
-    windows = []
-    for triangle in glass[::2]:  # two make a pane
-        corners = building.vertices[triangle].astype(float)
-        low, high = corners[:, 2].min(), corners[:, 2].max()
-        floors = building.storeys["floor"]
-        floor = float(floors[floors <= low + LOW_SILL].max(initial=floors[0]))
-        ends = corners[np.argsort(corners[:, 2])][:2, :2] if corners[1, 2] == low else corners[[0, 2], :2]
-        wide = ends[1] - ends[0]
-        if low > floor + LOW_SILL and high > low and np.hypot(*wide) > 0.2:
-            direction = float(np.arctan2(wide[1], wide[0]) + np.pi / 2)
-            windows.append((*ends.mean(axis=0).tolist(), floor, direction, float(np.hypot(*wide)), low - floor, high - floor))
-    return windows

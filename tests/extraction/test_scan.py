@@ -65,3 +65,43 @@ def test_what_looked_wrong_is_told_with_the_error() -> None:
         read_scan(PointCloud(np.zeros((0, 3), np.float32), warnings=("all points were NaN",)), 0.1)
     with pytest.raises(InputError, match="^why$"), reasons(()):
         raise InputError("why")
+
+
+def coloured(many: int, k: int = 0) -> PointCloud:
+    """Points in a row of cells; the colour of each says where it is."""
+    points = np.column_stack([np.arange(many) % 250 / 10 + 0.05, np.full(many, k / 10.0), np.zeros(many)]).astype(np.float32)
+    at = (np.arange(many) % 250).astype(np.uint8)
+    return PointCloud(
+        points, np.array([100.0, 0, 0]), colors=np.column_stack([at, 255 - at, np.full(many, k + 1)]).astype(np.uint8)
+    )
+
+
+def test_each_held_point_has_its_own_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+    chunks = [coloured(3000, k) for k in range(4)]
+    whole = read_scan(chunks, 0.1).shades
+    assert whole is not None and len(whole[0]) == 12_000
+    monkeypatch.setattr("topomerge.extraction.scan.MOST_SHADES_HELD", 5000)
+    some = read_scan(chunks, 0.1).shades
+    assert some is not None and 1500 < len(some[0]) <= 5000
+    for points, colours in (whole, some):
+        assert np.allclose(points[:, 0] - 100.05, colours[:, 0] / 10, atol=1e-4) and points.dtype == np.float64
+        assert np.allclose(points[:, 1] * 10 + 1, colours[:, 2], atol=1e-4)
+    assert np.bincount(some[1][:, 2])[1:].min() > 0.15 * len(some[0])  # of all chunks alike
+    again = read_scan(chunks, 0.1).shades
+    assert again is not None and np.array_equal(again[0], some[0])
+
+
+def test_intensities_are_grey_and_nothing_that_is_none_has_a_shade() -> None:
+    cloud = coloured(2000)
+    bright = np.linspace(-7000.0, 900.0, 2000).astype(np.float32)
+    bright[5] = np.nan
+    shades = read_scan(PointCloud(cloud.points, intensities=bright), 0.1).shades
+    assert shades is not None and len(shades[0]) == 1999 and (shades[1] == shades[1][:, :1]).all()
+    assert shades[1][0, 0] < 31 and shades[1][-1, 0] > 224 and (np.diff(shades[1][:, 0].astype(int)) >= 0).all()
+    both = read_scan(PointCloud(cloud.points, colors=cloud.colors, intensities=bright), 0.1).shades
+    assert both is not None and (both[1][:, 1] == 255 - both[1][:, 0]).all()
+    black = np.zeros((2000, 3), np.uint8)
+    nothing: list[dict[str, Any]] = [{}, {"intensities": np.zeros(2000, np.float32)}, {"colors": black}, {"colors": black + 7}]
+    nothing.append({"intensities": np.full(2000, np.nan, np.float32)})
+    for more in nothing:
+        assert read_scan(PointCloud(cloud.points, **more), 0.1).shades is None

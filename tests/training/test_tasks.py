@@ -17,6 +17,7 @@ import pytest
 from tests.training import tiny
 from topomerge.embedding.engineered import scaled
 from topomerge.errors import InputError
+from topomerge.extraction.elevations.colour_network import weights as colour_weights
 from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, DoorCandidates, door_chance
 from topomerge.extraction.elevations.wall_network import place_probabilities
 from topomerge.extraction.plans.door_classifier import door_probability
@@ -28,7 +29,15 @@ from topomerge.fusion.verify import model
 from topomerge.io.weight_files import VARIABLE, weights_file
 from topomerge.matching.odds import odds_weights
 from topomerge.matching.room_matcher import matcher_weights
-from topomerge.training import door_classification, place_evidence, plan_segmentation, room_matcher, wall_doors, wall_segmentation
+from topomerge.training import (
+    door_classification,
+    place_evidence,
+    plan_segmentation,
+    room_matcher,
+    wall_colours,
+    wall_doors,
+    wall_segmentation,
+)
 from topomerge.training.door_classification import door_scores
 from topomerge.training.judging import judge_task
 from topomerge.training.loop import State
@@ -41,6 +50,7 @@ NETWORKS = {
     "plan_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
     "door_classification": ["epochs=2", "batch=64", "hidden=4", "networks=2"],
     "wall_segmentation": ["epochs=2", "steps=2", "batch=4", "length=32", "hold_out=2", "widths=[4,4,8,8]"],
+    "wall_colours": ["epochs=2", "steps=2", "batch=4", "length=32", "hold_out=2", "width=8"],
     "place_evidence": ["epochs=2", "steps=2", "batch=8", "widths=[4,4,4]", "hold_out=2", "lookalikes=false"],
     "room_matcher": ["epochs=2", "steps=2", "batch=2", "width=8", "layers=1"],
 }
@@ -60,6 +70,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(door_classification, "door_examples", lambda *_: tiny.door_tables(320))
     walls = tiny.wall_files(tmp_path / "walls", 6)
     monkeypatch.setattr(wall_segmentation, "build_walls", lambda *_: (walls, None))
+    monkeypatch.setattr(wall_colours, "build_walls", lambda *_: (walls, None))
     monkeypatch.setattr(wall_doors, "build_walls", lambda *_: (walls, None))
     places = tiny.place_files(tmp_path / "places")
     monkeypatch.setattr(place_evidence, "hypothesis_files", lambda *_: places)
@@ -95,6 +106,7 @@ def read(task: str) -> Any:
         "place_evidence": lambda: place_weights()["a.w"],
         "room_matcher": lambda: matcher_weights()["rows.w"],
         "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
+        "wall_colours": lambda: colour_weights()["out.w"],
         "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(4, EDGE_DTYPE), signs, np.arange(4))),
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "room_odds": lambda: np.array(room_weights()["entered"]),
@@ -133,7 +145,7 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
 @pytest.mark.parametrize("task", list(NETWORKS))
 def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
     jobs = {"plan_segmentation": plan_segmentation.PlanJob, "door_classification": door_classification.DoorJob}
-    jobs |= {"wall_segmentation": wall_segmentation.WallJob}
+    jobs |= {"wall_segmentation": wall_segmentation.WallJob, "wall_colours": wall_colours.ColourJob}
     kind = {**jobs, "place_evidence": place_evidence.PlaceJob, "room_matcher": room_matcher.MatcherJob}[task]
     train(settings_of(words(task, "name=whole")), quiet)
     step, seen = kind.step, []
@@ -182,6 +194,8 @@ def test_fits_learn_what_is_so(words) -> None:
         (["task=plan_segmentation", "crop=30"], "crop"),
         (["task=wall_segmentation", "length=31"], "length"),
         (["task=wall_segmentation", "widths=[4,4]"], "widths"),
+        (["task=wall_colours", "length=31"], "length"),
+        (["task=wall_colours", "classes=[1,2]"], "classes"),
         (["task=plan_segmentation", "loss.classes=[1,2]"], "loss.classes"),
         (["task=door_classification", "networks=0"], "networks"),
         (["task=merge_belief", "risk=0"], "risk"),
@@ -225,8 +239,10 @@ SIMULATED = {
     "plan_segmentation": [*NETWORKS["plan_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "door_classification": ["data=plan_scans", "data.scans=4", "data.seed=0", "epochs=2", "hold_out=2", "heldout.scans=1"],
     "wall_segmentation": [*NETWORKS["wall_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
+    "wall_colours": [*NETWORKS["wall_colours"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "wall_doors": [
-        *(f"{of}.scans=2" for of in ("data", "flat", "heldout", "heldout_flat")), "data.seed=0", "flat.seed=0", "folds=2",
+        *(f"{of}.scans=2" for of in ("data", "painted", "flat", "heldout", "heldout_painted", "heldout_flat")),
+        *(f"{of}.seed=0" for of in ("data", "painted", "flat")), "folds=2",
     ],
     "room_odds": ["data=plan_scans", "data.scans=4", "data.seed=0", "folds=2", "heldout.scans=1"],
     "place_evidence": [*NETWORKS["place_evidence"], *SMALL_GRIDS],

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from topomerge.blas import one_blas_thread
 from topomerge.extraction.distinct_doors import distinct_doors
+from topomerge.extraction.elevations.doorway_rooms import doors_inside_rooms
 from topomerge.extraction.elevations.doorways import place_classes
 from topomerge.extraction.elevations.elevation import wall_elevations
 from topomerge.extraction.elevations.wall_doors import with_wall_doors
@@ -17,8 +20,10 @@ from topomerge.extraction.floor_patches import without_patches
 from topomerge.extraction.free_space import free_space
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
+from topomerge.extraction.plans.inner_doors import INNER_DOOR_DTYPE
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.plans.plan_rooms import rooms_of_plans
+from topomerge.extraction.plans.storey_rooms import OtherSigns
 from topomerge.extraction.room_odds import with_room_odds
 from topomerge.extraction.scan import Scan, read_scan
 from topomerge.extraction.slices import is_slice, with_raised_slice
@@ -65,10 +70,15 @@ def extract(
     scan, navigable, floor, map = rooms_and_passages(source, voxel_size, p, watch, parts)
 
     watch.begin("odds of rooms, doors on walls", 0.87)
-    made, doubts, one = _with_odds_and_openings(map, scan, floor, p)
-    if one is not None and not parts:  # rooms of joined maps are what their parts say
-        floor = gathered(floor, one)
-        made, doubts, _ = _with_odds_and_openings(topometric_map(scan.grid, floor, p.standing_height), scan, floor, p)
+    made, doubts, again = _with_odds_and_openings(map, scan, floor, p)
+    if not parts:  # rooms of joined maps are what their parts say
+        if len(again.doors) and not isinstance(p, ThesisParameters):
+            signs = OtherSigns(doors=again.doors)
+            floor = rooms_of_plans(scan.grid, navigable, p.door, p.narrow, p.standing_height, signs)
+            made, doubts, again = _with_odds_and_openings(topometric_map(scan.grid, floor, p.standing_height), scan, floor, p)
+        if again.one is not None:
+            floor = gathered(floor, again.one)
+            made, doubts, _ = _with_odds_and_openings(topometric_map(scan.grid, floor, p.standing_height), scan, floor, p)
     map = made
 
     watch.begin("free space", 0.9)
@@ -114,7 +124,7 @@ def rooms_and_passages(
         floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
     else:
         door = p.slice_door if flat else p.door
-        floor = rooms_of_plans(scan.grid, navigable, door, p.narrow, p.standing_height, parts)
+        floor = rooms_of_plans(scan.grid, navigable, door, p.narrow, p.standing_height, OtherSigns(parts))
 
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
@@ -125,26 +135,36 @@ def rooms_and_passages(
     return scan, navigable, floor, map
 
 
+class _Reconsidered(NamedTuple):
+    """What walls and the sensor's way say of how the floors were cut: doors inside of rooms (`doorway_rooms.doors_inside_rooms`),
+    and rooms that are one (`walked_rooms`)."""
+
+    doors: Array = np.zeros(0, INNER_DOOR_DTYPE)
+    one: Array | None = None
+
+
 def _with_odds_and_openings(
     map: TopometricMap, scan: Scan, floor: Floor, p: Parameters
-) -> tuple[TopometricMap, list[str], Array | None]:
+) -> tuple[TopometricMap, list[str], _Reconsidered]:
     """The map with how likely each room is one, with the doors and windows that its walls show, and with the doors that the
-    sensor was carried through; what is odd about its way; and which rooms of the floor it proves to be one (`walked_rooms`)."""
+    sensor was carried through; what is odd about its way; and what these say of its rooms."""
     if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
-        return replace(map, rooms=with_outline_odds(map.rooms)), [], None
+        return replace(map, rooms=with_outline_odds(map.rooms)), [], _Reconsidered()
     map = with_room_odds(map, scan.rays)
-    walls = wall_elevations(map, scan.fine) if p.walls and scan.fine is not None and len(map.rooms) else None
+    walls = wall_elevations(map, scan.fine, scan.shades) if p.walls and scan.fine is not None and len(map.rooms) else None
     classes = None if walls is None else place_classes(walls)
-    one = None
+    again = _Reconsidered()
+    if walls is not None and classes is not None:
+        again = _Reconsidered(doors_inside_rooms(map, walls, classes))
     if p.walls:
         map, likeliest = with_wall_doors(map, floor.classified_storeys, walls, classes)
     map, doubt = with_walked_doors(map, scan.places)
     map = distinct_doors(map)
     if walls is not None:
-        one = walked_rooms(map, floor, likeliest)
+        again = again._replace(one=walked_rooms(map, floor, likeliest))
     if walls is not None and classes is not None:
         map = without_patches(with_windows(map, walls, classes), scan.places)
-    return map, [doubt] if doubt else [], one
+    return map, [doubt] if doubt else [], again
 
 
 def _doubts(map: TopometricMap) -> list[str]:

@@ -29,6 +29,7 @@ LIBRARY_MEMORY = 2 << 30  # bytes for all blocks, which take 0.2 GB
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLOR_FIELDS = ("colorRed", "colorGreen", "colorBlue")
+INTENSITY_FIELD = "intensity"
 INVALID_FIELDS = ("cartesianInvalidState", "sphericalInvalidState")
 
 
@@ -57,10 +58,11 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
         yield Piece(np.empty((0, 3)), poses=poses)
         done = 0
         for number, header in enumerate(headers):
-            for xyz, colors, count in _scan(path, file, header):
+            for xyz, colors, bright, count in _scan(path, file, header):
                 done += count
                 world = xyz @ poses[number, :3, :3].T + poses[number, :3, 3]
-                yield Piece(world, colors, pose_of=np.full(len(world), number, np.int32), done=done / total)
+                pose_of = np.full(len(world), number, np.int32)
+                yield Piece(world, colors, pose_of=pose_of, done=done / total, intensities=bright)
     finally:
         file.close()
 
@@ -74,15 +76,16 @@ def _pose(header: Any) -> Array:
     return pose(quaternion / norm if norm > 0 else np.array([1.0, 0, 0, 0]), np.asarray(header.translation, np.float64))
 
 
-def _scan(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | None, int]]:
-    """Blocks of one scan: points in the scanner's frame, colours, and how many rows were read."""
+def _scan(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | None, Array | None, int]]:
+    """Blocks of one scan: points in the scanner's frame, colours, intensities, and how many rows were read."""
     fields = set(header.point_fields)
     axes = next((a for a in (CARTESIAN, SPHERICAL) if fields >= set(a)), None)
     if axes is None:
         raise InputError(f"{path}: a scan has neither x y z nor range and angles; export it with coordinates")
     shades = COLOR_FIELDS if fields >= set(COLOR_FIELDS) else ()
     flags = [f for f in INVALID_FIELDS if f in fields]
-    data, buffers = file.make_buffers([*axes, *shades, *flags], min(BLOCK_POINTS, max(header.point_count, 1)))
+    lights = [INTENSITY_FIELD] if INTENSITY_FIELD in fields else []
+    data, buffers = file.make_buffers([*axes, *shades, *lights, *flags], min(BLOCK_POINTS, max(header.point_count, 1)))
     reader = header.points.reader(buffers)
     left = header.point_count
     try:
@@ -94,7 +97,8 @@ def _scan(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | N
                 valid &= rows[flag] == 0
             xyz = np.stack([rows[a] for a in axes], axis=1)[valid]
             colors = bytes8(np.stack([rows[c] for c in shades], axis=1)[valid]) if shades else None
-            yield (xyz if axes is CARTESIAN else _cartesian(xyz)), colors, count
+            bright = rows[INTENSITY_FIELD][valid].astype(np.float32) if lights else None
+            yield (xyz if axes is CARTESIAN else _cartesian(xyz)), colors, bright, count
     finally:
         reader.close()
     if left > 0:

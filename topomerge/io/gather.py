@@ -24,19 +24,20 @@ class _Part:
     colors: Array | None = None
     labels: Array | None = None
     pose_of: Array | None = None
+    intensities: Array | None = None
 
     def at(self, rows: Array | slice) -> _Part:
-        values = (self.points, self.colors, self.labels, self.pose_of)
+        values = (self.points, self.colors, self.labels, self.pose_of, self.intensities)
         return _Part(*(None if v is None else v[rows] for v in values))  # type: ignore[arg-type]
 
 
 def _join(parts: list[_Part]) -> _Part:
-    """All parts as one and nothing left in the list. What a part lacks is black, without room, without pose."""
+    """All parts as one and nothing left in the list. What a part lacks is black, without room, pose or intensity."""
     if len(parts) == 1:
         return parts.pop()
     rows = [len(p.points) for p in parts]
     columns: list[Array | None] = []
-    for name, blank in (("points", 0), ("colors", 0), ("labels", -1), ("pose_of", -1)):
+    for name, blank in (("points", 0), ("colors", 0), ("labels", -1), ("pose_of", -1), ("intensities", np.nan)):
         values = [getattr(p, name) for p in parts]
         present = next((v for v in values if v is not None), None)
         if present is None:
@@ -112,7 +113,7 @@ class Gatherer:
 
     def _place(self, piece: Piece) -> _Part:
         points = frame.place_points(piece.points, self.rotation, self.factor)
-        part = _Part(points, piece.colors, piece.labels, piece.pose_of)
+        part = _Part(points, piece.colors, piece.labels, piece.pose_of, piece.intensities)
         if not (points.min() > -BEYOND and points.max() < BEYOND):  # so of nan, too
             finite = np.asarray((np.abs(points) < BEYOND).all(axis=1))
             self.dropped += int(len(points) - finite.sum())
@@ -128,6 +129,7 @@ class Gatherer:
         cloud = PointCloud(
             part.points, self.shift, part.colors, part.labels, self.poses, part.pose_of, self.free, self.rooms, self.source
         )
+        cloud = replace(cloud, intensities=part.intensities)
         self.free, self.rooms = None, ()
         if self.pending is not None:
             yield self.pending

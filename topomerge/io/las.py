@@ -30,7 +30,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         _check_head(path)
     for header, rows, done in records(path) if octree is None else coarse_records(path, octree, options):
         colored = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
-        yield Piece(coordinates(rows), _colors(rows) if colored else None, done=done)
+        bright = np.asarray(rows.intensity, np.float32)
+        yield Piece(coordinates(rows), _colors(rows) if colored else None, done=done, intensities=bright)
 
 
 def las_node(path: Path, promised: int, options: ReadOptions) -> Iterator[Piece]:

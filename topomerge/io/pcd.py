@@ -20,6 +20,7 @@ from topomerge.kernels.codecs import lzf_unpack
 from topomerge.types import Array
 
 LONGEST_HEADER = 1 << 16  # bytes
+INTENSITY = "intensity"
 BEST_PACKING = 100  # LZF can't shrink more than that
 PCD_TYPES = {("F", 4), ("F", 8), ("U", 1), ("U", 2), ("U", 4), ("U", 8), ("I", 1), ("I", 2), ("I", 4), ("I", 8)}
 
@@ -51,7 +52,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         xyz = np.stack([rows[n] for n in "xyz"], axis=1)
         pose_of = None if pose is None else np.zeros(len(rows), np.int32)
         first = pose if done == len(rows) else None
-        yield Piece(xyz, _colors(rows), poses=first, pose_of=pose_of, done=done / header.points)
+        bright = rows[INTENSITY].astype(np.float32) if INTENSITY in names and not header.dtype[INTENSITY].shape else None
+        yield Piece(xyz, _colors(rows), poses=first, pose_of=pose_of, done=done / header.points, intensities=bright)
     if done < header.points:
         raise cut_short(path, done, header.points)
 
@@ -128,7 +130,7 @@ def _packed(path: Path, header: Header) -> Iterator[Array]:
 
 def _ascii(path: Path, header: Header) -> Iterator[Array]:
     names = header.dtype.names or ()
-    wanted = [n for n in names if n in ("x", "y", "z", "rgb", "rgba", "r", "g", "b") and not header.dtype[n].shape]
+    wanted = [n for n in names if n in ("x", "y", "z", "rgb", "rgba", "r", "g", "b", INTENSITY) and not header.dtype[n].shape]
     widths = [int(np.prod(header.dtype[n].shape, dtype=int)) for n in names]
     columns = tuple(sum(widths[: names.index(n)]) for n in wanted)
     kind = np.dtype([(n, header.dtype[n]) for n in wanted])

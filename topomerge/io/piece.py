@@ -33,6 +33,7 @@ class Piece:
     rooms: tuple[TrueRoom, ...] = ()
     warnings: tuple[str, ...] = ()
     done: float = 0.0  # share of the file read so far
+    intensities: Array | None = None  # (n,) float32, in whatever the file counts in
 
 
 def read_head(path: Path, kind: str, magic: bytes, length: int) -> bytes:

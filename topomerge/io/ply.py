@@ -25,6 +25,7 @@ PLY_TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectance", "scalar_reflectance")
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -126,6 +127,11 @@ def color_names(names: list[str]) -> tuple[str, ...]:
     return next((c for c in text.COLOR_COLUMNS if all(n in names for n in c)), ())
 
 
+def intensity_name(names: list[str]) -> str:
+    """The name of the intensity, or none."""
+    return next((n for n in names if n.lower() in INTENSITY_NAMES), "")
+
+
 def _read_binary(path: Path, header: Header, before: list[Element], vertex: Element) -> Iterator[Piece]:
     dtype = vertex.dtype(header.order)
     start = header.start + sum(e.count * e.dtype(header.order).itemsize for e in before)
@@ -135,10 +141,13 @@ def _read_binary(path: Path, header: Header, before: list[Element], vertex: Elem
     if not vertex.count:
         return
     rows = np.memmap(path, dtype, "r", start, (vertex.count,))
-    colors = color_names([n for n, _ in vertex.properties])
+    names = [n for n, _ in vertex.properties]
+    colors, shade = color_names(names), intensity_name(names)
     for first in range(0, vertex.count, BLOCK_POINTS):
         block = rows[first : first + BLOCK_POINTS]
-        yield Piece(_stack(block, ("x", "y", "z")), _colors(block, colors), done=(first + len(block)) / vertex.count)
+        done = (first + len(block)) / vertex.count
+        bright = block[shade].astype(np.float32) if shade else None
+        yield Piece(_stack(block, ("x", "y", "z")), _colors(block, colors), done=done, intensities=bright)
 
 
 def _stack(rows: Array, names: tuple[str, ...]) -> Array:
@@ -156,7 +165,8 @@ def _colors(rows: Array, names: tuple[str, ...]) -> Array | None:
 
 def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Element) -> Iterator[Piece]:
     names = [n for n, _ in vertex.properties]
-    wanted = ("x", "y", "z", *color_names(names))
+    shades, shade = color_names(names), intensity_name(names)
+    wanted = ("x", "y", "z", *shades, *([shade] if shade else []))
     columns = tuple(names.index(n) for n in wanted)
     count = 0
     with path.open(encoding="latin-1") as stream:
@@ -164,10 +174,12 @@ def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Eleme
         lines = itertools.islice(stream, skip + vertex.count)
         for values in text.rows(path, lines, columns, skip=skip):
             count += len(values)
-            colors = values[:, 3:] if len(wanted) == 6 else None
+            colors = values[:, 3:6] if shades else None
+            bright = values[:, -1].astype(np.float32) if shade else None
             if colors is not None and vertex.properties[columns[3]][1] not in ("f4", "f8"):
                 colors = colors.clip(0, 65535).astype(np.int64)
-            yield Piece(values[:, :3], None if colors is None else bytes8(colors), done=count / vertex.count)
+            shown = None if colors is None else bytes8(colors)
+            yield Piece(values[:, :3], shown, done=count / vertex.count, intensities=bright)
     if count < vertex.count:
         raise cut_short(path, count, vertex.count)
 

@@ -23,7 +23,9 @@ from topomerge.io.options import ReadOptions
 from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array, TrueRoom
 
-ARRAYS = {"points": np.float64, "colors": np.uint8, "poses": np.float64, "pose_of": np.int32}  # of a piece
+ARRAYS = {  # of a piece
+    "points": np.float64, "colors": np.uint8, "poses": np.float64, "pose_of": np.int32, "intensities": np.float32,
+}  # fmt: skip
 
 
 def read_in_subprocess(

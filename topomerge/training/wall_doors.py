@@ -1,7 +1,7 @@
 """Task `wall_doors`: how much what plans and what walls show says of a door (`extraction.elevations.wall_doors`).
 
-The extraction's candidates in scans that did not train the network of elevations, which ships, and in slices and grid maps;
-a candidate is a door where a true one lies near. There is a logistic model for each of what shows it.
+The extraction's candidates in scans that did not train the networks of walls, which ship, with colours and without, and in slices
+and grid maps; a candidate is a door where a true one lies near. There is a logistic model for each of what shows it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,13 @@ from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import build_walls, load_walls
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.doorways import place_classes
-from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
+from topomerge.extraction.elevations.wall_doors import (
+    SOURCES,
+    WALL_DOOR_FEATURES,
+    DoorCandidates,
+    door_candidates,
+    door_chance,
+)
 from topomerge.metrics import match_places
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
@@ -36,7 +42,7 @@ def fit(settings: WallDoors, say: Say) -> dict[str, float]:
 
 def fit_doors(settings: WallDoors, say: Say) -> Fitted:
     """Weights of the models from all scans, and scores of those that were fitted without each scan."""
-    scans = [*candidates_of(settings.data, settings, say), *candidates_of(settings.flat, settings, say)]
+    scans = [scan for recipe in (settings.data, settings.painted, settings.flat) for scan in candidates_of(recipe, settings, say)]
     parts = [scans[k :: settings.folds] for k in range(settings.folds)]
     left_out = []
     for k, part in enumerate(parts):
@@ -97,5 +103,6 @@ def door_figures(scans: Sequence[tuple[Array, Array]]) -> dict[str, float]:
 def judge(settings: WallDoors, file: Path, say: Say) -> dict[str, Any]:
     """Scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
-    scans = [*candidates_of(settings.heldout, settings, say), *candidates_of(settings.heldout_flat, settings, say)]
+    recipes = (settings.heldout, settings.heldout_painted, settings.heldout_flat)
+    scans = [scan for recipe in recipes for scan in candidates_of(recipe, settings, say)]
     return door_figures([(door_chance(c, weights), y) for c, y in scans])

@@ -146,6 +146,15 @@ def wall_scores(examples: Sequence[WallExample], weights: dict[str, Array]) -> d
             strip = scan.strips[low:high] / np.float32(255)
             right, there = answers(scan.truth[low:high], strip)
             np.add.at(table, (right[there], place_probabilities(strip, weights).argmax(axis=1)[there]), 1)
+    return class_scores(table)
+
+
+def class_scores(table: Array) -> dict[str, float]:
+    """F1 of each of `WALL_CLASSES`, and the mean of those of doors.
+
+    Args:
+        table: (4, 4) how often each was taken for each.
+    """
     f1 = 2 * np.diag(table) / np.maximum(table.sum(axis=0) + table.sum(axis=1), 1)
     scores = {f"f1_{name}": float(v) for name, v in zip(WALL_CLASSES, f1, strict=True)}
     return {**scores, "f1_doors": float((scores["f1_open"] + scores["f1_shut"]) / 2)}

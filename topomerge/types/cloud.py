@@ -38,6 +38,7 @@ class PointCloud:
         rooms: the true rooms, where they are known.
         source: file that the points come from.
         warnings: what looked wrong while it was read.
+        intensities: (N,) float32, how much of its light came back, in whatever the file counts in.
 
     Raises:
         ValueError: arrays of other shapes, or points that are no array of numbers.
@@ -53,12 +54,13 @@ class PointCloud:
     rooms: tuple[TrueRoom, ...] = ()
     source: str = ""
     warnings: tuple[str, ...] = ()
+    intensities: Array | None = None
 
     def __post_init__(self) -> None:
         numbers = isinstance(self.points, np.ndarray) and self.points.dtype.kind in "biuf"
         require(numbers, f"points must be an (N, 3) array of numbers, not {getattr(self.points, 'dtype', type(self.points))}")
         require(self.points.ndim == 2 and self.points.shape[1] == 3, f"points must be (N, 3), not {self.points.shape}")
-        for name in ("colors", "labels", "pose_of"):
+        for name in ("colors", "labels", "pose_of", "intensities"):
             values = getattr(self, name)
             require(values is None or len(values) == len(self.points), f"{name} must have one row a point")
 

@@ -148,7 +148,13 @@ def test_a_doorway_into_nothing_joins_nothing():
 def test_a_model_each_for_what_shows_a_door():
     candidates = DoorCandidates(seen(chances(8)).edges[[0] * 4], np.eye(4, len(WALL_DOOR_FEATURES)), np.arange(4))
     zeros = [0.0] * len(WALL_DOOR_FEATURES)
-    models = {"both": [0.0, 2.0, *zeros[1:]], "plan": [-1.0, *zeros], "wall": [1.0, *zeros], "flat": [2.0, *zeros]}
+    models = {
+        "both": [0.0, 2.0, *zeros[1:]],
+        "plan": [-1.0, *zeros],
+        "wall": [1.0, *zeros],
+        "flat": [2.0, *zeros],
+        "colour": [0.5, *zeros],
+    }
     assert door_chance(candidates, models) == pytest.approx(1 / (1 + np.exp([-2.0, 1.0, -1.0, -2.0])))
 
 

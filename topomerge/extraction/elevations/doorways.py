@@ -11,6 +11,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse.csgraph import connected_components
 
+from topomerge.extraction.elevations.colour_network import with_colours
 from topomerge.extraction.elevations.elevation import ALONG, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities
 from topomerge.types import Array
@@ -50,6 +51,30 @@ def read_both_ways(strip: Array) -> Array:
         strip: (n, 32, 14), n even.
     """
     one, mirrored = place_probabilities(np.stack([strip, strip[::-1]]))
+    mean: Array = (one + mirrored[::-1]) / np.float32(2)
+    return mean
+
+
+def coloured_classes(walls: Elevations, classes: Array) -> Array:
+    """(n / 2, 4) float32 likewise, by shape and colours; walls without colours as they are.
+
+    Args:
+        classes: (n / 2, 4) of `place_classes`.
+    """
+    if walls.colours is None:
+        return classes
+    parts = [coloured_both_ways(walls.colours[a:b], classes[a // PLACES : b // PLACES]) for a, b in strip_bounds(walls)]
+    return np.concatenate([np.zeros((0, len(WALL_CLASSES)), np.float32), *parts])
+
+
+def coloured_both_ways(colours: Array, classes: Array) -> Array:
+    """(n / 2, 4) float32 likewise, by shape and colours.
+
+    Args:
+        colours: (n, 13, 4), n even.
+        classes: (n / 2, 4) by shape.
+    """
+    one, mirrored = with_colours(colours, classes), with_colours(colours[::-1], classes[::-1])
     mean: Array = (one + mirrored[::-1]) / np.float32(2)
     return mean
 

@@ -8,7 +8,7 @@ shows, of which nothing is left in the cells of a map.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,9 @@ DEPTHS, BANDS = round((BEFORE + BEHIND) / ACROSS), round((HIGHEST - LOWEST) / UP
 STRIP_CHANNELS = BANDS + 1  # and where one can walk
 FULL = 0.75  # of the cells of a flat surface that make an element full
 SIDE_REACH = (0.15, 0.6)  # m from a face: where its room's floor lies
+SURFACE = (-0.1, 0.3)  # m from a face: what has a colour there is of the wall, or of a leaf in it
+LEAST_SHADE = 0.25  # points
+DARKEST, HUE_STEP, MOST_CONTRAST = 15.0, 64.0, 2.0  # of 255; of a difference of 1
 WALL_CLASSES = ("wall", "open", "shut", "window")  # of a place along a wall; where there is no wall, too
 TILE = 1.0  # m: squares in which faces are looked up
 FACE_DTYPE = np.dtype(
@@ -50,18 +53,22 @@ class Elevations:
         first: (F + 1,) the first element of each strip in `strips`.
         strips: (n, 32, 14) float32 0..1 of each place along all strips: how full its elements are across the wall, from before it
             to behind it, in each band of heights; the last channel is where one can walk.
+        colours: (n, 13, 4) float32 in each band of heights: was its colour seen (0 or 1), and by how much it is lighter, redder
+            and yellower than most of its wall; None of a scan without colours.
     """
 
     faces: Array
     first: Array
     strips: Array
+    colours: Array | None = None
 
 
-def wall_elevations(map: TopometricMap, cells: VoxelGrid) -> Elevations:
+def wall_elevations(map: TopometricMap, cells: VoxelGrid, shades: tuple[Array, Array] | None = None) -> Elevations:
     """The faces of all rooms, unrolled.
 
     Args:
         cells: with the means of their points (`cell_means`), in the map's frame; 5 cm or as fine as there are.
+        shades: (k, 3) points and their colours (k, 3) uint8, as of `Scan`.
     """
     faces = wall_faces(map)
     sizes = 2 * np.ceil(faces["length"] / ALONG / 2).astype(np.int64)
@@ -76,7 +83,29 @@ def wall_elevations(map: TopometricMap, cells: VoxelGrid) -> Elevations:
     flat = ALONG * UPWARDS / cells.edge**2  # cells of a wall that an element holds
     edge = map.navigable.edge
     strips = np.concatenate([solid / (FULL * flat), walk / (FULL * ALONG * ACROSS / edge**2)], axis=2)
-    return Elevations(faces, np.concatenate([[0], np.cumsum(sizes)]), np.minimum(strips, 1.0))
+    walls = Elevations(faces, np.concatenate([[0], np.cumsum(sizes)]), np.minimum(strips, 1.0))
+    return walls if shades is None else replace(walls, colours=strip_colours(walls, *shades))
+
+
+def strip_colours(walls: Elevations, points: Array, colours: Array) -> Array:
+    """(n, 13, 4) float32 `Elevations.colours`, of points (k, 3) m and their colours (k, 3) uint8.
+
+    Lightness is compared as a ratio, so that neither light nor the unit of an intensity matters; hues as differences.
+    """
+    faces, sizes = walls.faces, np.diff(walls.first)
+    frames = np.column_stack([faces["start"] + SURFACE[0] * faces["out"], faces["along"], faces["out"], faces["floor"] + LOWEST])
+    step, values = np.array([ALONG, SURFACE[1] - SURFACE[0], UPWARDS]), np.column_stack([np.ones(len(points)), colours])
+    sums = fill_strips(np.asarray(points, float), frames, sizes, (1, BANDS), step, TILE, values.astype(float))[:, 0].astype(float)
+    seen = sums[..., 0] > LEAST_SHADE
+    red, green, blue = (sums[..., k] / np.maximum(sums[..., 0], LEAST_SHADE) for k in (1, 2, 3))
+    light = np.log((red + green + blue) / 3 + DARKEST)
+    out = np.stack([seen, light, (red - green) / HUE_STEP, ((red + green) / 2 - blue) / HUE_STEP], axis=-1)
+    for low, high in zip(walls.first[:-1], walls.first[1:], strict=True):
+        strip, there = out[low:high], seen[low:high]
+        if there.any():
+            strip[..., 1:] -= np.median(strip[there][:, 1:], axis=0)
+    out[~seen] = 0
+    return np.asarray(np.clip(out, -MOST_CONTRAST, MOST_CONTRAST), np.float32)
 
 
 def wall_faces(map: TopometricMap) -> Array:

@@ -11,11 +11,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
-from topomerge.extraction.elevations.doorways import STOOD, STRAIGHT, door_places, doorways, joined_openings
+from topomerge.extraction.elevations.doorway_rooms import colour_doorways, with_other_room
+from topomerge.extraction.elevations.doorways import (
+    STRAIGHT,
+    door_places,
+    doorways,
+    joined_openings,
+)
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.extraction.plans.partition import Pair, pair_of
@@ -39,9 +44,9 @@ WALL_DOOR_FEATURES = (
     "fill",  # logarithm of the share of the walls' elements that hold points: what sparse scans show is less sure
     *PLAN_SIGNS,
 )
-SOURCES = ("both", "plan", "wall", "flat")  # what shows a door, flat: the plan of a map without walls; there is a model for each
+# What shows a door (flat: the plan of a map without walls; colour: the colours of a wall alone); there is a model for each.
+SOURCES = ("both", "plan", "wall", "flat", "colour")
 WALL_DOOR_REACH = 1.0  # m between a door of the plan and the same one on the wall
-BEYOND = (0.1, 1.0)  # m from a wall: there the other room begins
 NEAR = 0.3  # m around a door of the plan
 PART_OFF = 0.5  # m between the middle of an opening of the plan and the wall that shows a part of it
 SUREST = 0.0005  # probability: what walls show is not taken for surer
@@ -120,7 +125,7 @@ def door_candidates(
     if walls is None or classes is None:
         return _flat_candidates(map, storeys, level)
     doors = door_places(walls, classes)
-    ways, shown = joined_openings(_with_other_room(map, doorways(walls, doors)))
+    ways, shown = joined_openings(with_other_room(map, doorways(walls, doors)))
     whole = _opening_of(level, ways)
     partner = _partners(level, ways, whole)
     edges, features, source = [], [], []
@@ -144,6 +149,11 @@ def door_candidates(
             edges.append(_edge(way))
             features.append([*_seen(way), 0, 0, 1, *_size(shown[i], complete, 0)])
             source.append(SOURCES.index("wall"))
+    for way in colour_doorways(map, walls, classes, np.concatenate([ways["centre"], level["centre"]]), WALL_DOOR_REACH):
+        complete = float(map.rooms["completeness"][way["rooms"]].min())
+        edges.append(_edge(way))
+        features.append([*_seen(way), 0, 0, 1, *_size(way["width"], complete, 0)])
+        source.append(SOURCES.index("colour"))
     table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
     seen = walls.strips[..., :BANDS] > 0
     fill = float(np.log(LEAST_FILL + (seen.mean() if seen.size else 0.0)))
@@ -178,10 +188,12 @@ def _flat_candidates(map: TopometricMap, storeys: Sequence[ClassifiedStorey], ed
 def _candidates(
     edges: Array, features: Sequence[Sequence[float]], fill: float, storeys: Sequence[ClassifiedStorey], source: Array
 ) -> DoorCandidates:
-    """With the signs of the plan beside what was measured; where walls alone show a door the plan is not asked."""
+    """With the signs of the plan beside what was measured; where walls or their colours alone show a door the plan is not
+    asked."""
     measured = np.array(features, float).reshape(len(edges), len(WALL_DOOR_FEATURES) - len(PLAN_SIGNS) - 1)
     measured = np.column_stack([measured, np.full(len(edges), fill)])
-    signs = np.where(source[:, None] == SOURCES.index("wall"), 0.0, plan_signs(storeys, edges["centre"]))
+    unasked = np.isin(source, [SOURCES.index("wall"), SOURCES.index("colour")])
+    signs = np.where(unasked[:, None], 0.0, plan_signs(storeys, edges["centre"]))
     return DoorCandidates(edges, np.hstack([measured, signs]), source)
 
 
@@ -194,29 +206,6 @@ def _size(width: float, complete: float, apart: float) -> tuple[float, ...]:
     """The four of `WALL_DOOR_FEATURES` before the last ones, which are not of a door alone."""
     odd = abs(float(np.log(max(float(width), 0.1) / 0.9)))
     return odd, complete, apart, float(width > DOOR_MOST_WIDTH)
-
-
-def _with_other_room(map: TopometricMap, ways: Array) -> Array:
-    """The doorways with the room behind those that one face shows; without those that lead from a room into itself."""
-    ways = ways.copy()
-    floor = map.navigable.centroids()
-    storey = map.rooms["storey"][map.navigable_room]
-    trees = {s: np.flatnonzero((storey == s) & (map.navigable_room >= 0)) for s in range(len(map.storeys))}
-    looked = {s: cKDTree(floor[rows, :2]) for s, rows in trees.items() if len(rows)}
-    for way in ways:
-        s = int(map.rooms["storey"][way["rooms"][0]])
-        if way["rooms"][1] >= 0 or s not in looked:
-            continue
-        steps = np.arange(BEYOND[0], BEYOND[1] + 0.05, 0.1)
-        side = np.array([-way["out"][1], way["out"][0]]) * float(way["width"]) / 4
-        places = way["centre"][:2] + side * np.array([[-1.0], [0.0], [1.0]]) + steps[:, None, None] * way["out"]
-        far, row = looked[s].query(places, distance_upper_bound=STOOD)
-        rows = trees[s][np.minimum(row, len(trees[s]) - 1)]
-        label = np.where(np.isfinite(far), map.navigable_room[rows], -1)
-        other = label[(label >= 0) & (label != way["rooms"][0])]
-        if len(other):
-            way["rooms"][1] = np.bincount(other).argmax()
-    return ways
 
 
 def _opening_of(edges: Array, ways: Array) -> Array:

@@ -32,11 +32,11 @@ def place_probabilities(strip: Array, network: dict[str, Array] | None = None) -
     x = np.moveaxis(convolution(x, w["b.w"], w["b.b"]), -3, -1)
     x = relu(linear(x.reshape(*x.shape[:-2], -1), w["depths.w"], w["depths.b"]))
     for name, dilation in zip(ALONG_LAYERS, DILATIONS, strict=True):
-        x = relu(linear(_neighbours(x, dilation), w[f"{name}.w"], w[f"{name}.b"]))
+        x = relu(linear(neighbours(x, dilation), w[f"{name}.w"], w[f"{name}.b"]))
     return softmax(linear(x, w["out.w"], w["out.b"]))
 
 
-def _neighbours(x: Array, dilation: int) -> Array:
+def neighbours(x: Array, dilation: int) -> Array:
     """(..., n, 5 c) of each row (..., n, c) those around it, `dilation` apart; zeros past the ends."""
     reach, count = TAPS // 2 * dilation, x.shape[-2]
     padded = np.pad(x, [(0, 0)] * (x.ndim - 2) + [(reach, reach), (0, 0)])

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from topomerge.extraction.floor import Floor
-from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.plans.storey_floor import floor_of_storeys
-from topomerge.extraction.plans.storey_rooms import cut_storey
+from topomerge.extraction.plans.storey_rooms import NO_SIGNS, OtherSigns, cut_storey
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.types import Array, VoxelGrid
 
@@ -18,7 +15,7 @@ THINNEST_SLAB = 0.15  # m: a thinner one parts no storeys
 
 
 def rooms_of_plans(
-    grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: float, body_height: float, parts: Sequence[PartRooms] = ()
+    grid: VoxelGrid, navigable: VoxelGrid, door: float, narrow: float, body_height: float, others: OtherSigns = NO_SIGNS
 ) -> Floor:
     """Cut every storey into rooms.
 
@@ -28,13 +25,13 @@ def rooms_of_plans(
         door: narrowings with at least this probability of a door part rooms.
         narrow: those with at least this one part areas of a room.
         body_height: m, whatever is lower than this above the floor is no ceiling.
-        parts: rooms of the maps that these cells were joined of.
+        others: what else speaks for where rooms part.
     """
     storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, body_height))
     factor = max(round(PLAN_CELL / grid.edge), 1)
     coarse_grid, coarse_floor, coarse_storey = _coarser(grid, navigable, storey, factor)
     cut = [
-        cut_storey(coarse_grid, coarse_floor, coarse_storey, k, door, narrow, parts)
+        cut_storey(coarse_grid, coarse_floor, coarse_storey, k, door, narrow, others)
         for k in range(len(storeys))
         if (coarse_storey == k).any() and not _is_upper_side(storeys[k], storeys[:k])
     ]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from topomerge.extraction.classified_storey import ClassifiedStorey
 from topomerge.extraction.plans.door_classifier import door_probability
+from topomerge.extraction.plans.inner_doors import INNER_DOOR_DTYPE, inner_columns, inner_log_odds
 from topomerge.extraction.plans.part_rooms import PartRooms, door_log_odds, laid_rooms, parted_columns
 from topomerge.extraction.plans.partition import Pair, Partition, merge_regions
 from topomerge.extraction.plans.passages import clearance_of, find_passages, regions_of
@@ -20,6 +22,21 @@ from topomerge.types import Array, VoxelGrid
 
 ROOM_LEAST_AREA = 0.8  # m2
 ROOM_LEAST_HALF_WIDTH = 0.35  # m: what is nowhere wider is the edge of a facade or of a slab
+
+
+class OtherSigns(NamedTuple):
+    """What speaks for where rooms part beside a plan itself.
+
+    Args:
+        parts: rooms of the maps that these cells were joined of.
+        doors: (D,) INNER_DOOR_DTYPE, doors that walls show inside of what was one room.
+    """
+
+    parts: Sequence[PartRooms] = ()
+    doors: Array = np.zeros(0, INNER_DOOR_DTYPE)
+
+
+NO_SIGNS = OtherSigns()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +62,7 @@ class StoreyRooms:
 
 
 def cut_storey(
-    grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, door: float, narrow: float, parts: Sequence[PartRooms] = ()
+    grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, door: float, narrow: float, others: OtherSigns = NO_SIGNS
 ) -> StoreyRooms:
     """Cut storey `k` into rooms: regions between all narrowings, merged until only likely doors part them.
 
@@ -54,19 +71,20 @@ def cut_storey(
         navigable: the navigable volume.
         storey: (m,) storey of each of its cells.
         door, narrow: probabilities of a door from which on a narrowing parts rooms, and areas of a room.
-        parts: rooms of the maps that these cells were joined of.
+        others: what else speaks for where rooms part.
     """
     plan = storey_plan(grid, navigable, storey, k)
     probability = column_probabilities(plan)
     plan = without_furniture(plan, probability)
     clearance = clearance_of(plan)
-    others = laid_rooms(plan, parts)
-    region = regions_of(plan, probability, parted_columns(others) if others else None)
+    laid = laid_rooms(plan, others.parts)
+    parted = inner_columns(plan, others.doors)
+    region = regions_of(plan, probability, parted | parted_columns(laid) if laid else parted)
     if k > 0:
         region = without_upper_sides(grid, plan, region)
     passages = find_passages(plan, clearance, region, probability)
-    log_odds = door_log_odds(region, plan.edge, passages, others)
-    passages = {pair: replace(passage, log_odds=log_odds[pair]) for pair, passage in passages.items()}
+    by_parts, by_walls = door_log_odds(region, plan.edge, passages, laid), inner_log_odds(plan, passages, others.doors)
+    passages = {pair: replace(passage, log_odds=by_parts[pair] + by_walls[pair]) for pair, passage in passages.items()}
     partition = merge_regions(region, clearance, passages, plan.edge, door_probability, door, narrow, ROOM_LEAST_AREA)
     low, base = columns_of(plan, grid)
     corner = grid.origin + np.append(low, np.median(base)) * plan.edge
