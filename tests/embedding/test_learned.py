@@ -205,6 +205,10 @@ def test_what_is_no_safetensors_file_is_refused(data):
 def test_folders_of_an_embedder(tmp_path):
     assert embedder_folder(PRETRAINED / WEIGHTS_FILE) == PRETRAINED == embedder_folder(PRETRAINED)
     network, weights, about = read_weights(PRETRAINED)
-    assert network.geometry.parts == ["scalars", "surroundings"] and len(weights) > 40 and "data" in about
+    assert (
+        network.geometry.parts == ["scalars", "surroundings", "wide_surroundings", "door_surroundings"]
+        and len(weights) > 40
+        and "data" in about
+    )
     with pytest.raises(InputError, match="give a run's folder"):
         load_embedder(tmp_path)

@@ -99,7 +99,10 @@ def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
 
 
 def test_runs_are_called_by_what_they_are_made_of() -> None:
-    run, title = "topomerge/embedding/pretrained", "scalars + surroundings, gat around ways, infonce"
+    run, title = (
+        "topomerge/embedding/pretrained",
+        "scalars + surroundings + wide_surroundings + door_surroundings, gat around ways, infonce",
+    )
     assert run_title(run) == title
     settings = Evaluation(SMALL, run=[run], titles=True, mergers=[])
     assert [v.name for v in variants(settings)] == [title] == list(prediction_settings(settings)["run"])

@@ -27,7 +27,7 @@ from topomerge.types import Array, TopometricMap
 METHODS = ("consistent", "attention", "growing", "assignment", "thesis")
 THESIS: dict[str, Any] = {"laplacian": "graph", "values": 256, "normalise": "first", "k": 1}
 LIKELY_MATCH = 0.5  # probability of a match that the best hypothesis lacks
-LEAST_CERTAINTY = 0.25  # of a match by attention: the best F1 on validation pairs
+LEAST_CERTAINTY = 0.4  # of a match by attention: the best F1 on validation pairs
 MOST_HYPOTHESES = 10
 
 
