@@ -48,5 +48,5 @@ def test_each_step_is_a_task_with_its_words(tmp_path: Path, monkeypatch: pytest.
     sets, settings = [a.data.name for a in asked if not hasattr(a, "task")], [a for a in asked if hasattr(a, "task")]  # type: ignore[attr-defined]
     assert sets == ["train_walks", "val_small"] and [s.task for s in settings] == list(TASKS)
     embedding = settings[list(TASKS).index("embedding")]
-    assert embedding.epochs == 22 and embedding.network.node.around == 10 and settings[0].jobs == 2
+    assert embedding.epochs == 12 and embedding.network.node.around == 10 and settings[0].jobs == 2
     assert all(s.cache == str(tmp_path) and s.export == "" and s.name == s.task for s in settings)
