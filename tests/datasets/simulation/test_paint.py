@@ -13,6 +13,8 @@ from topomerge.datasets.simulation.rays import cast, placed
 from topomerge.datasets.simulation.scanner import scan
 from topomerge.datasets.simulation.sensors import get_sensor
 
+from topomerge.errors import InputError
+
 TLS = get_sensor("tls")
 
 
@@ -60,3 +62,8 @@ def test_two_scans_differ_in_light_alone(house, seen):
     large = np.flatnonzero(np.bincount(thing[thing >= 0]) > 20)
     hues = [[(shown[thing == k, 0] - shown[thing == k, 2]).mean() for k in large] for shown in (one, other)]
     assert len(large) > 4 and np.corrcoef(hues)[0, 1] > 0.9
+
+
+def test_other_shades_are_refused(house):
+    with pytest.raises(InputError, match="shades 'heat' of a sensor: colour, intensity or none"):
+        scan(house, replace(TLS, shades="heat"), [0], 3, 0.1)
