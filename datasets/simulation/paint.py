@@ -10,9 +10,10 @@ import numpy as np
 from topomerge.datasets.core.building import SURFACES, Building
 from topomerge.datasets.simulation.rays import Hits
 
+from topomerge.errors import InputError
 from topomerge.types import Array
 
-SHADES = ("", "colour", "intensity")  # what a sensor tells of a surface beside its place
+SHADES = ("colour", "intensity")  # what a sensor may tell of a surface beside its place
 ACCENT, WAINSCOT, SKIRTING, ROUGH = 0.25, 0.15, 0.5, 0.3  # share of the rooms with walls of another colour, in two colours, ...
 LIKE_WALL = 0.3  # share of the buildings whose doors have the colour of their walls
 OTHER_LEAF = 0.15  # share of the doors that are unlike the others of the building
@@ -31,7 +32,12 @@ def painted(building: Building, hits: Hits, points: Array, rooms: Array, kind: s
         rooms: (n,) the room of each, -1 none.
         kind: ``colour`` or ``intensity``.
         rng: of light and exposure.
+
+    Raises:
+        InputError: another kind.
     """
+    if kind not in SHADES:
+        raise InputError(f"shades {kind!r} of a sensor: {', '.join(SHADES)} or none are possible")
     paint = np.random.default_rng([max(building.seed, 0), len(building.triangles), 21])
     wall = _wall_colour(paint)
     label = building.labels[hits.triangle]

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 from topomerge.datasets.core.building import SURFACES, Building
 from topomerge.datasets.simulation.floors import draw_floors
-from topomerge.datasets.simulation.paint import SHADES, painted
+from topomerge.datasets.simulation.paint import painted
 from topomerge.datasets.simulation.rays import Hits, cast, placed
 from topomerge.datasets.simulation.sensors import Sensor, get_sensor
 from topomerge.datasets.simulation.trajectory import drifted, sensor_poses
@@ -55,8 +55,6 @@ def scan(
     kind, rng = get_sensor(sensor), np.random.default_rng(seed)
     if spacing is not None and not 0.005 <= spacing <= 1.0:
         raise InputError(f"spacing must be 0.005 to 1 m, not {spacing}")
-    if kind.shades not in SHADES:
-        raise InputError(f"shades {kind.shades!r} of a sensor: {', '.join(SHADES[1:])} or none are possible")
     spacing = spacing or kind.spacing
     visited = [i for i, r in enumerate(building.rooms) if r.kind != "lift"] if rooms is None else [int(r) for r in rooms]
     walk = plan_walk(building, visited, rng, unfinished)

@@ -38,7 +38,7 @@ class Sensor:
         plain: share of the points on floors, ceilings and walls that are kept (cameras need texture).
         lowest: points lower than this above the floor are missing.
         metric: the scale of its maps is known.
-        shades: what it tells of a surface beside its place, one of `paint.SHADES`.
+        shades: what it tells of a surface beside its place, one of `paint.SHADES`, or nothing.
     """
 
     name: str
