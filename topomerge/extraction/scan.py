@@ -157,7 +157,7 @@ class _Shades:
     """A sample of the points that have a colour or an intensity: each is as likely in it as any other, however many there are."""
 
     def __init__(self) -> None:
-        self._parts: list[tuple[Array, ...]] = []  # numbers drawn for the points, ascending bound; points; colours or intensities
+        self._parts: list[tuple[Array, ...]] = []  # drawn numbers; points; colours or intensities
         self._share = 1.0
         self._rng = np.random.default_rng(0)
 

@@ -17,7 +17,6 @@ from torch.nn import functional
 
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import WallExample, build_walls, load_walls
-from topomerge.errors import InputError
 from topomerge.extraction.elevations.colour_network import LEAST_CHANCE, colour_inputs, read_network, with_colours
 from topomerge.extraction.elevations.doorways import read_both_ways
 from topomerge.extraction.elevations.elevation import WALL_CLASSES
@@ -27,7 +26,7 @@ from topomerge.models.colour_network import ColourNetwork, exported_colours
 from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import NetworkJob, run_network
 from topomerge.training.scan_settings import ColourAugment, WallColours
-from topomerge.training.wall_segmentation import class_scores
+from topomerge.training.wall_segmentation import class_scores, learned_and_watched
 from topomerge.types import Array
 
 Weights = dict[str, Array]
@@ -57,9 +56,7 @@ def fit(settings: WallColours, say: Say) -> dict[str, float]:
         InputError: no scan to train on or to watch.
     """
     scans = coloured_walls(settings.data, settings, say)
-    watched, learned = scans[:: settings.hold_out], [s for k, s in enumerate(scans) if k % settings.hold_out]
-    if not learned or not watched:
-        raise InputError(f"data.scans={settings.data.scans}: too few scans to train on some and watch others")
+    learned, watched = learned_and_watched(scans, settings)
     torch.manual_seed(mixed(settings.seed))
     job = ColourJob(settings, learned, watched)
     say(f"{len(learned)} scans, {sum(p.numel() for p in job.network.parameters())} weights")

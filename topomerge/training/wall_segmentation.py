@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,9 +22,10 @@ from topomerge.io import archive
 from topomerge.models.wall_network import WallNetwork, exported_network
 from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import NetworkJob, run_network
-from topomerge.training.scan_settings import WallAugment, WallSegmentation
+from topomerge.training.scan_settings import WallAugment, WallSegmentation, WallTask
 from topomerge.types import Array
 
+ScanT = TypeVar("ScanT")
 Stretch = tuple[Array, Array, Array]  # strip, truth and weight of each place
 
 
@@ -36,13 +37,23 @@ def fit(settings: WallSegmentation, say: Say) -> dict[str, float]:
     """
     paths, _ = build_walls(settings.data, settings, say)
     scans = [load_walls(path) for path in paths]
-    watched, learned = scans[:: settings.hold_out], [s for k, s in enumerate(scans) if k % settings.hold_out]
-    if not learned or not watched:
-        raise InputError(f"data.scans={settings.data.scans}: too few scans to train on some and watch others")
+    learned, watched = learned_and_watched(scans, settings)
     torch.manual_seed(mixed(settings.seed))
     job = WallJob(settings, learned, watched)
     say(f"{len(learned)} scans, {sum(p.numel() for p in job.network.parameters())} weights")
     return run_network(job, settings, settings.steps, say)
+
+
+def learned_and_watched(scans: Sequence[ScanT], settings: WallTask) -> tuple[list[ScanT], list[ScanT]]:
+    """The scans to train on, and every n-th one, which is watched.
+
+    Raises:
+        InputError: too few for both.
+    """
+    watched, learned = list(scans[:: settings.hold_out]), [s for k, s in enumerate(scans) if k % settings.hold_out]
+    if not learned or not watched:
+        raise InputError(f"data.scans={settings.data.scans}: too few scans to train on some and watch others")
+    return learned, watched
 
 
 class WallJob(NetworkJob):

@@ -18,9 +18,10 @@ LARGEST_PARTED = 30.0  # m2: the plan misses the doors of toilets and stores, an
 
 
 def with_other_room(map: TopometricMap, ways: Array) -> Array:
-    """The doorways (D,) DOORWAY_DTYPE with the room behind those that one face shows; without those that lead from a room into
-    itself."""
+    """The doorways (D,) DOORWAY_DTYPE with the room behind those that one face shows, -1 where there is none but their own."""
     ways = ways.copy()
+    if not len(ways):
+        return ways
     floor = map.navigable.centroids()
     storey = map.rooms["storey"][map.navigable_room]
     trees = {s: np.flatnonzero((storey == s) & (map.navigable_room >= 0)) for s in range(len(map.storeys))}
@@ -44,10 +45,11 @@ def doors_inside_rooms(map: TopometricMap, walls: Elevations, classes: Array) ->
     Args:
         walls, classes: as of `with_wall_doors`.
     """
-    ways = with_other_room(map, doorways(walls, door_places(walls, classes)))
+    ways = doorways(walls, door_places(walls, classes))
     sure = (ways["rooms"][:, 1] < 0) & (ways["mean"] >= SURE_INSIDE) & (ways["width"] <= DOOR_MOST_WIDTH)
     sure &= map.rooms["area"][ways["rooms"][:, 0]] <= LARGEST_PARTED
-    ways = ways[sure]
+    ways = with_other_room(map, ways[sure])
+    ways = ways[ways["rooms"][:, 1] < 0]
     own = np.array([bool(np.mean(_behind(map, way) == way["rooms"][0]) >= SAME_ROOM) for way in ways], bool)
     out = np.zeros(int(own.sum()), INNER_DOOR_DTYPE)
     out["centre"], out["normal"], out["width"] = ways["centre"][own], ways["out"][own], ways["width"][own]
@@ -78,7 +80,8 @@ def colour_doorways(map: TopometricMap, walls: Elevations, classes: Array, other
     """
     if walls.colours is None:
         return np.zeros(0, DOORWAY_DTYPE)
-    ways = with_other_room(map, doorways(walls, door_places(walls, coloured_classes(walls, classes))))
+    ways = doorways(walls, door_places(walls, coloured_classes(walls, classes)))
     apart = ways["centre"][:, None] - others
     far = (np.linalg.norm(apart[..., :2], axis=2) > reach) | (np.abs(apart[..., 2]) > reach)
-    return ways[far.all(axis=1) & (ways["rooms"][:, 1] >= 0)]
+    ways = with_other_room(map, ways[far.all(axis=1)])
+    return ways[ways["rooms"][:, 1] >= 0]
