@@ -16,15 +16,32 @@ USUAL_HEADROOM = 2.6  # m between an assumed floor and the ceiling: that of most
 CARRIED_HEIGHT = 1.4  # m above the floor: a tablet in the hands, a helmet, a tripod
 CARRIER_HEADROOM = 2.0, 6.0  # m under the ceiling of somebody who carries a sensor: at least, at most
 OVERHEAD = 1.0  # m above the bottom: what is higher and no wall is a ceiling
+OVER_FLOOR = 0.5  # m: likewise where there is no floor, of a sensor that looked up in low rooms
+OFF_LEVEL = 2  # cells: nearer ones are of the floor itself
 
 
 def has_floor(grid: VoxelGrid, navigable: VoxelGrid, body_height: float) -> bool:
-    """Was a floor seen? Without one, what one could stand on is the upper side of the ceiling: it has nothing above, and most
-    columns begin high over the lowest ones around."""
+    """Was a floor seen? Without one, what one could stand on is the upper side of the ceiling: it has nothing above, and walls
+    hang from it, or most columns begin high over the lowest ones around."""
     lowest = lowest_of_column(navigable)
     covered = (floor_to_ceiling(grid, navigable, body_height)[lowest] > 0).mean()
+    if covered > COVERED_SHARE:
+        return True
+    above = _above_floor(grid, navigable.cells[lowest])
+    if (above < -OFF_LEVEL).sum() > (above > OFF_LEVEL).sum():
+        return False
     hanging, _, top = _under_ceiling(grid)
-    return bool(covered > COVERED_SHARE or hanging.sum() < HANGING_SHARE * (top >= 0).sum())
+    return bool(hanging.sum() < HANGING_SHARE * (top >= 0).sum())
+
+
+def _above_floor(grid: VoxelGrid, floor: Array) -> Array:
+    """(n,) cells by which each occupied one lies above the nearest column of a floor, (k, 3) of the same lattice."""
+    level = np.full(grid.shape[:2], -1, np.int64)
+    level[tuple(floor[:, :2].T)] = floor[:, 2]
+    nearest = ndimage.distance_transform_edt(level < 0, return_distances=False, return_indices=True)
+    at = tuple(grid.cells[:, :2].T)
+    above: Array = grid.cells[:, 2].astype(np.int64) - level[nearest[0][at], nearest[1][at]]
+    return above
 
 
 def any_ceiling(grid: VoxelGrid) -> bool:
@@ -39,7 +56,7 @@ def with_assumed_floor(grid: VoxelGrid, rays: tuple[Array, Array] | None = None)
     Args:
         rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, where they are known.
     """
-    inside, height, top = _under_ceiling(grid)
+    inside, height, top = _under_ceiling(grid, OVER_FLOOR)
     inside = ndimage.binary_closing(np.pad(inside, 5), np.ones((7, 7)))[5:-5, 5:-5]
     lowest, ceiling = float(np.median(height[inside])), float(np.median(top[inside & (top >= 0)]))
     below = ceiling - round(USUAL_HEADROOM / grid.edge)
@@ -51,8 +68,9 @@ def with_assumed_floor(grid: VoxelGrid, rays: tuple[Array, Array] | None = None)
     return _with_cells(grid, np.argwhere(inside), int(min(lowest, below)))
 
 
-def _under_ceiling(grid: VoxelGrid) -> tuple[Array, Array, Array]:
-    """(nx, ny) columns that begin high above the lowest ones around; that lowest level; the highest occupied one of each."""
+def _under_ceiling(grid: VoxelGrid, overhead: float = OVERHEAD) -> tuple[Array, Array, Array]:
+    """(nx, ny) columns that begin `overhead` m above the lowest ones around; that lowest level; the highest occupied one of
+    each."""
     nx, ny = grid.shape[:2]
     bottom, top = np.full((nx, ny), np.iinfo(np.int64).max), np.full((nx, ny), -1)
     at = tuple(grid.cells[:, :2].T)
@@ -71,7 +89,7 @@ def _under_ceiling(grid: VoxelGrid) -> tuple[Array, Array, Array]:
     lowest = ndimage.minimum_filter(lowest.reshape(tx, ty), 3, mode="nearest")
     lowest[~np.isfinite(lowest)] = 0
     height = np.repeat(np.repeat(lowest, tile, 0), tile, 1)[:nx, :ny].astype(np.int64)
-    return (top >= 0) & ((bottom - height) * grid.edge >= OVERHEAD), height, top
+    return (top >= 0) & ((bottom - height) * grid.edge >= overhead), height, top
 
 
 def _with_cells(grid: VoxelGrid, columns: Array, level: int) -> VoxelGrid:

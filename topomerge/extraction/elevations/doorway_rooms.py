@@ -5,16 +5,38 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from topomerge.extraction.distinct_doors import rooms_at
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
 from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE, STOOD, coloured_classes, door_places, doorways
-from topomerge.extraction.elevations.elevation import Elevations
+from topomerge.extraction.elevations.elevation import ALONG, Elevations
+from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.extraction.plans.inner_doors import INNER_DOOR_DTYPE
 from topomerge.types import Array, TopometricMap
 
+SPOTS_BEFORE = (0.2, 0.35, 0.5)  # m before a face: there its room's floor lies
 BEYOND = (0.1, 1.0)  # m from a wall: there the other room begins
 SURE_INSIDE = 0.91  # probability of a door, the mean along a doorway, from which on it parts what was one room
 SAME_ROOM = 0.5  # of the places behind it
 LARGEST_PARTED = 30.0  # m2: the plan misses the doors of toilets and stores, and the room on their other side is small, too
+
+
+def rooms_before(map: TopometricMap, walls: Elevations) -> Array:
+    """(n / 2, 3) int64 room on whose floor spots before each place along all strips lie, -1 none."""
+    sizes = np.diff(walls.first) // PLACES
+    face = walls.faces[np.repeat(np.arange(len(sizes)), sizes)]
+    along = (np.arange(len(face)) - np.repeat(walls.first[:-1] // PLACES, sizes) + 0.5) * (PLACES * ALONG)
+    at = face["start"] + along[:, None] * face["along"]
+    spots = [np.column_stack([at - off * face["out"], face["floor"]]) for off in SPOTS_BEFORE]
+    return np.stack([rooms_at(map, spot) for spot in spots], axis=1)
+
+
+def doorways_of(map: TopometricMap, walls: Elevations, doors: Array) -> Array:
+    """(D,) DOORWAY_DTYPE of a map's walls with the rooms on both sides.
+
+    Args:
+        doors: (n / 2, 2) of `door_places`.
+    """
+    return with_other_room(map, doorways(walls, doors, rooms_before(map, walls)))
 
 
 def with_other_room(map: TopometricMap, ways: Array) -> Array:
@@ -45,7 +67,7 @@ def doors_inside_rooms(map: TopometricMap, walls: Elevations, classes: Array) ->
     Args:
         walls, classes: as of `with_wall_doors`.
     """
-    ways = doorways(walls, door_places(walls, classes))
+    ways = doorways(walls, door_places(walls, classes), rooms_before(map, walls))
     sure = (ways["rooms"][:, 1] < 0) & (ways["mean"] >= SURE_INSIDE) & (ways["width"] <= DOOR_MOST_WIDTH)
     sure &= map.rooms["area"][ways["rooms"][:, 0]] <= LARGEST_PARTED
     ways = with_other_room(map, ways[sure])
@@ -80,7 +102,7 @@ def colour_doorways(map: TopometricMap, walls: Elevations, classes: Array, other
     """
     if walls.colours is None:
         return np.zeros(0, DOORWAY_DTYPE)
-    ways = doorways(walls, door_places(walls, coloured_classes(walls, classes)))
+    ways = doorways(walls, door_places(walls, coloured_classes(walls, classes)), rooms_before(map, walls))
     apart = ways["centre"][:, None] - others
     far = (np.linalg.norm(apart[..., :2], axis=2) > reach) | (np.abs(apart[..., 2]) > reach)
     ways = with_other_room(map, ways[far.all(axis=1)])

@@ -90,17 +90,29 @@ def strip_bounds(walls: Elevations) -> Iterator[tuple[int, int]]:
     return zip(walls.first[:-1].tolist(), walls.first[1:].tolist(), strict=True)
 
 
-def doorways(walls: Elevations, doors: Array) -> Array:
+def doorways(walls: Elevations, doors: Array, before: Array | None = None) -> Array:
     """(D,) DOORWAY_DTYPE, each once however many faces show it.
 
     Args:
         doors: (n / 2, 2) of `door_places`.
+        before: (n / 2, k) room on whose floor each of k spots before a place lies, -1 none: a strip goes on past its face, where
+            the next room may lie before it. None: the room of the face everywhere.
     """
     rows = []
     for face, (low, high) in zip(walls.faces, strip_bounds(walls), strict=True):
         each = doors[low // PLACES : high // PLACES]
-        rows += [_doorway(face, each, start, stop) for start, stop in _runs(each.sum(axis=1))]
+        for start, stop in _runs(each.sum(axis=1)):
+            rows.append(_doorway(face, each, start, stop))
+            if before is not None:
+                spots = before[low // PLACES + start : low // PLACES + stop]
+                rows[-1] = ((_most_common(spots, int(face["room"])), -1), *rows[-1][1:])
     return _joined(np.array(rows, DOORWAY_DTYPE))
+
+
+def _most_common(rooms: Array, otherwise: int) -> int:
+    """The room that occurs most often, `otherwise` where it is one of these or there is none (-1)."""
+    counts = np.bincount(rooms[rooms >= 0].astype(np.int64), minlength=otherwise + 1)
+    return otherwise if counts[otherwise] == counts.max() else int(counts.argmax())
 
 
 def joined_openings(ways: Array) -> tuple[Array, Array]:

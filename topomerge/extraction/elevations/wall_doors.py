@@ -14,11 +14,10 @@ import numpy as np
 
 from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
-from topomerge.extraction.elevations.doorway_rooms import colour_doorways, with_other_room
+from topomerge.extraction.elevations.doorway_rooms import colour_doorways, doorways_of
 from topomerge.extraction.elevations.doorways import (
     STRAIGHT,
     door_places,
-    doorways,
     joined_openings,
 )
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
@@ -125,7 +124,7 @@ def door_candidates(
     if walls is None or classes is None:
         return _flat_candidates(map, storeys, level)
     doors = door_places(walls, classes)
-    ways, shown = joined_openings(with_other_room(map, doorways(walls, doors)))
+    ways, shown = joined_openings(doorways_of(map, walls, doors))
     whole = _opening_of(level, ways)
     partner = _partners(level, ways, whole)
     edges, features, source = [], [], []
