@@ -124,7 +124,7 @@ def rooms_and_passages(
         floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
     else:
         door = p.slice_door if flat else p.door
-        floor = rooms_of_plans(scan.grid, navigable, door, p.narrow, p.standing_height, OtherSigns(parts))
+        floor = rooms_of_plans(scan.grid, navigable, door, p.narrow, p.standing_height, OtherSigns(parts, flat=flat))
 
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7

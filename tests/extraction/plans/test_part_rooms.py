@@ -90,7 +90,7 @@ def test_a_side_that_was_not_seen_and_another_storey_say_nothing(cut):
 def rooms_of(cut, log_odds) -> int:
     plan, region, clearance, passages, _ = cut
     weighed = {pair: replace(passage, log_odds=log_odds.get(pair, 0.0)) for pair, passage in passages.items()}
-    partition = merge_regions(region, clearance, weighed, plan.edge, door_probability, 0.5, 0.2, 0.8)
+    partition = merge_regions(region, clearance, weighed, plan.edge, door_probability, 0.5, 0.2, (0.8, 0.8))
     sizes = np.bincount(region[region >= 0])
     return len(np.unique(partition.room[sizes * plan.edge**2 > 1]))
 

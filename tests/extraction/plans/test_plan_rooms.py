@@ -12,11 +12,12 @@ from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.partition import merge_regions
-from topomerge.extraction.plans.passages import DOOR_FEATURES, clearance_of, door_features, find_passages, regions_of
+from topomerge.extraction.plans.passages import DOOR_FEATURES, Passage, clearance_of, door_features, find_passages, regions_of
 from topomerge.extraction.plans.plan import storey_plan
 from topomerge.extraction.plans.plan_network import column_probabilities
 from topomerge.extraction.plans.plan_rooms import _is_upper_side
 from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, joined_floor
+from topomerge.extraction.plans.storey_rooms import ROOM_LEAST_AREA
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import is_slice
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
@@ -193,12 +194,28 @@ def test_passages_measure_the_door() -> None:
     assert values["lintel"] == pytest.approx(scenes.HEIGHT - scenes.DOOR[1], abs=0.15) and values["lintel_cover"] > 0.8
     assert values["jamb"] > 0.8 and values["opens"] > 1.0 and values["length"] < 0.5
     assert door_probability(door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
-    parted = merge_regions(region, clearance, passages, plan.edge, door_probability, 0.5, 0.2, 0.8)
-    never = merge_regions(region, clearance, passages, plan.edge, lambda x: np.zeros(len(x)), 0.5, 0.2, 0.8)
-    always = merge_regions(region, clearance, passages, plan.edge, lambda x: np.ones(len(x)), 0.5, 0.2, 0.0)
+    parted = merge_regions(region, clearance, passages, plan.edge, door_probability, 0.5, 0.2, (0.8, 0.8))
+    never = merge_regions(region, clearance, passages, plan.edge, lambda x: np.zeros(len(x)), 0.5, 0.2, (0.8, 0.8))
+    always = merge_regions(region, clearance, passages, plan.edge, lambda x: np.ones(len(x)), 0.5, 0.2, (0.0, 0.0))
     sizes = np.bincount(region[region >= 0])
     assert len(np.unique(parted.room[sizes * 0.01 > 1])) == 2
     assert len(np.unique(never.room)) == 1 and len(np.unique(always.room)) == len(sizes)
+
+
+@pytest.mark.parametrize(
+    ("side", "chance", "rooms"),
+    [(9, 0.9, 3), (7, 0.9, 3), (7, 0.7, 2), (5, 0.9, 2)],
+    ids=["a room", "small, surely parted", "small, less surely", "tiny"],
+)
+def test_what_is_small_is_a_room_where_a_door_surely_parts_it(side: int, chance: float, rooms: int) -> None:
+    region = np.zeros((20, 60), np.int64)
+    region[:, 30:] = 1
+    region[:side, 60 - side :] = 2  # squares of 0.81, 0.49 and 0.25 m2
+    passage = Passage((0, 0), 0.8, (1.0, 0.0), (0.0,) * 12)
+    passages = {(0, 1): passage, (1, 2): passage}
+    least = ROOM_LEAST_AREA
+    partition = merge_regions(region, np.ones(region.shape), passages, 0.1, lambda x: np.full(len(x), chance), 0.5, 0.2, least)
+    assert len(np.unique(partition.room)) == rooms
 
 
 def test_what_nothing_is_above_at_the_height_of_a_ceiling_is_no_storey() -> None:

@@ -14,6 +14,7 @@ from topomerge.types import Array
 
 DoorClassifier = Callable[[Array], Array]  # (n, 17) features -> (n,) probability that a door parts the two
 Pair = tuple[int, int]
+SURE_PARTED = 0.8  # probability of a door from which on what is small, but not tiny, stays a room: toilets and stores
 SUREST_DOOR = 1e-6  # probabilities are that far from 0 and 1 at least where other maps are weighed
 
 
@@ -40,7 +41,7 @@ def merge_regions(
     classify: DoorClassifier,
     door: float,
     narrow: float,
-    least_area: float,
+    least_area: tuple[float, float],
 ) -> Partition:
     """Merge neighbouring regions, the least likely door first; each merger changes the features of the next ones.
 
@@ -52,7 +53,8 @@ def merge_regions(
         classify: tells doors from narrowings of a room.
         door: probability from which on two rooms stay apart.
         narrow: the lower one from which on two areas of a room do.
-        least_area: m2, smaller rooms are given to the neighbour from which the least likely door parts them.
+        least_area: m2, smaller rooms are given to the neighbour from which the least likely door parts them, and those above the
+            second only where that door is less likely than `SURE_PARTED`.
     """
     rooms = _GrowingRooms(region, clearance, passages, edge, classify)
     area: Array | None = None
@@ -64,14 +66,15 @@ def merge_regions(
             break
         rooms.merge(pair)
     area = rooms.of_region.copy() if area is None else area
-    small = {int(r) for r in np.unique(rooms.of_region) if rooms.area[r] < least_area}
+    small = {int(r) for r in np.unique(rooms.of_region) if rooms.area[r] < least_area[0]}
     while small:
-        near = [p for p in rooms.door_probability if p[0] in small or p[1] in small]
+        near = [(p, min(rooms.area[r] for r in p)) for p in rooms.door_probability if p[0] in small or p[1] in small]
+        near = [(p, size) for p, size in near if size < least_area[1] or rooms.door_probability[p] < SURE_PARTED]
         if not near:
             break
-        pair = min(near, key=lambda p: (rooms.door_probability[p], p))
+        pair = min((p for p, _ in near), key=lambda p: (rooms.door_probability[p], p))
         rooms.merge(pair)
-        small = {r for r in small - {pair[1]} if rooms.area[r] < least_area}
+        small = {r for r in small - {pair[1]} if rooms.area[r] < least_area[0]}
     return Partition(rooms.of_region, area, dict(rooms.door_probability))
 
 

@@ -20,8 +20,9 @@ from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.plans.upper_sides import without_upper_sides
 from topomerge.types import Array, VoxelGrid
 
-ROOM_LEAST_AREA = 0.8  # m2
-ROOM_LEAST_HALF_WIDTH = 0.35  # m: what is nowhere wider is the edge of a facade or of a slab
+ROOM_LEAST_AREA = 0.8, 0.3  # m2 of floor that was seen; the second where doors surely part it
+ROOM_LEAST_HALF_WIDTH = 0.2  # m: what is nowhere wider is the edge of a facade or of a slab
+FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH = (0.8, 0.8), 0.35  # likewise in slices and grid maps, where legs and sights look like walls
 
 
 class OtherSigns(NamedTuple):
@@ -30,10 +31,12 @@ class OtherSigns(NamedTuple):
     Args:
         parts: rooms of the maps that these cells were joined of.
         doors: (D,) INNER_DOOR_DTYPE, doors that walls show inside of what was one room.
+        flat: is it a slice or a grid map, in which nothing tells walls from what else stands about?
     """
 
     parts: Sequence[PartRooms] = ()
     doors: Array = np.zeros(0, INNER_DOOR_DTYPE)
+    flat: bool = False
 
 
 NO_SIGNS = OtherSigns()
@@ -85,23 +88,26 @@ def cut_storey(
     passages = find_passages(plan, clearance, region, probability)
     by_parts, by_walls = door_log_odds(region, plan.edge, passages, laid), inner_log_odds(plan, passages, others.doors)
     passages = {pair: replace(passage, log_odds=by_parts[pair] + by_walls[pair]) for pair, passage in passages.items()}
-    partition = merge_regions(region, clearance, passages, plan.edge, door_probability, door, narrow, ROOM_LEAST_AREA)
+    least = FLAT_LEAST_AREA if others.flat else ROOM_LEAST_AREA
+    partition = merge_regions(region, clearance, passages, plan.edge, door_probability, door, narrow, least)
+    wide = FLAT_LEAST_HALF_WIDTH if others.flat else ROOM_LEAST_HALF_WIDTH
     low, base = columns_of(plan, grid)
     corner = grid.origin + np.append(low, np.median(base)) * plan.edge
     classes = ClassifiedStorey(probability, corner[:2], plan.edge, float(corner[2]))
-    return StoreyRooms(k, plan, classes, *_numbered(partition, region, clearance, plan.edge))
+    return StoreyRooms(k, plan, classes, *_numbered(partition, region, clearance, plan.edge, (least[1], wide)))
 
 
 def _numbered(
-    partition: Partition, region: Array, clearance: Array, edge: float
+    partition: Partition, region: Array, clearance: Array, edge: float, least: tuple[float, float]
 ) -> tuple[Array, Array, Array, dict[Pair, float]]:
-    """Room and area of each column, room of each area and the probabilities of doors, of rooms that are large enough."""
+    """Room and area of each column, room of each area and the probabilities of doors, of rooms that are large enough:
+    `least` m2, and somewhere as far from walls, m."""
     in_region = region >= 0
     room = partition.room[region[in_region]]
     size = np.bincount(room, minlength=len(partition.room)) * edge**2
     widest = np.zeros(len(size))
     np.maximum.at(widest, room, clearance[in_region])
-    large = np.flatnonzero((size >= ROOM_LEAST_AREA) & (widest >= ROOM_LEAST_HALF_WIDTH))
+    large = np.flatnonzero((size >= least[0]) & (widest >= least[1]))
     number = np.full(len(size) + 1, -1)
     number[large] = np.arange(len(large))
     room_of_region = np.append(number[partition.room], -1)
