@@ -17,7 +17,7 @@ from topomerge.extraction.plans.plan import storey_plan
 from topomerge.extraction.plans.plan_network import column_probabilities
 from topomerge.extraction.plans.plan_rooms import _is_upper_side
 from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, joined_floor
-from topomerge.extraction.plans.storey_rooms import ROOM_LEAST_AREA
+from topomerge.extraction.plans.storey_rooms import FLAT_LEAST_AREA, ROOM_LEAST_AREA
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import is_slice
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
@@ -203,17 +203,24 @@ def test_passages_measure_the_door() -> None:
 
 
 @pytest.mark.parametrize(
-    ("side", "chance", "rooms"),
-    [(9, 0.9, 3), (7, 0.9, 3), (7, 0.7, 2), (5, 0.9, 2)],
-    ids=["a room", "small, surely parted", "small, less surely", "tiny"],
+    ("side", "chance", "least", "rooms"),
+    [
+        (9, 0.9, ROOM_LEAST_AREA, 3),
+        (7, 0.9, ROOM_LEAST_AREA, 3),
+        (7, 0.7, ROOM_LEAST_AREA, 2),
+        (5, 0.9, ROOM_LEAST_AREA, 2),
+        (7, 0.9, FLAT_LEAST_AREA, 2),
+    ],
+    ids=["a room", "small, surely parted", "small, less surely", "tiny", "small, of a slice"],
 )
-def test_what_is_small_is_a_room_where_a_door_surely_parts_it(side: int, chance: float, rooms: int) -> None:
+def test_what_is_small_is_a_room_where_a_door_surely_parts_it(
+    side: int, chance: float, least: tuple[float, float], rooms: int
+) -> None:
     region = np.zeros((20, 60), np.int64)
     region[:, 30:] = 1
     region[:side, 60 - side :] = 2  # squares of 0.81, 0.49 and 0.25 m2
     passage = Passage((0, 0), 0.8, (1.0, 0.0), (0.0,) * 12)
     passages = {(0, 1): passage, (1, 2): passage}
-    least = ROOM_LEAST_AREA
     partition = merge_regions(region, np.ones(region.shape), passages, 0.1, lambda x: np.full(len(x), chance), 0.5, 0.2, least)
     assert len(np.unique(partition.room)) == rooms
 

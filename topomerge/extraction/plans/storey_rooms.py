@@ -22,7 +22,7 @@ from topomerge.types import Array, VoxelGrid
 
 ROOM_LEAST_AREA = 0.8, 0.3  # m2 of floor that was seen; the second where doors surely part it
 ROOM_LEAST_HALF_WIDTH = 0.2  # m: what is nowhere wider is the edge of a facade or of a slab
-FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH = (0.8, 0.8), 0.35  # likewise in slices and grid maps, where legs and sights look like walls
+FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH = (0.8, 0.8), 0.35  # in slices and grid maps, where legs look like walls
 
 
 class OtherSigns(NamedTuple):
