@@ -102,10 +102,10 @@ def doorways(walls: Elevations, doors: Array, before: Array | None = None) -> Ar
     for face, (low, high) in zip(walls.faces, strip_bounds(walls), strict=True):
         each = doors[low // PLACES : high // PLACES]
         for start, stop in _runs(each.sum(axis=1)):
-            rows.append(_doorway(face, each, start, stop))
+            room = int(face["room"])
             if before is not None:
-                spots = before[low // PLACES + start : low // PLACES + stop]
-                rows[-1] = ((_most_common(spots, int(face["room"])), -1), *rows[-1][1:])
+                room = _most_common(before[low // PLACES + start : low // PLACES + stop], room)
+            rows.append(_doorway(face, room, each, start, stop))
     return _joined(np.array(rows, DOORWAY_DTYPE))
 
 
@@ -154,8 +154,8 @@ def _runs(chance: Array) -> Iterator[tuple[int, int]]:
             yield start, stop
 
 
-def _doorway(face: Array, doors: Array, start: int, stop: int) -> tuple[object, ...]:
-    """Row of DOORWAY_DTYPE of one stretch of a face."""
+def _doorway(face: Array, room: int, doors: Array, start: int, stop: int) -> tuple[object, ...]:
+    """Row of DOORWAY_DTYPE of one stretch of a face, with the room before it."""
     step = PLACES * ALONG
     chance = doors[start:stop].sum(axis=1)
     at = (np.average(np.arange(start, stop), weights=chance) + 0.5) * step
@@ -163,7 +163,7 @@ def _doorway(face: Array, doors: Array, start: int, stop: int) -> tuple[object, 
     width = float(chance.sum()) * step
     share = float(doors[start:stop, 0].sum() / chance.sum())
     place = (*middle.tolist(), float(face["floor"]))
-    return (int(face["room"]), -1), place, face["out"], width, float(chance.max()), float(chance.mean()), share, 1
+    return (room, -1), place, face["out"], width, float(chance.max()), float(chance.mean()), share, 1
 
 
 def _joined(rows: Array) -> Array:
