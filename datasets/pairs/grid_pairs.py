@@ -27,7 +27,7 @@ from topomerge.extraction.voxels import voxelise
 from topomerge.io import archive
 from topomerge.types import Array, PointCloud, Sim3, VoxelGrid
 
-GRID_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
+GRID_FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names
 GRID_EDGE = 0.1  # m
 COLUMN_EDGE = 0.2  # m, columns by which the area in common is measured
 NOTHING_IN_COMMON = 99.0  # m: nothing is shown by both

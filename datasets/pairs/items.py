@@ -22,7 +22,7 @@ from topomerge.embedding import graph
 from topomerge.io.listing import plain
 
 # Raise it when the same item gives other bytes, by whatever step: simulation, extraction, truth. It is part of the files' names.
-PAIR_FORMAT = 12
+PAIR_FORMAT = 13
 EXTRACTION = "topomerge.extraction.extract"
 MAKER = "topomerge.datasets.pairs.example"  # what makes the files
 CANDIDATES = 4  # buildings tried for an item: not every one has two parts with the overlap that is wanted

@@ -29,7 +29,7 @@ from topomerge.datasets.simulation.walk import part
 from topomerge.io.listing import plain
 from topomerge.types import Array, PointCloud, Sim3
 
-PLAN_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
+PLAN_FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.55, "r2v": 0.3, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.16, "lidar": 0.16, "depth": 0.12, "tablet": 0.12, "mono": 0.08, "laser2d": 0.2, "drawn": 0.16}
 SPOIL_SHARES = {"": 0.48, "sparse": 0.16, "noise": 0.1, "below2": 0.1, "drift": 0.06, "above": 0.1}  # above: no lower half

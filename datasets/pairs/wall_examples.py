@@ -55,7 +55,7 @@ from topomerge.io import archive
 from topomerge.io.listing import plain
 from topomerge.types import ROOM_DTYPE, Array, PointCloud, Sim3, TopometricMap, VoxelGrid
 
-WALL_FORMAT = 4  # raise it when the same item gives other bytes: it is part of the files' names
+WALL_FORMAT = 5  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.6, "r2v": 0.25, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.35, "depth": 0.25, "lidar": 0.2, "tablet": 0.12, "mono": 0.08}
 MAP_CELL = 0.1  # m

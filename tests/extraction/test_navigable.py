@@ -133,6 +133,15 @@ def test_a_ceiling_is_no_floor_but_an_open_upper_storey_is():
     assert set(without_ceilings(above, unobstructed(above, body)).cells[:, 2].tolist()) >= {0, 25}
 
 
+def test_the_ceiling_of_rooms_that_are_hardly_wider_than_their_walls_is_no_floor():
+    """Of 42 x 42 columns two thirds lie over walls or beside them: what is hollow below are the rooms between."""
+    ceiling, floor = slab(42, 42, 25), slab(42, 42)
+    walls = [(x, y, z) for x in range(42) for y in range(42) if x % 10 < 2 or y % 10 < 2 for z in range(1, 25)]
+    flat = floor.with_cells(np.concatenate([floor.cells, ceiling.cells, walls]).astype(np.int32))
+    standing = without_ceilings(flat, unobstructed(flat, stick(0.25, 0.3, 1.5, 0.1)))
+    assert set(standing.cells[:, 2].tolist()) == {0}
+
+
 def test_largest_component_and_floors():
     big, small = slab(30, 30), slab(12, 12)
     both = np.concatenate([big.cells, small.cells + (40, 0, 0), [(60, y, 20) for y in range(40)], [(70, 0, 0)]])

@@ -15,6 +15,7 @@ from topomerge.kernels.columns import first_occupied, hollow_below, levels_below
 from topomerge.types import Array, VoxelGrid
 
 HOLLOW_HEIGHT = 1.2  # m: empty space under a ceiling, above furniture
+HOLLOW_SHARE = 0.5  # of a ceiling, between walls, that has such a space below it
 STOREY_REACH = 8.0  # m: how far above a floor something may be, and how far below a ceiling its floor
 SHEET_HEIGHT = 0.3  # m: a noisy sheet is this thick
 SLAB_HEIGHT = 0.8  # m: so far below a ceiling's upper side, or a roof's, its lower side may be
@@ -25,9 +26,9 @@ WALLED_SHARE = 0.25  # share of a floor's boundary beside which walls rise
 def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
     """The standing cells less those on the upper side of a ceiling or of a wall.
 
-    A part of the standing cells with nothing above it is a ceiling if below most of it is empty space and then something. The
-    floor of an upper storey whose own ceiling was not scanned looks so, too; but walls rise along its boundary, and along a
-    ceiling's they end.
+    A part of the standing cells with nothing above it is a ceiling if below most of it, walls left aside, is empty space and then
+    something: of small flats half may lie over walls. The floor of an upper storey whose own ceiling was not scanned looks so,
+    too; but walls rise along its boundary, and along a ceiling's they end.
     """
     cells = standing.cells.astype(np.int64)
     thick = max(int(np.ceil(SHEET_HEIGHT / grid.edge)), 1)
@@ -44,9 +45,11 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
     walled = any_at(grid, cells[boundary], beside_and_above(grid.edge))
     on_boundary = np.bincount(component[boundary], minlength=count)
     with_wall = np.bincount(component[boundary], walled, minlength=count)
-    hollow_share = np.bincount(component[bare], hollow[bare], minlength=count) / np.bincount(component[bare], minlength=count)
-    ceiling = (hollow_share > 0.5) & (with_wall < WALLED_SHARE * np.maximum(on_boundary, 1))
-    return standing.subset(~(bare & (ceiling[component] | _on_a_wall(grid, cells))))
+    on_wall = _on_a_wall(grid, cells)
+    between = bare & ~on_wall
+    hollow_area, area = (np.bincount(component[rows], minlength=count) for rows in (between & hollow, between))
+    ceiling = (hollow_area > HOLLOW_SHARE * area) & (with_wall < WALLED_SHARE * np.maximum(on_boundary, 1))
+    return standing.subset(~(bare & (ceiling[component] | on_wall)))
 
 
 def _on_a_wall(grid: VoxelGrid, cells: Array) -> Array:

@@ -25,7 +25,7 @@ from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.types import Array
 
-PACKED_FORMAT = 6
+PACKED_FORMAT = 7
 PAIRS_PER_CHUNK = 100  # pairs; descriptors that take long are stored chunk by chunk
 PACKED_TABLES = ("x", "edge_attr", "door_attr", "pos", "edge_pos")  # no network reads positions: they depend on the frame
 INDICES = ("edge_index", "door_index", "near_index")
@@ -122,21 +122,24 @@ def pairs_of(file: Mapping[str, Array], row: Mapping[str, Any]) -> list[tuple[di
 
 
 def _add_sheets(pairs: Sequence[GraphPair], files: Sequence[Path], packed_file: Path, say: Callable[[str], None]) -> None:
-    """The storeys of all maps from above (`embedding.surroundings`), packed in chunks, too."""
+    """The storeys of all maps from above (`embedding.surroundings`), packed in chunks, too: of all files, so that a chunk serves
+    any `limit`."""
     of_file: dict[str, list[GraphPair]] = {}
     for pair in pairs:
         of_file.setdefault(str(pair.about["file"]), []).append(pair)
     for k, first in enumerate(range(0, len(files), PAIRS_PER_CHUNK)):
-        chunk = [file for file in files[first : first + PAIRS_PER_CHUNK] if file.name in of_file]
+        chunk = files[first : first + PAIRS_PER_CHUNK]
+        if not any(file.name in of_file for file in chunk):
+            continue
         path = packed_file.with_name(f"{packed_file.stem}-sheets-{k}.npz")
-        if chunk and not path.exists():
+        if not path.exists():
             say(f"packing storeys of files {first} to {first + len(chunk)}")
             read = {file.stem: archive.read(file, "cached pair") for file in chunk}
             named = {f"{stem}.{n}": v for stem, one in read.items() for n, v in one.items() if n.partition(".")[2] in SHEET}
             archive.write(named, path)
-        arrays = archive.read(path, "storeys") if chunk else {}
+        arrays = archive.read(path, "storeys")
         for file in chunk:
-            for pair in of_file[file.name]:
+            for pair in of_file.get(file.name, []):
                 for side, graph in zip(pair.about["sides"], (pair.a, pair.b), strict=True):
                     graph.update({name: torch.from_numpy(arrays[f"{file.stem}.{side}.{name}"]) for name in SHEET})
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,6 +53,12 @@ def test_a_training_takes_all_pairs_that_share_a_room_with_their_sheets(manifest
             assert all(np.array_equal(graph[name].numpy(), file[f"{side}.{name}"], equal_nan=True) for name in SHEET)
             assert np.allclose(graph["x"].numpy(), file[f"{side}.x"])
     assert len(load_pairs(manifest, ["sheet"], limit=1)) == 1
+
+
+def test_what_a_limited_run_packed_serves_all_pairs(manifest: Path) -> None:
+    shutil.rmtree(manifest.parent / "packed", ignore_errors=True)
+    assert len(load_pairs(manifest, ["sheet"], limit=1)) == 1
+    assert len({pair.about["file"] for pair in load_pairs(manifest, ["sheet"])}) > 1
 
 
 def test_older_sets_keep_their_names_and_what_makes_no_sense_is_refused() -> None:

@@ -141,6 +141,25 @@ def test_turning_shuffling_and_other_cells_change_little(corridor: Array) -> Non
         assert len(extract(corridor, voxel_size=edge).rooms) == 9
 
 
+def test_a_room_is_there_without_its_floor_where_walls_and_ceiling_were_seen() -> None:
+    points = scenes.two_rooms().points(0.01)
+    points = points[(points[:, 0] < 4.3) | (points[:, 2] > 0.3)]  # a camera that was held level in the small room
+    result = extract(points)
+    left, right = (room_at(result, x, 2.5) for x in (2, 5.5))
+    assert len(result.rooms) == 2 and left != right
+    area = dict(zip(range(2), result.rooms["area"].tolist(), strict=True))
+    assert area[left] == pytest.approx(20, abs=2) and area[right] == pytest.approx(14, abs=2)
+
+
+def test_a_plan_without_anything_beyond_is_as_large_as_its_floor() -> None:
+    scan = Scan(voxelise(scenes.two_rooms().points(0.01), 0.1))
+    scan, navigable = navigable_volume(scan, PRESETS["default"])
+    _, storey = find_storeys(navigable, floor_to_ceiling(scan.grid, navigable, 1.75))
+    plan = storey_plan(scan.grid, navigable, storey, 0)
+    reach = np.ptp(navigable.cells[:, :2], axis=0) + 1
+    assert (np.array(plan.wall.shape) == reach + 12).all()  # 0.6 m on all sides
+
+
 def test_a_wide_opening_keeps_both_readings() -> None:
     scene = scenes.Scene().shell(0, 0, 10, 5).wall((5, 0), (5, 1.2)).wall((5, 3.8), (5, 5))  # 2.6 m open, no lintel
     result = extract(scene.points(0.005))

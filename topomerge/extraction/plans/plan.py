@@ -20,7 +20,8 @@ from topomerge.extraction.plans.storey_plan import (
     observed_bands,
     wall_columns,
 )
-from topomerge.extraction.storeys import lowest_of_column
+from topomerge.extraction.storeys import HIGHEST_CEILING, STOREY_LEAST_HEIGHT, lowest_of_column
+from topomerge.kernels.columns import first_occupied
 from topomerge.kernels.profile import PROFILE_BELOW, PROFILE_LEVELS, profiles
 from topomerge.types import Array, VoxelGrid
 
@@ -30,6 +31,8 @@ OVER_FURNITURE = 2.05  # m: cupboards end below
 BLOCK = 0.5  # m: ceilings are measured on tiles of this size
 CLUTTER = 0.9  # m: free-standing pieces of wall shorter than this are pillars and the like
 FLOOR_REACH = 1.5  # m: so far from a seen floor a column still has its height
+COVERED_REACH = 3.0  # m: likewise where something is above it
+OVER_LEVEL = 0.3  # m: what is higher above a storey's level does not lie in its floor
 LEAST_FLOOR = 0.5  # m2 of seen floor in a part
 HOLE = 4.0  # m2: gaps this small in what is known are filled
 TOUCHES = 0.25  # m: pieces this close to a longer wall belong to it
@@ -56,9 +59,10 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
     floor = lowest_of_column(navigable)
     cells = navigable.cells[floor].astype(np.int64)
     mine = cells[storey[floor] == k]
-    margin = int(np.ceil(PLAN_MARGIN / e))
-    low = mine[:, :2].min(axis=0) - margin
-    size = mine[:, :2].max(axis=0) + margin + 1 - low
+    margin, far_off = int(np.ceil(PLAN_MARGIN / e)), round(COVERED_REACH / e)
+    first, last = mine[:, :2].min(axis=0) - margin, mine[:, :2].max(axis=0) + margin
+    low, high = first - far_off, last + far_off
+    size = high + 1 - low
     base, seen, far = _heights(mine, low, size)
     above = cells[storey[floor] == k + 1]
     top = base + PROFILE_LEVELS
@@ -75,10 +79,27 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
     wall = wall_like & ~_below_ceiling(profile, ceiling, e)
     wall = _without_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
     on_floor = (profile & np.uint64(bands.mask(-0.3, 0.3))) != 0
-    inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (~np.isnan(clear) & (far * e <= 2 * FLOOR_REACH))
+    reach = np.where(_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
+    inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (~np.isnan(clear) & (far * e <= reach))
     inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), ~np.isnan(clear), e)
-    origin, floor = grid.origin[:2] + low * e, grid.origin[2] + (base + 0.5) * e
-    return StoreyPlan(origin, e, wall, inside, profile, bands, floor, ceiling, (top - base) * e)
+    box = _box_around(inside, first - low, last - low, margin)
+    origin = grid.origin[:2] + (low + [side.start for side in box]) * e
+    floor, height = grid.origin[2] + (base[box] + 0.5) * e, (top - base)[box] * e
+    return StoreyPlan(origin, e, wall[box], inside[box], profile[box], bands, floor, ceiling[box], height)
+
+
+def _box_around(inside: Array, first: Array, last: Array, margin: int) -> tuple[slice, slice]:
+    """The part of a raster from columns `first` to `last`, and `margin` columns beyond where what is inside reaches further."""
+    box = []
+    for axis in (0, 1):
+        at = np.flatnonzero(inside.any(axis=1 - axis))
+        begin, end = int(first[axis]), int(last[axis])
+        if len(at) and at[0] < begin:
+            begin = max(int(at[0]) - margin, 0)
+        if len(at) and at[-1] > end:
+            end = min(int(at[-1]) + margin, inside.shape[axis] - 1)
+        box.append(slice(begin, end + 1))
+    return box[0], box[1]
 
 
 def _within(at: Array, size: Array) -> Array:
@@ -97,6 +118,17 @@ def _heights(cells: Array, low: Array, size: Array, nominal: int = 0) -> tuple[A
     seen[at] = True
     far, nearest = ndimage.distance_transform_edt(~seen, return_indices=True)
     return base[tuple(nearest)], seen, far
+
+
+def _open_below(grid: VoxelGrid, lower: Array, low: Array, base: Array) -> Array:
+    """(nx, ny) bool: does the floor of the storey below, (n, 3) cells, see past the level of this one's? A hall through both."""
+    out = np.zeros(base.shape, bool)
+    lower = np.ascontiguousarray(lower[_within(lower[:, :2] - low, np.array(base.shape))])
+    at = tuple((lower[:, :2] - low).T)
+    upright, highest = round(STOREY_LEAST_HEIGHT / grid.edge), round(HIGHEST_CEILING / grid.edge)
+    free = first_occupied(*grid._bricks, lower, upright, 1, highest)
+    out[at] = (free == 0) | (lower[:, 2] + free > base[at] + round(OVER_LEVEL / grid.edge))
+    return out
 
 
 def profile_bands(edge: float) -> HeightBands:
