@@ -13,8 +13,8 @@ from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.partition import merge_regions
 from topomerge.extraction.plans.passages import DOOR_FEATURES, Passage, clearance_of, door_features, find_passages, regions_of
-from topomerge.extraction.plans.plan import storey_plan
-from topomerge.extraction.plans.plan_network import column_probabilities
+from topomerge.extraction.plans.plan import _box_around, storey_plan
+from topomerge.extraction.plans.plan_network import COARSEST_STRIDE, column_probabilities
 from topomerge.extraction.plans.plan_rooms import _is_upper_side
 from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, joined_floor
 from topomerge.extraction.plans.storey_rooms import FLAT_LEAST_AREA, ROOM_LEAST_AREA
@@ -141,11 +141,12 @@ def test_turning_shuffling_and_other_cells_change_little(corridor: Array) -> Non
         assert len(extract(corridor, voxel_size=edge).rooms) == 9
 
 
-def test_a_room_is_there_without_its_floor_where_walls_and_ceiling_were_seen() -> None:
+@pytest.mark.parametrize("degrees", [0, 180])
+def test_a_room_is_there_without_its_floor_where_walls_and_ceiling_were_seen(degrees: int) -> None:
     points = scenes.two_rooms().points(0.01)
     points = points[(points[:, 0] < 4.3) | (points[:, 2] > 0.3)]  # a camera that was held level in the small room
-    result = extract(points)
-    left, right = (room_at(result, x, 2.5) for x in (2, 5.5))
+    result = extract(turned(points, degrees))
+    (left, right) = (room_at(result, *turned(np.array([[x, 2.5, 0.0]]), degrees)[0]) for x in (2, 5.5))
     assert len(result.rooms) == 2 and left != right
     area = dict(zip(range(2), result.rooms["area"].tolist(), strict=True))
     assert area[left] == pytest.approx(20, abs=2) and area[right] == pytest.approx(14, abs=2)
@@ -158,6 +159,15 @@ def test_a_plan_without_anything_beyond_is_as_large_as_its_floor() -> None:
     plan = storey_plan(scan.grid, navigable, storey, 0)
     reach = np.ptp(navigable.cells[:, :2], axis=0) + 1
     assert (np.array(plan.wall.shape) == reach + 12).all()  # 0.6 m on all sides
+
+
+def test_a_plan_grows_by_strides_of_the_network_at_its_beginning() -> None:
+    inside = np.zeros((200, 200), bool)
+    inside[100:120, 100:120] = True
+    first, last, margin = np.array([94, 94]), np.array([125, 125]), 6
+    assert _box_around(inside, first, last, margin) == (slice(94, 126), slice(94, 126))
+    inside[80, 100] = inside[110, 140] = True
+    assert _box_around(inside, first, last, margin) == (slice(94 - 2 * COARSEST_STRIDE, 126), slice(94, 147))
 
 
 def test_a_wide_opening_keeps_both_readings() -> None:

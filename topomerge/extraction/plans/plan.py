@@ -10,6 +10,7 @@ import edt
 import numpy as np
 from scipy import ndimage
 
+from topomerge.extraction.plans.plan_network import COARSEST_STRIDE
 from topomerge.extraction.plans.storey_plan import (
     WALL_HEIGHTS,
     HeightBands,
@@ -59,7 +60,8 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
     floor = lowest_of_column(navigable)
     cells = navigable.cells[floor].astype(np.int64)
     mine = cells[storey[floor] == k]
-    margin, far_off = int(np.ceil(PLAN_MARGIN / e)), round(COVERED_REACH / e)
+    margin, steps = int(np.ceil(PLAN_MARGIN / e)), int(np.lcm(COARSEST_STRIDE, _tile(e)))
+    far_off = -(-(round(COVERED_REACH / e) + margin) // steps) * steps
     first, last = mine[:, :2].min(axis=0) - margin, mine[:, :2].max(axis=0) + margin
     low, high = first - far_off, last + far_off
     size = high + 1 - low
@@ -81,7 +83,7 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
     on_floor = (profile & np.uint64(bands.mask(-0.3, 0.3))) != 0
     reach = np.where(_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
     inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (~np.isnan(clear) & (far * e <= reach))
-    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), ~np.isnan(clear), e)
+    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), ~np.isnan(clear), e) & (far * e <= COVERED_REACH)
     box = _box_around(inside, first - low, last - low, margin)
     origin = grid.origin[:2] + (low + [side.start for side in box]) * e
     floor, height = grid.origin[2] + (base[box] + 0.5) * e, (top - base)[box] * e
@@ -89,15 +91,18 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
 
 
 def _box_around(inside: Array, first: Array, last: Array, margin: int) -> tuple[slice, slice]:
-    """The part of a raster from columns `first` to `last`, and `margin` columns beyond where what is inside reaches further."""
+    """The part of a raster from columns `first` to `last`, and `margin` columns beyond where what is inside reaches further.
+
+    At its beginning it grows by whole strides of the plan network, which so sees all else as it would without.
+    """
     box = []
     for axis in (0, 1):
         at = np.flatnonzero(inside.any(axis=1 - axis))
         begin, end = int(first[axis]), int(last[axis])
         if len(at) and at[0] < begin:
-            begin = max(int(at[0]) - margin, 0)
+            begin -= -(-(begin - int(at[0]) + margin) // COARSEST_STRIDE) * COARSEST_STRIDE
         if len(at) and at[-1] > end:
-            end = min(int(at[-1]) + margin, inside.shape[axis] - 1)
+            end = int(at[-1]) + margin
         box.append(slice(begin, end + 1))
     return box[0], box[1]
 
@@ -152,7 +157,7 @@ def _filled_like_walls(profile: Array, bands: HeightBands) -> Array:
 
 def _ceiling(clear: Array, edge: float) -> Array:
     """Ceiling of each column: the median of a few tiles around it, which lamps and lintels don't reach."""
-    tile = max(round(BLOCK / edge), 1)
+    tile = _tile(edge)
     nx, ny = (-(-s // tile) for s in clear.shape)
     padded = np.full((nx * tile, ny * tile), np.nan)
     padded[: clear.shape[0], : clear.shape[1]] = clear
@@ -161,6 +166,11 @@ def _ceiling(clear: Array, edge: float) -> Array:
     around = np.pad(middle, 2, constant_values=np.nan)
     smooth = _nanmedian(np.stack([around[i : i + nx, j : j + ny] for i in range(5) for j in range(5)], axis=-1))
     return np.repeat(np.repeat(smooth, tile, 0), tile, 1)[: clear.shape[0], : clear.shape[1]]
+
+
+def _tile(edge: float) -> int:
+    """Columns a side of the tiles on which ceilings are measured."""
+    return max(round(BLOCK / edge), 1)
 
 
 def _nanmedian(values: Array) -> Array:
