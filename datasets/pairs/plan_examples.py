@@ -21,12 +21,13 @@ from topomerge.datasets.plans import splits
 from topomerge.datasets.simulation.scanner import moved
 
 from topomerge.errors import InputError
+from topomerge.extraction.free_space import with_crossed_cells
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.plan import columns_of, profile_bands, storey_plan
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.scan import read_scan
-from topomerge.extraction.slices import with_raised_slice
+from topomerge.extraction.slices import is_slice, with_raised_slice
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.io import archive
 from topomerge.types import Array, PointCloud
@@ -194,13 +195,15 @@ def make_examples(item: PlanItem, plan: Plan | None) -> list[PlanExample]:
 def storeys_of(cloud: PointCloud, edge: float) -> list[tuple[StoreyPlan, Array]]:
     """The plans of a scan as the extraction makes them, and the places (nx, ny, 3) of their columns' floors."""
     p = PRESETS["default"]
-    upright, navigable = navigable_volume(with_raised_slice(read_scan(cloud, edge, p.sparse)), p)
-    grid = upright.grid
+    scan = read_scan(cloud, edge, p.sparse)
+    flat = is_slice(scan.grid)
+    upright, navigable = navigable_volume(with_raised_slice(scan), p)
+    grid, crossed = upright.grid, None if flat else with_crossed_cells(upright).crossed
     storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, p.standing_height))
     out = []
     for k in range(len(storeys)):
         if (storey == k).any():
-            plan = storey_plan(grid, navigable, storey, k)
+            plan = storey_plan(grid, navigable, storey, k, crossed)
             low, base = columns_of(plan, grid)
             columns = np.stack(np.meshgrid(*(np.arange(n) for n in plan.wall.shape), indexing="ij"), axis=-1) + low
             cells = np.concatenate([columns, np.full((*plan.wall.shape, 1), np.median(base))], axis=-1)

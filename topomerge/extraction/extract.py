@@ -17,7 +17,7 @@ from topomerge.extraction.elevations.wall_doors import with_wall_doors
 from topomerge.extraction.elevations.windows import with_windows
 from topomerge.extraction.floor import Floor
 from topomerge.extraction.floor_patches import without_patches
-from topomerge.extraction.free_space import free_space
+from topomerge.extraction.free_space import free_space, with_crossed_cells
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
 from topomerge.extraction.plans.inner_doors import INNER_DOOR_DTYPE
@@ -73,7 +73,7 @@ def extract(
     made, doubts, again = _with_odds_and_openings(map, scan, floor, p)
     if not parts:  # rooms of joined maps are what their parts say
         if len(again.doors) and not isinstance(p, ThesisParameters):
-            signs = OtherSigns(doors=again.doors)
+            signs = OtherSigns(doors=again.doors, crossed=scan.crossed)
             floor = rooms_of_plans(scan.grid, navigable, p.door, p.narrow, p.standing_height, signs)
             made, doubts, again = _with_odds_and_openings(topometric_map(scan.grid, floor, p.standing_height), scan, floor, p)
         if again.one is not None:
@@ -123,8 +123,9 @@ def rooms_and_passages(
     if isinstance(p, ThesisParameters):
         floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
     else:
-        door = p.slice_door if flat else p.door
-        floor = rooms_of_plans(scan.grid, navigable, door, p.narrow, p.standing_height, OtherSigns(parts, flat=flat))
+        scan = scan if flat else with_crossed_cells(scan)
+        door, signs = p.slice_door if flat else p.door, OtherSigns(parts, flat=flat, crossed=scan.crossed)
+        floor = rooms_of_plans(scan.grid, navigable, door, p.narrow, p.standing_height, signs)
 
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7

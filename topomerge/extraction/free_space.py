@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from topomerge.extraction.distance_field import horizontal_distance_field
@@ -31,16 +33,39 @@ def free_space(scan: Scan, navigable: VoxelGrid, range: float) -> VoxelGrid | No
     """
     if scan.free is not None:
         return scan.free
-    nx, ny, nz = (-(-s // FREE_CELL) for s in scan.grid.shape)
-    if nx * ny * nz > LARGEST_VOLUME:
-        return None
-    crossed = np.zeros((nx, ny, nz), bool)
+    scan = with_crossed_cells(scan)
     if scan.rays is not None:
-        _carve_rays(scan.grid, *scan.rays, crossed)
-    else:
-        _carve_views(scan.grid, navigable, range, crossed)
-    crossed[tuple((scan.grid.cells // FREE_CELL).T)] = False
-    return VoxelGrid.from_cells(np.argwhere(crossed), scan.grid.origin, scan.grid.edge * FREE_CELL, (nx, ny, nz))
+        return scan.crossed
+    crossed = _nothing_crossed(scan.grid)
+    if crossed is None:
+        return None
+    _carve_views(scan.grid, navigable, range, crossed)
+    return _empty_cells(scan.grid, crossed)
+
+
+def with_crossed_cells(scan: Scan) -> Scan:
+    """The scan with the cells that its rays crossed, twice as long as those of its grid, where the places of the sensor are known
+    and the volume is not too large to be carved."""
+    if scan.rays is None or scan.crossed is not None:
+        return scan
+    crossed = _nothing_crossed(scan.grid)
+    if crossed is None:
+        return scan
+    _carve_rays(scan.grid, *scan.rays, crossed)
+    return replace(scan, crossed=_empty_cells(scan.grid, crossed))
+
+
+def _nothing_crossed(grid: VoxelGrid) -> Array | None:
+    """(nx, ny, nz) bool of the free cells, none of them crossed; None where there are too many."""
+    nx, ny, nz = (-(-s // FREE_CELL) for s in grid.shape)
+    return np.zeros((nx, ny, nz), bool) if nx * ny * nz <= LARGEST_VOLUME else None
+
+
+def _empty_cells(grid: VoxelGrid, crossed: Array) -> VoxelGrid:
+    """The crossed cells in which nothing stands."""
+    crossed[tuple((grid.cells // FREE_CELL).T)] = False
+    nx, ny, nz = crossed.shape
+    return VoxelGrid.from_cells(np.argwhere(crossed), grid.origin, grid.edge * FREE_CELL, (nx, ny, nz))
 
 
 def _carve_rays(grid: VoxelGrid, starts: Array, ends: Array, crossed: Array) -> None:

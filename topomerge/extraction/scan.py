@@ -38,6 +38,7 @@ class Scan:
         free: cells that the file says are empty, or None.
         source: where it comes from.
         warnings: what the user should know.
+        crossed: cells that its rays crossed (`free_space.with_crossed_cells`); None where that is unknown.
     """
 
     grid: VoxelGrid
@@ -47,6 +48,7 @@ class Scan:
     free: VoxelGrid | None = None
     source: str = ""
     warnings: tuple[str, ...] = ()
+    crossed: VoxelGrid | None = None
 
     @property
     def places(self) -> Array:

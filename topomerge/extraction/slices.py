@@ -78,7 +78,7 @@ def _extruded(grid: VoxelGrid, rays: tuple[Array, Array] | None) -> VoxelGrid:
         wall, inside = (points > 0) & (passed <= SEEN_THROUGH * np.maximum(met, 1)), passed > 0
     else:
         wall = _filled_columns(points, grid.edge)
-        inside = _enclosed(wall, grid.edge)
+        inside = enclosed_columns(wall, grid.edge)
     inside = ndimage.binary_closing(np.pad(inside, 2), np.ones((3, 3)))[2:-2, 2:-2] & ~wall
     high = round(EXTRUDED_HEIGHT / grid.edge)
     levels = np.arange(low + 1, low + high)
@@ -112,7 +112,7 @@ def _filled_columns(points: Array, edge: float) -> Array:
     return np.asarray(some & (points >= FEW_POINTS * usual))
 
 
-def _enclosed(wall: Array, edge: float) -> Array:
+def enclosed_columns(wall: Array, edge: float) -> Array:
     """(nx, ny) columns around which walls stand in most directions."""
     hits = np.zeros(wall.shape, np.int32)
     far = round(SIGHT_RANGE / edge)

@@ -152,6 +152,22 @@ def test_a_room_is_there_without_its_floor_where_walls_and_ceiling_were_seen(deg
     assert area[left] == pytest.approx(20, abs=2) and area[right] == pytest.approx(14, abs=2)
 
 
+def test_a_room_is_there_without_floor_and_ceiling_where_rays_crossed_it() -> None:
+    """A camera with a narrow view, carried through both rooms, sees the walls of the second one only."""
+    points = scenes.two_rooms().points(0.01)
+    points = points[(points[:, 0] < 4.3) | ((points[:, 2] > 0.3) & (points[:, 2] < 2.2))]
+    right = points[:, 0] > 4.07
+    stands = np.tile(np.eye(4), (2, 1, 1))
+    stands[:, :3, 3] = (2.0, 2.5, 1.5), (5.5, 2.5, 1.5)
+    walked = extract(PointCloud(points, poses=stands, pose_of=right.astype(np.int32)))
+    places = walked.navigable.centroids()[walked.navigable_room == room_at(walked, 5.5, 2.5)]
+    assert room_at(walked, 2, 2.5) != room_at(walked, 5.5, 2.5)
+    assert len(places) * walked.navigable.edge**2 == pytest.approx(14, abs=2) and places[:, 0].min() > 3.8
+    unknown = extract(points)  # where the camera was is not known: nothing tells that the middle of the second room is empty
+    middle = np.abs(unknown.navigable.centroids()[unknown.navigable_room >= 0][:, :2] - (5.5, 2.5)).max(axis=1) < 1
+    assert not middle.any()
+
+
 def test_a_plan_without_anything_beyond_is_as_large_as_its_floor() -> None:
     scan = Scan(voxelise(scenes.two_rooms().points(0.01), 0.1))
     scan, navigable = navigable_volume(scan, PRESETS["default"])

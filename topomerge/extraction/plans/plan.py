@@ -21,6 +21,7 @@ from topomerge.extraction.plans.storey_plan import (
     observed_bands,
     wall_columns,
 )
+from topomerge.extraction.slices import enclosed_columns
 from topomerge.extraction.storeys import HIGHEST_CEILING, STOREY_LEAST_HEIGHT, lowest_of_column
 from topomerge.kernels.columns import first_occupied
 from topomerge.kernels.profile import PROFILE_BELOW, PROFILE_LEVELS, profiles
@@ -33,6 +34,8 @@ BLOCK = 0.5  # m: ceilings are measured on tiles of this size
 CLUTTER = 0.9  # m: free-standing pieces of wall shorter than this are pillars and the like
 FLOOR_REACH = 1.5  # m: so far from a seen floor a column still has its height
 COVERED_REACH = 3.0  # m: likewise where something is above it
+LOOKED_THROUGH = 0.4, 1.9  # m above the floor, where rays say that a column is empty
+LONGEST_CROSSED = 0.3  # m: longer free cells reach from wall to wall
 OVER_LEVEL = 0.3  # m: what is higher above a storey's level does not lie in its floor
 LEAST_FLOOR = 0.5  # m2 of seen floor in a part
 HOLE = 4.0  # m2: gaps this small in what is known are filled
@@ -48,13 +51,15 @@ def columns_of(plan: StoreyPlan, grid: VoxelGrid) -> tuple[Array, Array]:
     return low, np.rint((plan.floor - grid.origin[2]) / plan.edge - 0.5).astype(np.int64)
 
 
-def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) -> StoreyPlan:
+def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, crossed: VoxelGrid | None = None) -> StoreyPlan:
     """The plan of storey `k`.
 
     Args:
         grid: occupied cells.
         navigable: the navigable volume.
         storey: (m,) storey of each of its cells.
+        crossed: cells that the sensor looked through, where that is known: there is a room, though neither its floor nor its
+            ceiling was seen.
     """
     e = grid.edge
     floor = lowest_of_column(navigable)
@@ -82,8 +87,11 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int) ->
     wall = _without_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
     on_floor = (profile & np.uint64(bands.mask(-0.3, 0.3))) != 0
     reach = np.where(_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
-    inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (~np.isnan(clear) & (far * e <= reach))
-    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), ~np.isnan(clear), e) & (far * e <= COVERED_REACH)
+    known = ~np.isnan(clear)
+    if crossed is not None:
+        known |= _looked_through(crossed, grid, low, base) & enclosed_columns(wall, e)  # what lies before windows is no room
+    inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (known & (far * e <= reach))
+    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), known, e) & (far * e <= COVERED_REACH)
     box = _box_around(inside, first - low, last - low, margin)
     origin = grid.origin[:2] + (low + [side.start for side in box]) * e
     floor, height = grid.origin[2] + (base[box] + 0.5) * e, (top - base)[box] * e
@@ -134,6 +142,23 @@ def _open_below(grid: VoxelGrid, lower: Array, low: Array, base: Array) -> Array
     free = first_occupied(*grid._bricks, lower, upright, 1, highest)
     out[at] = (free == 0) | (lower[:, 2] + free > base[at] + round(OVER_LEVEL / grid.edge))
     return out
+
+
+def _looked_through(crossed: VoxelGrid, grid: VoxelGrid, low: Array, base: Array) -> Array:
+    """(nx, ny) bool: did rays cross two free cells or more of a column at the height of a body?"""
+    count = np.zeros(base.shape, np.int64)
+    if crossed.edge > LONGEST_CROSSED:
+        return count > 0
+    parts = max(round(crossed.edge / grid.edge), 1)  # columns a side that lie in a free cell
+    height = (crossed.cells[:, 2] + 0.5) * (crossed.edge / grid.edge)
+    for part in np.argwhere(np.ones((parts, parts), bool)):
+        at = np.floor((crossed.cells[:, :2] + (part + 0.5) / parts) * (crossed.edge / grid.edge)).astype(np.int64) - low
+        within = _within(at, np.array(base.shape))
+        columns = tuple(at[within].T)
+        above = (height[within] - base[columns]) * grid.edge
+        body = (above > LOOKED_THROUGH[0]) & (above < LOOKED_THROUGH[1])
+        np.add.at(count, tuple(axis[body] for axis in columns), 1)
+    return count >= 2
 
 
 def profile_bands(edge: float) -> HeightBands:
@@ -208,7 +233,8 @@ def _without_clutter(wall: Array, edge: float) -> Array:
 
 
 def _filled(inside: Array, wall: Array, seen: Array, covered: Array, edge: float) -> Array:
-    """What is known, without small holes and without parts of which neither a floor was seen nor a ceiling with walls around."""
+    """What is known, without small holes and without parts of which neither a floor was seen nor walls around what has a ceiling
+    or was looked through (`covered`)."""
     reach = max(round(0.2 / edge), 1)
     closed = ndimage.binary_closing(np.pad(inside | wall, reach), np.ones((2 * reach + 1,) * 2))[reach:-reach, reach:-reach]
     hole, count = ndimage.label(~closed)

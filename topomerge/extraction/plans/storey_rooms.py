@@ -32,11 +32,13 @@ class OtherSigns(NamedTuple):
         parts: rooms of the maps that these cells were joined of.
         doors: (D,) INNER_DOOR_DTYPE, doors that walls show inside of what was one room.
         flat: is it a slice or a grid map, in which nothing tells walls from what else stands about?
+        crossed: cells that the sensor looked through, where that is known.
     """
 
     parts: Sequence[PartRooms] = ()
     doors: Array = np.zeros(0, INNER_DOOR_DTYPE)
     flat: bool = False
+    crossed: VoxelGrid | None = None
 
 
 NO_SIGNS = OtherSigns()
@@ -76,7 +78,7 @@ def cut_storey(
         door, narrow: probabilities of a door from which on a narrowing parts rooms, and areas of a room.
         others: what else speaks for where rooms part.
     """
-    plan = storey_plan(grid, navigable, storey, k)
+    plan = storey_plan(grid, navigable, storey, k, others.crossed)
     probability = column_probabilities(plan)
     plan = without_furniture(plan, probability)
     clearance = clearance_of(plan)
