@@ -87,11 +87,11 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, cr
     wall = _without_clutter(ndimage.binary_closing(wall, np.ones((3, 3)), border_value=0) | wall, e)
     on_floor = (profile & np.uint64(bands.mask(-0.3, 0.3))) != 0
     reach = np.where(_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
-    known = ~np.isnan(clear)
+    covered = ~np.isnan(clear)
     if crossed is not None:
-        known |= _looked_through(crossed, grid, low, base) & enclosed_columns(wall, e)  # what lies before windows is no room
-    inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (known & (far * e <= reach))
-    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), known, e) & (far * e <= COVERED_REACH)
+        covered |= _looked_through(crossed, grid, low, base) & enclosed_columns(wall, e)  # what lies before windows is no room
+    inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (covered & (far * e <= reach))
+    inside = _filled(inside, wall, on_floor & (far * e <= FLOOR_REACH), covered, e) & (far * e <= COVERED_REACH)
     box = _box_around(inside, first - low, last - low, margin)
     origin = grid.origin[:2] + (low + [side.start for side in box]) * e
     floor, height = grid.origin[2] + (base[box] + 0.5) * e, (top - base)[box] * e
