@@ -146,10 +146,9 @@ def test_a_room_is_there_without_its_floor_where_walls_and_ceiling_were_seen(deg
     points = scenes.two_rooms().points(0.01)
     points = points[(points[:, 0] < 4.3) | (points[:, 2] > 0.3)]  # a camera that was held level in the small room
     result = extract(turned(points, degrees))
-    (left, right) = (room_at(result, *turned(np.array([[x, 2.5, 0.0]]), degrees)[0]) for x in (2, 5.5))
+    left, right = (room_at(result, *turned(np.array([[x, 2.5, 0.0]]), degrees)[0]) for x in (2, 5.5))
     assert len(result.rooms) == 2 and left != right
-    area = dict(zip(range(2), result.rooms["area"].tolist(), strict=True))
-    assert area[left] == pytest.approx(20, abs=2) and area[right] == pytest.approx(14, abs=2)
+    assert result.rooms["area"][[left, right]] == pytest.approx((20, 14), abs=2)
 
 
 def test_a_room_is_there_without_floor_and_ceiling_where_rays_crossed_it() -> None:

@@ -146,19 +146,18 @@ def _open_below(grid: VoxelGrid, lower: Array, low: Array, base: Array) -> Array
 
 def _looked_through(crossed: VoxelGrid, grid: VoxelGrid, low: Array, base: Array) -> Array:
     """(nx, ny) bool: did rays cross two free cells or more of a column at the height of a body?"""
-    count = np.zeros(base.shape, np.int64)
+    count = np.zeros(base.size, np.int64)
     if crossed.edge > LONGEST_CROSSED:
-        return count > 0
+        return count.reshape(base.shape) > 0
     parts = max(round(crossed.edge / grid.edge), 1)  # columns a side that lie in a free cell
     height = (crossed.cells[:, 2] + 0.5) * (crossed.edge / grid.edge)
     for part in np.argwhere(np.ones((parts, parts), bool)):
         at = np.floor((crossed.cells[:, :2] + (part + 0.5) / parts) * (crossed.edge / grid.edge)).astype(np.int64) - low
         within = _within(at, np.array(base.shape))
-        columns = tuple(at[within].T)
-        above = (height[within] - base[columns]) * grid.edge
-        body = (above > LOOKED_THROUGH[0]) & (above < LOOKED_THROUGH[1])
-        np.add.at(count, tuple(axis[body] for axis in columns), 1)
-    return count >= 2
+        column = at[within, 0] * base.shape[1] + at[within, 1]
+        above = (height[within] - base.ravel()[column]) * grid.edge
+        count += np.bincount(column[(above > LOOKED_THROUGH[0]) & (above < LOOKED_THROUGH[1])], minlength=base.size)
+    return count.reshape(base.shape) >= 2
 
 
 def profile_bands(edge: float) -> HeightBands:
