@@ -46,9 +46,9 @@ def exported_colours(network: ColourNetwork) -> dict[str, Array]:
     weights = {}
     for name, layer in _layers(network):
         assert layer.bias is not None
-        taps = layer.weight.detach().numpy()
+        taps = layer.weight.detach().cpu().numpy()
         turned = taps.T if taps.ndim == 2 else taps.transpose(2, 1, 0).reshape(-1, taps.shape[0])
-        weights[f"{name}.w"], weights[f"{name}.b"] = turned, layer.bias.detach().numpy()
+        weights[f"{name}.w"], weights[f"{name}.b"] = turned, layer.bias.detach().cpu().numpy()
     return weights
 
 

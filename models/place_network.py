@@ -44,5 +44,5 @@ def exported_weights(network: PlaceNetwork) -> dict[str, Array]:
     """Weights for `place_log_odds`: (9 c, k) with the normalisation in them."""
     weights = folded(network.layers)
     for name, layer in (("f", network.hidden), ("out", network.out)):
-        weights[f"{name}.w"], weights[f"{name}.b"] = layer.weight.detach().numpy().T, layer.bias.detach().numpy()
+        weights[f"{name}.w"], weights[f"{name}.b"] = layer.weight.detach().cpu().numpy().T, layer.bias.detach().cpu().numpy()
     return weights

@@ -54,9 +54,9 @@ class PlanUNet(nn.Module):
 def exported_weights(network: PlanUNet) -> dict[str, Array]:
     """Weights for `plan_network.forward`: (9 c, k) with the normalisation in them."""
     weights = folded(network.layers)
-    weights["out.w"] = network.out.weight.detach().numpy()[:, :, 0, 0].T
+    weights["out.w"] = network.out.weight.detach().cpu().numpy()[:, :, 0, 0].T
     assert network.out.bias is not None
-    weights["out.b"] = network.out.bias.detach().numpy()
+    weights["out.b"] = network.out.bias.detach().cpu().numpy()
     return weights
 
 
@@ -69,7 +69,7 @@ def folded(layers: nn.ModuleDict) -> dict[str, Array]:
         assert isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)
         assert norm.running_var is not None and norm.running_mean is not None
         scale = (norm.weight / (norm.running_var + norm.eps).sqrt()).detach()
-        kernel = (conv.weight * scale[:, None, None, None]).detach().numpy()
+        kernel = (conv.weight * scale[:, None, None, None]).detach().cpu().numpy()
         weights[f"{name}.w"] = kernel.transpose(2, 3, 1, 0).reshape(-1, kernel.shape[0])
-        weights[f"{name}.b"] = (norm.bias - norm.running_mean * scale).detach().numpy()
+        weights[f"{name}.b"] = (norm.bias - norm.running_mean * scale).detach().cpu().numpy()
     return weights

@@ -53,10 +53,10 @@ def exported_network(network: WallNetwork) -> dict[str, Array]:
     """Weights for `wall_network.place_probabilities`: (in, out), with the normalisation in them."""
     weights = folded(network.layers)
     for name, layer in (("depths", network.depths), ("out", network.out)):
-        weights[f"{name}.w"], weights[f"{name}.b"] = layer.weight.detach().numpy().T, layer.bias.detach().numpy()
+        weights[f"{name}.w"], weights[f"{name}.b"] = layer.weight.detach().cpu().numpy().T, layer.bias.detach().cpu().numpy()
     for name, convolved in zip(ALONG_LAYERS, network.along, strict=True):
         assert isinstance(convolved, nn.Conv1d) and convolved.bias is not None
-        taps = convolved.weight.detach().numpy()  # (out, in, taps)
+        taps = convolved.weight.detach().cpu().numpy()  # (out, in, taps)
         weights[f"{name}.w"] = taps.transpose(2, 1, 0).reshape(-1, taps.shape[0])
-        weights[f"{name}.b"] = convolved.bias.detach().numpy()
+        weights[f"{name}.b"] = convolved.bias.detach().cpu().numpy()
     return weights

@@ -12,7 +12,7 @@ from topomerge.models.plan_unet import PlanUNet, exported_weights
 from benchmarks.speed.bench import best, line
 from topomerge.extraction.plans.plan_network import EVIDENCE_CHANNELS, forward
 
-NETWORK_WIDTHS = (16, 32, 40, 40, 40, 32, 16, 12)  # of configs/task/plan_segmentation.yaml
+NETWORK_WIDTHS = (32, 64, 96, 96, 96, 64, 32, 16)  # of configs/task/plan_segmentation.yaml
 AGREE = 1e-4  # of scores
 
 

@@ -34,7 +34,7 @@ from topomerge.types import Array, PointCloud
 
 LONGEST_SCAN = 600.0  # s
 VOXEL_SIZES = (0.1, 0.1, 0.1, 0.08, 0.15)  # m
-PLANS_READ = 300  # of a source
+PLANS_READ = 1000  # of a source
 PLAN_RASTERS = ("wall", "inside", "profile", "ceiling")
 
 

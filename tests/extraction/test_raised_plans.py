@@ -9,10 +9,13 @@ import pytest
 from PIL import Image
 
 from tests.scenes import two_rooms
+from topomerge.errors import InputError
+from topomerge.extraction.extract import extract
 from topomerge.extraction.scan import read_scan
 from topomerge.extraction.slices import is_raised, with_raised_slice
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import read_points
+from topomerge.io.weight_files import VARIABLE
 
 
 @pytest.fixture
@@ -47,3 +50,15 @@ def test_walls_without_anything_in_between_but_with_a_lintel_are_none(drawn: Pat
 
 def test_no_cells() -> None:
     assert not is_raised(voxelise(np.zeros((1, 3)), 0.1))
+
+
+@pytest.mark.parametrize("broken", ["plan_network.npz", "grid_network.npz"])
+def test_a_raised_plan_is_looked_at_by_its_own_network(drawn: Path, broken: str, tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / broken).write_bytes(b"no archive")
+    plan, scan = read_points(drawn, resolution=0.05), two_rooms().points()
+    used, other = (scan, plan) if broken == "plan_network.npz" else (plan, scan)
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "weights"))
+    assert len(extract(other).rooms) == 2
+    with pytest.raises(InputError, match=broken):
+        extract(used)

@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, DoorC
 from topomerge.extraction.elevations.wall_network import place_probabilities
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
+from topomerge.extraction.plans.plan_network import weights as plan_weights
 from topomerge.extraction.room_odds import room_weights
 from topomerge.fusion.evidence.network import weights as place_weights
 from topomerge.fusion.match_belief import belief_weights
@@ -40,7 +42,8 @@ from topomerge.training import (
 )
 from topomerge.training.door_classification import door_scores
 from topomerge.training.judging import judge_task
-from topomerge.training.loop import State
+from topomerge.training.loop import State, made_beside
+from topomerge.training.networks import device_of
 from topomerge.training.plan_segmentation import class_scores
 from topomerge.training.tasks import TASKS, settings_of, train, weights_of
 from topomerge.types import EDGE_DTYPE
@@ -48,6 +51,7 @@ from topomerge.types import EDGE_DTYPE
 ROOT = Path(__file__).parent.parent.parent
 NETWORKS = {
     "plan_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
+    "grid_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
     "door_classification": ["epochs=2", "batch=64", "hidden=4", "networks=2"],
     "wall_segmentation": ["epochs=2", "steps=2", "batch=4", "length=32", "hold_out=2", "widths=[4,4,8,8]"],
     "wall_colours": ["epochs=2", "steps=2", "batch=4", "length=32", "hold_out=2", "width=8"],
@@ -102,6 +106,7 @@ def read(task: str) -> Any:
     plan, signs = tiny.two_rooms(0).plan, np.ones((4, len(WALL_DOOR_FEATURES)))
     return {
         "plan_segmentation": lambda: column_probabilities(plan),
+        "grid_segmentation": lambda: column_probabilities(plan, plan_weights(raised=True)),
         "door_classification": lambda: door_probability(np.zeros((3, 17))),
         "place_evidence": lambda: place_weights()["a.w"],
         "room_matcher": lambda: matcher_weights()["rows.w"],
@@ -144,7 +149,8 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
 @pytest.mark.longer
 @pytest.mark.parametrize("task", list(NETWORKS))
 def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
-    jobs = {"plan_segmentation": plan_segmentation.PlanJob, "door_classification": door_classification.DoorJob}
+    jobs = dict.fromkeys(("plan_segmentation", "grid_segmentation"), plan_segmentation.PlanJob)
+    jobs |= {"door_classification": door_classification.DoorJob}
     jobs |= {"wall_segmentation": wall_segmentation.WallJob, "wall_colours": wall_colours.ColourJob}
     kind = {**jobs, "place_evidence": place_evidence.PlaceJob, "room_matcher": room_matcher.MatcherJob}[task]
     train(settings_of(words(task, "name=whole")), quiet)
@@ -192,6 +198,8 @@ def test_fits_learn_what_is_so(words) -> None:
         (["task=plan_segmentation", "data.scan=3"], "data.scan"),
         (["task=plan_segmentation", "epochs=many"], "epochs"),
         (["task=plan_segmentation", "crop=30"], "crop"),
+        (["task=plan_segmentation", "accelerator=tpu"], "accelerator"),
+        (["task=door_classification", "accelerator=cuda"], "accelerator"),
         (["task=wall_segmentation", "length=31"], "length"),
         (["task=wall_segmentation", "widths=[4,4]"], "widths"),
         (["task=wall_colours", "length=31"], "length"),
@@ -210,6 +218,26 @@ def test_a_wrong_word_is_one_line_with_its_key(given: list[str], key: str) -> No
     with pytest.raises(InputError, match=key) as refused:
         settings_of(given)
     assert "\n" not in str(refused.value)
+
+
+def test_a_device_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(InputError, match="accelerator=cuda"):
+        device_of(settings_of(["task=plan_segmentation", "accelerator=cuda"]))
+    assert device_of(settings_of(["task=door_classification"])).type == "cpu"
+
+
+def test_batches_made_beside_are_the_same() -> None:
+    assert list(made_beside(iter(range(1, 7)))) == list(range(1, 7))
+
+    def broken() -> Iterator[int]:
+        yield 1
+        raise InputError("the second batch")
+
+    batches = made_beside(broken())
+    assert next(batches) == 1
+    with pytest.raises(InputError, match="the second batch"):
+        next(batches)
 
 
 def test_scores_of_classes_and_doors() -> None:

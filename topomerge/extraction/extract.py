@@ -26,7 +26,7 @@ from topomerge.extraction.plans.plan_rooms import rooms_of_plans
 from topomerge.extraction.plans.storey_rooms import OtherSigns
 from topomerge.extraction.room_odds import with_room_odds
 from topomerge.extraction.scan import Scan, read_scan
-from topomerge.extraction.slices import is_slice, with_raised_slice
+from topomerge.extraction.slices import is_raised, is_slice, with_raised_slice
 from topomerge.extraction.small_rooms import gathered, without_small_rooms
 from topomerge.extraction.stopwatch import Progress, Stopwatch
 from topomerge.extraction.topology import topometric_map
@@ -124,8 +124,8 @@ def rooms_and_passages(
         floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
     else:
         scan = scan if flat else with_crossed_cells(scan)
-        door, signs = p.slice_door if flat else p.door, OtherSigns(parts, flat=flat, crossed=scan.crossed)
-        floor = rooms_of_plans(scan.grid, navigable, door, p.narrow, p.standing_height, signs)
+        signs = OtherSigns(parts, flat=flat, crossed=scan.crossed, raised=not flat and is_raised(scan.grid))
+        floor = rooms_of_plans(scan.grid, navigable, p.slice_door if flat else p.door, p.narrow, p.standing_height, signs)
 
     watch.begin("topology", 0.85)
     map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7

@@ -23,7 +23,13 @@ from topomerge.datasets.pairs.plan_examples import PlanRecipe, build_plans, load
 from topomerge.errors import InputError
 from topomerge.extraction.plans.door_classifier import read_classifier
 from topomerge.extraction.plans.passages import DOOR_FEATURES, clearance_of, door_features, find_passages, regions_of
-from topomerge.extraction.plans.plan_network import PLAN_NETWORK_FILE, column_probabilities, without_furniture
+from topomerge.extraction.plans.plan_network import (
+    GRID_NETWORK_FILE,
+    PLAN_NETWORK_FILE,
+    column_probabilities,
+    weights,
+    without_furniture,
+)
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.io.atomic import replacing
 from topomerge.io.weight_files import weights_file
@@ -57,8 +63,9 @@ def fit(settings: DoorClassification, say: Say) -> dict[str, float]:
 def door_examples(recipe: PlanRecipe, settings: DoorClassification, say: Say) -> Doors:
     """Examples of a set of scans, cached."""
     paths, _ = build_plans(recipe, settings, say)
-    digest = hashlib.sha256(weights_file("topomerge.extraction.plans", PLAN_NETWORK_FILE).read_bytes()).hexdigest()[:16]
-    files, _ = derive(f"{recipe.name}_doors", scan_doors, [[path] for path in paths], settings, {"plan_network": digest}, say)
+    networks = (weights_file("topomerge.extraction.plans", name) for name in (PLAN_NETWORK_FILE, GRID_NETWORK_FILE))
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in networks)).hexdigest()[:16]
+    files, _ = derive(f"{recipe.name}_doors", scan_doors, [[path] for path in paths], settings, {"plan_networks": digest}, say)
     scans = [read_derived(file) for file in files]
     if not scans:
         raise InputError(f"{recipe.name}: no scan could be made; see the reasons above")
@@ -66,20 +73,22 @@ def door_examples(recipe: PlanRecipe, settings: DoorClassification, say: Say) ->
     return np.concatenate([s["x"] for s in scans]), np.concatenate([s["y"] for s in scans]), numbers
 
 
-def scan_doors(path: Path, plan_network: str) -> dict[str, Array]:
+def scan_doors(path: Path, plan_networks: str) -> dict[str, Array]:
     """Features and answers for the neighbouring regions of the plans of a scan.
 
     Args:
-        plan_network: digest of the weights that cut the plans; they only name the cached file.
+        plan_networks: digest of the weights that cut the plans; they only name the cached file.
     """
-    parts = [region_pairs(e.plan, e.room, set(e.visited.tolist())) for e in load_examples(path)]
+    parts = []
+    for e in load_examples(path):
+        chance = column_probabilities(e.plan, weights(raised=e.source.startswith("drawn/")))
+        parts.append(region_pairs(e.plan, chance, e.room, set(e.visited.tolist())))
     x = np.array([row for rows, _ in parts for row in rows], float).reshape(-1, len(DOOR_FEATURES))
     return {"x": x, "y": np.array([answer for _, answers in parts for answer in answers], bool)}
 
 
-def region_pairs(plan: StoreyPlan, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
+def region_pairs(plan: StoreyPlan, chance: Array, truth: Array, visited: set[int]) -> tuple[list[Array], list[bool]]:
     """Features and answers for the neighbouring regions of one plan, before and while those of one room are merged."""
-    chance = column_probabilities(plan)
     plan = without_furniture(plan, chance)
     clearance = clearance_of(plan)
     region = regions_of(plan, chance)

@@ -10,7 +10,6 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from topomerge.models.weights import read_embedder, save_embedder
 from topomerge.training.batches import ChangedPairs, MapPair
 from topomerge.training.embedding_pictures import show_embedder
 from topomerge.training.log import Log
-from topomerge.training.loop import Loop, Schedule, State, mixed, pace
+from topomerge.training.loop import Loop, Schedule, State, made_beside, mixed, pace
 from topomerge.training.packed import EXTRAS, GraphPair, load_pairs
 from topomerge.training.run_folder import export_files, write_settings
 from topomerge.training.settings import Augment, Training, check, to_dict
@@ -98,12 +97,7 @@ class EmbeddingJob:
         rank, world, size = self.fabric.global_rank, self.fabric.world_size, settings.batch
         steps = [order[k * size * world :][: size * world][rank::world] for k in range(state.step, self.steps)]
         pairs = ChangedPairs(self.train, self.network.tensors, self.augment, lambda pair: mixed(settings.seed, state.epoch, pair))
-        loader = iter(DataLoader(pairs, batch_sampler=steps, generator=shuffle))
-        with ThreadPoolExecutor(1) as beside:
-            coming = beside.submit(next, loader, None)
-            while (batch := coming.result()) is not None:
-                coming = beside.submit(next, loader, None)
-                yield batch
+        yield from made_beside(iter(DataLoader(pairs, batch_sampler=steps, generator=shuffle)))
 
     def step(self, batch: MapPair, state: State) -> dict[str, float]:
         """One step of the optimizer; the losses."""

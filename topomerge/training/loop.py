@@ -13,10 +13,11 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import torch
 
@@ -25,6 +26,7 @@ from topomerge.errors import InputError
 from topomerge.training.log import Clock, Log
 
 Say = Callable[[str], None]
+T = TypeVar("T")
 
 
 @dataclass
@@ -201,6 +203,15 @@ class Loop:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def made_beside(batches: Iterator[T]) -> Generator[T, None, None]:
+    """The same batches, each made by a thread while the one before it is worked on."""
+    with ThreadPoolExecutor(1) as beside:
+        coming = beside.submit(next, batches, None)
+        while (batch := coming.result()) is not None:
+            coming = beside.submit(next, batches, None)
+            yield batch
 
 
 def pace(done: float, warmup: float) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from topomerge.checkpoint import NETWORK_FILE, load_state, write_network
+from topomerge.errors import InputError
 from topomerge.training.log import Log
 from topomerge.training.loop import Job, Loop, Say, Schedule, State, pace
 from topomerge.training.run_folder import export_files, write_card, write_settings
@@ -22,7 +23,8 @@ class NetworkJob(ABC):
     """A job without processes beside it; a task adds batches, steps, scores and the file of weights."""
 
     def __init__(self, settings: NetworkTask, network: torch.nn.Module, origin: Mapping[str, Any]) -> None:
-        self.settings, self.network, self.origin = settings, network, origin
+        self.device = device_of(settings)
+        self.settings, self.network, self.origin = settings, network.to(self.device), origin
         self.optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.decay)
 
     def total(self, sizes: int) -> float:
@@ -36,6 +38,10 @@ class NetworkJob(ABC):
     def write_network(self, folder: Path) -> None:
         """The weights as torch has them."""
         write_network(self.network, folder)
+
+    def there(self, batch: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
+        """A batch where the network is."""
+        return tuple(tensor.to(self.device, non_blocking=True) for tensor in batch)
 
     def descend(self, loss: torch.Tensor, options: Any, state: State) -> dict[str, float]:
         """One step of the optimizer at the rate of its place in the run: it rises over `options.warmup` steps, then falls."""
@@ -61,6 +67,18 @@ class NetworkJob(ABC):
     def line(self, row: Mapping[str, Any]) -> str:
         """The score that is watched."""
         return f"{self.settings.watch} {row[f'val/{self.settings.watch}']:.3f}"
+
+
+def device_of(settings: NetworkTask) -> torch.device:
+    """Where the network of a task runs.
+
+    Raises:
+        InputError: torch finds no such device here.
+    """
+    name = getattr(settings, "accelerator", "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"accelerator={name}: torch finds no such device here; leave it out to train on the processor")
+    return torch.device(name)
 
 
 def run_network(job: Job, settings: NetworkTask, steps: int, say: Say) -> dict[str, float]:

@@ -122,7 +122,7 @@ class PlaceJob(NetworkJob):
 
     def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
         """One step of the optimizer."""
-        options, (x, right) = self.options, batch
+        options, (x, right) = self.options, self.there(batch)
         loss = functional.binary_cross_entropy_with_logits(self.network(x), right)
         return self.descend(loss, options, state)
 

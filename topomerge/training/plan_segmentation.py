@@ -5,7 +5,7 @@ Crops of simulated scans' plans, turned and mirrored, with things taken away now
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from topomerge.extraction.classified_storey import COLUMN_CLASSES
 from topomerge.extraction.plans.plan_network import column_probabilities, evidence, read_weights
 from topomerge.io import archive
 from topomerge.models.plan_unet import PlanUNet, exported_weights
-from topomerge.training.loop import Say, State, mixed
+from topomerge.training.loop import Say, State, made_beside, mixed
 from topomerge.training.networks import NetworkJob, run_network
 from topomerge.training.scan_settings import PlanAugment, PlanLoss, PlanSegmentation
 from topomerge.types import Array
@@ -63,8 +63,12 @@ class PlanJob(NetworkJob):
         self.chance = chance / chance.sum()
 
     def batches(self, state: State) -> Generator[tuple[torch.Tensor, ...], None, None]:
-        """Crops, from a generator of each step."""
+        """Crops."""
         self.network.train()
+        yield from made_beside(self.crops(state))
+
+    def crops(self, state: State) -> Iterator[tuple[torch.Tensor, ...]]:
+        """Those of the state's epoch from its step on, from a generator of each step."""
         options = self.options
         for step in range(state.step, options.steps):
             rng = np.random.default_rng([options.seed, 1, state.epoch, step])
@@ -76,7 +80,7 @@ class PlanJob(NetworkJob):
 
     def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
         """One step of the optimizer."""
-        options, (x, truth, weight) = self.options, batch
+        options, (x, truth, weight) = self.options, self.there(batch)
         each = functional.cross_entropy(self.network(x), truth, reduction="none")
         loss = (each * weight).sum() / weight.sum()
         return self.descend(loss, options, state)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
-from topomerge.training.shared_settings import NetworkTask, TaskSettings
+from topomerge.training.shared_settings import NetworkTask, RasterTask, TaskSettings
 
 
 @dataclass
@@ -36,7 +36,7 @@ class PlanAugment:
 
 
 @dataclass
-class PlanSegmentation(NetworkTask):
+class PlanSegmentation(RasterTask):
     """Args:
     steps: of an epoch; warmup: steps in which the rate rises.
     crop: columns of a side, a multiple of 16.
@@ -47,14 +47,29 @@ class PlanSegmentation(NetworkTask):
     name: str = "plan_segmentation"
     data: PlanRecipe = field(default_factory=PlanRecipe)
     heldout: PlanRecipe = field(default_factory=PlanRecipe)
-    epochs: int = 27
-    steps: int = 500
-    warmup: int = 100
+    epochs: int = 32
+    batch: int = 32
+    steps: int = 400
+    warmup: int = 300
     crop: int = 128
-    widths: list[int] = field(default_factory=lambda: [16, 32, 40, 40, 40, 32, 16, 12])
+    widths: list[int] = field(default_factory=lambda: [32, 64, 96, 96, 96, 64, 32, 16])
     loss: PlanLoss = field(default_factory=PlanLoss)
     augment: PlanAugment = field(default_factory=PlanAugment)
     watch: str = "mean_f1"
+
+
+@dataclass
+class GridSegmentation(PlanSegmentation):
+    """The same for robots' grids and drawings, by a smaller network and fewer scans: a larger one learns how grids are simulated
+    (docs/adr/0005)."""
+
+    task: str = "grid_segmentation"
+    name: str = "grid_segmentation"
+    epochs: int = 27
+    batch: int = 8
+    steps: int = 500
+    warmup: int = 100
+    widths: list[int] = field(default_factory=lambda: [16, 32, 40, 40, 40, 32, 16, 12])
 
 
 @dataclass
@@ -76,7 +91,7 @@ class WallAugment:
 
 
 @dataclass
-class WallTask(NetworkTask):
+class WallTask(RasterTask):
     """What networks of walls share.
 
     Args:

@@ -55,3 +55,14 @@ class NetworkTask(TaskSettings):
     patience: int = 0
     hold_out: int = 8
     watch: str = ""
+
+
+@dataclass
+class RasterTask(NetworkTask):
+    """What tasks whose networks look at rasters have besides.
+
+    Args:
+        accelerator: cpu or cuda. Only cpu gives the same bytes again for the same seed.
+    """
+
+    accelerator: str = "cpu"

@@ -34,6 +34,8 @@ def check_task(settings: TaskSettings) -> None:
         raise InputError(f"lookalikes must be {', '.join(LOOKALIKES_TAKEN)}, not {settings.lookalikes!r}")
     if isinstance(settings, MergeBelief) and settings.refit not in ("all", "closely"):
         raise InputError(f"refit must be all or closely, not {settings.refit!r}")
+    if getattr(settings, "accelerator", "cpu") not in ("cpu", "cuda"):
+        raise InputError(f"accelerator must be cpu or cuda, not {settings.accelerator!r}")  # type: ignore[attr-defined]
     if len(getattr(settings, "halves", [])) not in (0, 2):
         raise InputError(f"halves must name two runs, not {settings.halves}")  # type: ignore[attr-defined]
     if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from topomerge.datasets.pairs.grid_pairs import GridRecipe
 from topomerge.datasets.pairs.lookalikes import LookalikeRecipe
 from topomerge.datasets.pairs.recipe import Recipe
-from topomerge.training.shared_settings import NetworkTask, TaskSettings
+from topomerge.training.shared_settings import NetworkTask, RasterTask, TaskSettings
 
 LOOKALIKES_TAKEN = ("none", "judged", "fitted")
 
@@ -26,7 +26,7 @@ class PlaceAugment:
 
 
 @dataclass
-class PlaceEvidence(NetworkTask):
+class PlaceEvidence(RasterTask):
     """Args:
     steps: of an epoch; warmup: steps in which the rate rises.
     hypotheses, inspected: of a pair, as of `MergeBelief`: the places are those of its hypotheses.

@@ -36,7 +36,10 @@ class Task:
 
 TASKS = {
     "plan_segmentation": Task(
-        "plan_segmentation", "PlanSegmentation", "topomerge.extraction.plans", "plan_network.npz", 1.5, "scan_settings"
+        "plan_segmentation", "PlanSegmentation", "topomerge.extraction.plans", "plan_network.npz", 5.0, "scan_settings"
+    ),
+    "grid_segmentation": Task(
+        "plan_segmentation", "GridSegmentation", "topomerge.extraction.plans", "grid_network.npz", 1.2, "scan_settings"
     ),
     "door_classification": Task(
         "door_classification", "DoorClassification", "topomerge.extraction.plans", "door_classifier.json", 0.7, "scan_settings"

@@ -107,7 +107,7 @@ class ColourJob(NetworkJob):
 
     def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
         """One step of the optimizer."""
-        x, scores, truth, weight = batch
+        x, scores, truth, weight = self.there(batch)
         each = functional.cross_entropy(self.network(x, scores), truth, reduction="none")
         return self.descend((each * weight).sum() / weight.sum().clamp(min=1), self.options, state)
 

@@ -83,7 +83,7 @@ class WallJob(NetworkJob):
 
     def step(self, batch: tuple[torch.Tensor, ...], state: State) -> dict[str, float]:
         """One step of the optimizer."""
-        x, truth, weight = batch
+        x, truth, weight = self.there(batch)
         each = functional.cross_entropy(self.network(x), truth, reduction="none")
         return self.descend((each * weight).sum() / weight.sum(), self.options, state)
 

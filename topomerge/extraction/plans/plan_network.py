@@ -1,5 +1,6 @@
-"""What probably stands in each column of a plan: a small convolutional network, trained on simulated scans of training buildings
-(`train.py task=plan_segmentation`), in NumPy (`numpy_nn`; beyond the thesis: docs/adr/0005).
+"""What probably stands in each column of a plan: a convolutional network, trained on simulated scans of training buildings
+(`train.py task=plan_segmentation`; for robots' grids and drawings `task=grid_segmentation`), in NumPy (`numpy_nn`; beyond the
+thesis: docs/adr/0005).
 
 A U-Net (Ronneberger et al. 2015) over what the plan knows of each column. It sees a few metres around, so that it may take the
 legs of a table for furniture, a stub of wall for the jamb of a door, and a gap between two stubs for a doorway.
@@ -22,6 +23,7 @@ from topomerge.numpy_nn import convolution, softmax
 from topomerge.types import Array
 
 PLAN_NETWORK_FILE = "plan_network.npz"
+GRID_NETWORK_FILE = "grid_network.npz"  # smaller: larger ones learn how grids are simulated
 EVIDENCE_HEIGHTS = ((0.1, 0.5), (0.5, 1.2), (1.2, 2.0), (2.0, 2.4))  # m
 EVIDENCE_CHANNELS = 11
 COARSEST_STRIDE = 16  # columns a side, of an element of the coarsest level
@@ -99,9 +101,13 @@ def _beside(coarse: Array, fine: Array) -> Array:
     return out
 
 
-def weights() -> dict[str, Array]:
-    """The weights that ship, or those in their place (`io.weight_files`)."""
-    return read_weights(weights_file("topomerge.extraction.plans", PLAN_NETWORK_FILE))
+def weights(raised: bool = False) -> dict[str, Array]:
+    """The weights that ship, or those in their place (`io.weight_files`).
+
+    Args:
+        raised: those for robots' grids and drawings, whose walls were all raised alike.
+    """
+    return read_weights(weights_file("topomerge.extraction.plans", GRID_NETWORK_FILE if raised else PLAN_NETWORK_FILE))
 
 
 @lru_cache(maxsize=4)

@@ -15,7 +15,7 @@ from topomerge.extraction.plans.part_rooms import PartRooms, door_log_odds, laid
 from topomerge.extraction.plans.partition import Pair, Partition, merge_regions
 from topomerge.extraction.plans.passages import clearance_of, find_passages, regions_of
 from topomerge.extraction.plans.plan import columns_of, storey_plan
-from topomerge.extraction.plans.plan_network import column_probabilities, without_furniture
+from topomerge.extraction.plans.plan_network import column_probabilities, weights, without_furniture
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.plans.upper_sides import without_upper_sides
 from topomerge.types import Array, VoxelGrid
@@ -33,12 +33,14 @@ class OtherSigns(NamedTuple):
         doors: (D,) INNER_DOOR_DTYPE, doors that walls show inside of what was one room.
         flat: is it a slice or a grid map, in which nothing tells walls from what else stands about?
         crossed: cells that the sensor looked through, where that is known.
+        raised: is it a robot's grid or a drawing, whose walls were all raised alike?
     """
 
     parts: Sequence[PartRooms] = ()
     doors: Array = np.zeros(0, INNER_DOOR_DTYPE)
     flat: bool = False
     crossed: VoxelGrid | None = None
+    raised: bool = False
 
 
 NO_SIGNS = OtherSigns()
@@ -79,7 +81,7 @@ def cut_storey(
         others: what else speaks for where rooms part.
     """
     plan = storey_plan(grid, navigable, storey, k, others.crossed)
-    probability = column_probabilities(plan)
+    probability = column_probabilities(plan, weights(others.raised))
     plan = without_furniture(plan, probability)
     clearance = clearance_of(plan)
     laid = laid_rooms(plan, others.parts)
