@@ -229,8 +229,11 @@ def run_tasks(tasks: list[Task], sharing: Sharing, note: Callable[[Row], None], 
 
     rows: dict[str, Row] = {}
     while pending := [task for task in tasks if task[0].name not in rows]:
+        names = {task[0].name for task in pending}
         try:
             for row in _parallel(pending, sharing, work):
+                if row.name not in names:  # it would be made for ever
+                    raise ValueError(f"{row.name} was made, but no task has this name")
                 rows[row.name] = row
                 note(row)
         except TerminatedWorkerError:

@@ -12,11 +12,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.core.builder import Row, Say, Sharing, build_set, check_sharing, make_item
+from topomerge.datasets.core.builder import Row, Say, Sharing, make_item
 from topomerge.datasets.core.plan import Plan
-from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, VOXEL_SIZES, PlanRecipe, check_plans, real_plans
-from topomerge.datasets.pairs.scan_items import PlanItem, draw_item, scan_of_item
-from topomerge.datasets.plans import splits
+from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, VOXEL_SIZES, PlanRecipe, build_scans
+from topomerge.datasets.pairs.scan_items import PlanItem, Plans, draw_item, scan_of_item
 from topomerge.datasets.simulation.floor_truth import in_frame, truth_of
 from topomerge.datasets.simulation.room_truth import room_truth
 from topomerge.datasets.simulation.scanner import moved
@@ -31,27 +30,31 @@ ROOM_EXAMPLE_FORMAT = 3  # raise it when the same item gives other bytes: it is 
 ANSWERS = ("one", "whole", "entered", "outside")
 
 
+class RoomItem(PlanItem):
+    """As of plans; what is made of it has a version of its own."""
+
+    @property
+    def name(self) -> str:
+        """A hash of the inputs and of the version of what is made from them."""
+        return self.named(ROOM_EXAMPLE_FORMAT)
+
+
 def build_rooms(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> list[Path]:
     """The files of a set, made where they are missing, in the order of the seeds."""
-    check_plans(recipe)
-    check_sharing(sharing)
-    plans = real_plans(recipe)
-    first = splits.seeds(recipe.split)[0] + recipe.seed
-    items = {item.named(ROOM_EXAMPLE_FORMAT): item for item in (draw_item(first + n, plans) for n in range(recipe.scans))}
-    named = {(source, name): plan for source, entries in plans.items() for name, plan in entries}
-    folder = Path(sharing.cache).resolve() / "rooms"
-    tasks = [(item, named.get((item.source, item.plan)), str(folder)) for item in items.values()]
-    begin, step = sharing.part
-    build_set(folder.parent / f"{recipe.name}.jsonl", tasks[begin - 1 :: step], make_room_file, sharing, say, unit="scans")
-    return [path for name in items if (path := folder / f"{name}.npz").exists()]
+    return build_scans(recipe, "rooms", draw_room_item, make_room_file, sharing, say)[0]
 
 
-def make_room_file(item: PlanItem, plan: Plan | None, folder: str) -> Row:
+def draw_room_item(seed: int, plans: Plans) -> RoomItem:
+    """The item of a seed: that of `scan_items`."""
+    return RoomItem(**asdict(draw_item(seed, plans)))
+
+
+def make_room_file(item: RoomItem, plan: Plan | None, folder: str) -> Row:
     """Make an item's file."""
-    return make_item(item.named(ROOM_EXAMPLE_FORMAT), folder, lambda: room_rows(item, plan), LONGEST_SCAN)
+    return make_item(item.name, folder, lambda: room_rows(item, plan), LONGEST_SCAN)
 
 
-def room_rows(item: PlanItem, plan: Plan | None) -> Mapping[str, Array]:
+def room_rows(item: RoomItem, plan: Plan | None) -> Mapping[str, Array]:
     """Features and answers of the rooms of a scan: `x` and answers without poses; `posed.x`, `posed.p` and answers with them."""
     made = scan_of_item(item, plan)
     visited = np.isin(np.arange(len(made.building.rooms)), made.visited)
@@ -71,7 +74,7 @@ def room_rows(item: PlanItem, plan: Plan | None) -> Mapping[str, Array]:
         if prefix:
             poses = pose_features(map, read_scan(cloud, voxel).rays)
             arrays["posed.p"] = (np.full((len(rows), len(POSE_FEATURES)), np.nan) if poses is None else poses)[rows]
-    about = {"file": f"{item.named(ROOM_EXAMPLE_FORMAT)}.npz", **asdict(item), "sensor": made.sensor}
+    about = {"file": f"{item.name}.npz", **asdict(item), "sensor": made.sensor}
     return {**arrays, "about": np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)}
 
 

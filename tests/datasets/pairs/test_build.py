@@ -251,6 +251,17 @@ def crash(item: Item, plans: list[Plan], folder: str) -> Row:
     return Row(item.name, "", 0.0)
 
 
+def misnamed(item: Item, plans: list[Plan], folder: str) -> Row:
+    """Stands in for `make_file`: a file that no task asked for."""
+    return Row(f"{item.name}.3", "", 0.0)
+
+
+def test_a_file_of_another_name_ends_the_building() -> None:
+    tasks = [(item, [], "") for item in draw_items(SMALL, {})]
+    with pytest.raises(ValueError, match="no task has this name"):
+        module.run_tasks(tasks, Build(SMALL), lambda row: None, misnamed)
+
+
 @pytest.mark.slow
 def test_an_item_that_kills_its_worker_is_refused() -> None:
     items = draw_items(SMALL, {})
