@@ -19,7 +19,13 @@ from tests.training import tiny
 from topomerge.embedding.engineered import scaled
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.colour_network import weights as colour_weights
-from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, DoorCandidates, door_chance
+from topomerge.extraction.elevations.wall_doors import (
+    SOURCES,
+    WALL_DOOR_FEATURES,
+    WALL_DOORS_FILE,
+    DoorCandidates,
+    door_chance,
+)
 from topomerge.extraction.elevations.wall_network import place_probabilities
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
@@ -28,7 +34,7 @@ from topomerge.extraction.room_odds import room_weights
 from topomerge.fusion.evidence.network import weights as place_weights
 from topomerge.fusion.match_belief import belief_weights
 from topomerge.fusion.verify import model
-from topomerge.io.weight_files import VARIABLE, weights_file
+from topomerge.io.weight_files import VARIABLE, read_weights_json, weights_file
 from topomerge.matching.odds import odds_weights
 from topomerge.matching.room_matcher import matcher_weights
 from topomerge.training import (
@@ -238,6 +244,17 @@ def test_batches_made_beside_are_the_same() -> None:
     assert next(batches) == 1
     with pytest.raises(InputError, match="the second batch"):
         next(batches)
+
+
+def test_a_source_with_hardly_any_door_keeps_its_model() -> None:
+    rng = np.random.default_rng(0)
+    sources = np.repeat([SOURCES.index("wall"), SOURCES.index("colour")], [60, 20]).astype(np.int8)
+    features = rng.normal(size=(80, len(WALL_DOOR_FEATURES)))
+    right = (features[:, 0] > 0) & (sources == SOURCES.index("wall"))
+    right[-2:] = True  # two doors by colours alone
+    model = wall_doors.doors_model([(DoorCandidates(np.zeros(80, EDGE_DTYPE), features, sources), right)], 1.0)
+    shipped = read_weights_json("topomerge.extraction.elevations", WALL_DOORS_FILE)
+    assert model["colour"] == shipped["colour"] and model["wall"] != shipped["wall"] and model["wall"][1] > 0.5
 
 
 def test_scores_of_classes_and_doors() -> None:

@@ -73,7 +73,8 @@ def extract(
     made, doubts, again = _with_odds_and_openings(map, scan, floor, p)
     if not parts:  # rooms of joined maps are what their parts say
         if len(again.doors) and not isinstance(p, ThesisParameters):
-            signs = OtherSigns(doors=again.doors, crossed=scan.crossed)
+            looks = [(plan, storey.probability) for plan, storey in zip(floor.plans, floor.classified_storeys, strict=True)]
+            signs = OtherSigns(doors=again.doors, looked_at=looks)
             floor = rooms_of_plans(scan.grid, navigable, p.door, p.narrow, p.standing_height, signs)
             made, doubts, again = _with_odds_and_openings(topometric_map(scan.grid, floor, p.standing_height), scan, floor, p)
         if again.one is not None:

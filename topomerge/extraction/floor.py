@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from topomerge.extraction.classified_storey import ClassifiedStorey
+from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.types import Array, VoxelGrid
 
 
@@ -23,6 +24,7 @@ class Floor:
         door_probability: that a door parts two rooms, where it was judged.
         completeness: (R,) share of each room's outline at which a wall was seen, where the plans tell it.
         classified_storeys: what probably stands in the columns of the storeys' plans.
+        plans: these plans, without furniture.
         chosen_parameters: of the extraction, that a step chose by itself.
     """
 
@@ -37,4 +39,5 @@ class Floor:
     door_probability: dict[tuple[int, int], float] = field(default_factory=dict)
     completeness: Array | None = None
     classified_storeys: tuple[ClassifiedStorey, ...] = ()
+    plans: tuple[StoreyPlan, ...] = ()
     chosen_parameters: dict[str, float] = field(default_factory=dict)

@@ -21,16 +21,19 @@ from topomerge.extraction.elevations.doorways import place_classes
 from topomerge.extraction.elevations.wall_doors import (
     SOURCES,
     WALL_DOOR_FEATURES,
+    WALL_DOORS_FILE,
     DoorCandidates,
     door_candidates,
     door_chance,
 )
+from topomerge.io.weight_files import read_weights_json
 from topomerge.metrics import match_places
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.scan_settings import WallDoors
 from topomerge.types import Array
 
+FEWEST_DOORS = 5  # among the candidates of a source
 NEAR_DOOR = 0.7  # m: of a door that lies farther off than the metrics allow (0.5 m) the rooms that it joins may still be right
 Candidates = tuple[DoorCandidates, Array]  # of a scan, and (n,) which are doors
 
@@ -73,12 +76,15 @@ def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Can
 
 
 def doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[float]]:
-    """Of each of `SOURCES` a constant and the weights of `WALL_DOOR_FEATURES`."""
+    """Of each of `SOURCES` a constant and the weights of `WALL_DOOR_FEATURES`; where hardly any candidate is a door, those that
+    ship stay: a constant of two doors would be chance."""
     x = np.concatenate([c.features for c, _ in scans])
     y, source = np.concatenate([y for _, y in scans]), np.concatenate([c.source for c, _ in scans])
-    weights = {}
+    weights = dict(read_weights_json("topomerge.extraction.elevations", WALL_DOORS_FILE))
     for k, name in enumerate(SOURCES):
         own = source == k
+        if 0 < y[own].sum() < FEWEST_DOORS:
+            continue
         share = float(np.clip(y[own].mean(), 0.01, 0.99)) if own.any() else 0.5
         row = [float(np.log(share / (1 - share))), *[0.0] * len(WALL_DOOR_FEATURES)]
         if 0 < y[own].sum() < own.sum():

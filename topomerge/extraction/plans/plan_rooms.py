@@ -6,7 +6,7 @@ import numpy as np
 
 from topomerge.extraction.floor import Floor
 from topomerge.extraction.plans.storey_floor import floor_of_storeys
-from topomerge.extraction.plans.storey_rooms import NO_SIGNS, OtherSigns, cut_storey
+from topomerge.extraction.plans.storey_rooms import NO_SIGNS, OtherSigns, cut_storey, look_at
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.types import Array, VoxelGrid
 
@@ -30,11 +30,9 @@ def rooms_of_plans(
     storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, body_height))
     factor = max(round(PLAN_CELL / grid.edge), 1)
     coarse_grid, coarse_floor, coarse_storey = _coarser(grid, navigable, storey, factor)
-    cut = [
-        cut_storey(coarse_grid, coarse_floor, coarse_storey, k, door, narrow, others)
-        for k in range(len(storeys))
-        if (coarse_storey == k).any() and not _is_upper_side(storeys[k], storeys[:k])
-    ]
+    numbers = [k for k in range(len(storeys)) if (coarse_storey == k).any() and not _is_upper_side(storeys[k], storeys[:k])]
+    looks = others.looked_at or [look_at(coarse_grid, coarse_floor, coarse_storey, k, others) for k in numbers]
+    cut = [cut_storey(coarse_grid, look, k, door, narrow, others) for look, k in zip(looks, numbers, strict=True)]
     return floor_of_storeys(grid, navigable, storey, storeys, cut, factor)
 
 

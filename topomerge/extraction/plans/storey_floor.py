@@ -68,6 +68,7 @@ def floor_of_storeys(
         door_probability=probability,
         completeness=np.concatenate(seen),
         classified_storeys=tuple(part.classes for part in cut),
+        plans=tuple(part.plan for part in cut),
     )
 
 

@@ -34,6 +34,7 @@ class OtherSigns(NamedTuple):
         flat: is it a slice or a grid map, in which nothing tells walls from what else stands about?
         crossed: cells that the sensor looked through, where that is known.
         raised: is it a robot's grid or a drawing, whose walls were all raised alike?
+        looked_at: what `look_at` gave of each storey, where these cells were cut before.
     """
 
     parts: Sequence[PartRooms] = ()
@@ -41,6 +42,7 @@ class OtherSigns(NamedTuple):
     flat: bool = False
     crossed: VoxelGrid | None = None
     raised: bool = False
+    looked_at: Sequence[tuple[StoreyPlan, Array]] = ()
 
 
 NO_SIGNS = OtherSigns()
@@ -68,21 +70,27 @@ class StoreyRooms:
     door_probability: dict[Pair, float]
 
 
+def look_at(
+    grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, others: OtherSigns = NO_SIGNS
+) -> tuple[StoreyPlan, Array]:
+    """The plan of storey `k` without furniture, and what probably stands in each of its columns (nx, ny, 5)."""
+    plan = storey_plan(grid, navigable, storey, k, others.crossed)
+    probability = column_probabilities(plan, weights(others.raised))
+    return without_furniture(plan, probability), probability
+
+
 def cut_storey(
-    grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, door: float, narrow: float, others: OtherSigns = NO_SIGNS
+    grid: VoxelGrid, looked_at: tuple[StoreyPlan, Array], k: int, door: float, narrow: float, others: OtherSigns = NO_SIGNS
 ) -> StoreyRooms:
     """Cut storey `k` into rooms: regions between all narrowings, merged until only likely doors part them.
 
     Args:
         grid: occupied cells.
-        navigable: the navigable volume.
-        storey: (m,) storey of each of its cells.
+        looked_at: what `look_at` gave.
         door, narrow: probabilities of a door from which on a narrowing parts rooms, and areas of a room.
         others: what else speaks for where rooms part.
     """
-    plan = storey_plan(grid, navigable, storey, k, others.crossed)
-    probability = column_probabilities(plan, weights(others.raised))
-    plan = without_furniture(plan, probability)
+    plan, probability = looked_at
     clearance = clearance_of(plan)
     laid = laid_rooms(plan, others.parts)
     parted = inner_columns(plan, others.doors)
