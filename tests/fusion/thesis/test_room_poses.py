@@ -18,8 +18,12 @@ pytest.importorskip("open3d", exc_type=ImportError)
 
 @pytest.fixture(scope="module")
 def flats():
-    """A flat of three rooms that differ in size, and most of it in another frame."""
-    points = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,)).points()
+    """A flat of three rooms that differ in size, and most of it in another frame. An empty rectangle looks the same upside down:
+    each room has a cupboard in a corner."""
+    scene = Scene().shell(0, 0, 13, 9).wall((5, 0), (5, 9), doors=(2.0,)).wall((5, 5), (13, 5), doors=(4.0,))
+    for x, y in ((0.1, 7.0), (5.2, 0.1), (5.2, 8.2)):
+        scene.box(x, y, 0, x + 1.6, y + 0.7, 2)
+    points = scene.points()
     other = MOVE.apply(part(points, high=(11, 99)))
     return tuple(tm.extract(p.astype(np.float32), name=n) for p, n in ((points, "a"), (other, "b")))
 
