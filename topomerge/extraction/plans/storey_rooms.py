@@ -22,7 +22,7 @@ from topomerge.types import Array, VoxelGrid
 
 ROOM_LEAST_AREA = 0.8, 0.3  # m2 of floor that was seen; the second where doors surely part it
 ROOM_LEAST_HALF_WIDTH = 0.2  # m: what is nowhere wider is the edge of a facade or of a slab
-FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH = (0.8, 0.8), 0.35  # in slices and grid maps, where legs look like walls
+FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH = (0.8, 0.8), 0.35  # in slices, where legs look like walls
 
 
 class OtherSigns(NamedTuple):
@@ -31,7 +31,7 @@ class OtherSigns(NamedTuple):
     Args:
         parts: rooms of the maps that these cells were joined of.
         doors: (D,) INNER_DOOR_DTYPE, doors that walls show inside of what was one room.
-        flat: is it a slice or a grid map, in which nothing tells walls from what else stands about?
+        flat: is it a slice, in which nothing tells walls from what else stands about?
         crossed: cells that the sensor looked through, where that is known.
         raised: is it a robot's grid or a drawing, whose walls were all raised alike?
         looked_at: what `look_at` gave of each storey, where these cells were cut before.
