@@ -26,7 +26,7 @@ from pathlib import Path
 from topomerge.datasets.core.script import exit_status
 from topomerge.datasets.plans.sealed import SEALED, sealed_run
 
-from benchmarks.sealed_measures import Row, SealedItem, items_of, measured, tables
+from benchmarks.sealed_measures import PARTS, Row, SealedItem, items_of, measured, tables
 from topomerge import __version__
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
@@ -46,12 +46,14 @@ def sealed_rows(item: SealedItem, split: str) -> list[Row]:
         return measured(item)
 
 
-def run(split: str, data: Path | None, public: Sequence[tuple[str, Path]], jobs: int, small: bool) -> list[Row]:
-    """Measure everything, in the order of the items."""
+def run(
+    split: str, data: Path | None, public: Sequence[tuple[str, Path]], jobs: int, small: bool, parts: Sequence[str] = PARTS
+) -> list[Row]:
+    """Measure everything of these parts, in the order of the items."""
     from joblib import Parallel, delayed
 
     with sealed_run() if split == SEALED else nullcontext():
-        items = items_of(split, data, public, small)
+        items = [item for item in items_of(split, data, public, small) if item.part in parts]
     print(f"sealed: {len(items)} items", file=sys.stderr, flush=True)
     if jobs == 1:
         return [row for item in items for row in sealed_rows(item, split)]
@@ -131,6 +133,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--again", action="store_true", help="measure a version that was measured; the block says so")
     parser.add_argument("--small", action="store_true", help="a few items of training seeds")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="what is measured; everything")
     parser.add_argument("--public", nargs="*", default=[], metavar="SOURCE=FOLDER", help="published sets")
     parser.add_argument("--page", type=Path, help="where the block goes; docs/results/sealed.md")
     return parser.parse_args(words)
@@ -145,7 +148,8 @@ def measure_and_append(words: Sequence[str]) -> None:
     before = blocks(page.read_text(encoding="utf-8")).count(__version__) if page and page.is_file() else 0
     data = Path(os.environ["TOPOMERGE_DATA"]) if os.environ.get("TOPOMERGE_DATA") and not options.small else None
     began = time.time()
-    rows = run("train" if options.small else SEALED, data, public_sets(options.public), options.jobs, options.small)
+    split, public = "train" if options.small else SEALED, public_sets(options.public)
+    rows = run(split, data, public, options.jobs, options.small, options.parts)
     text = block(rows, __version__, shlex.join(["python", "-m", "benchmarks.sealed", *words]), time.time() - began, before)
     if page:
         append(page, text)

@@ -2,7 +2,8 @@
 
 Rooms: procedural buildings by five sensors, and sealed plans of real buildings, scanned. Merges: pairs of grids as those that the
 belief in merges is judged on (`datasets.pairs.grid_pairs`), two scans of each sealed plan, both halves of each sealed robot grid
-(one capture: what it shows is less than two), robot grids of two places, and sealed buildings of published sets.
+(one capture: what it shows is less than two), robot grids of two places, and sealed buildings of published sets. How rooms are
+ranked: `sealed_ranking`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from topomerge.datasets.buildings.profiles import BUILDING_KINDS
 from topomerge.datasets.core.builder import one_thread, time_limit
 from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.core.physical import physical_building
-from topomerge.datasets.pairs.flat import Flat, flat_pair, read_flat
+from topomerge.datasets.pairs.flat import flat_pair
 from topomerge.datasets.pairs.grid_pairs import (
     GridItem,
     GridPair,
@@ -35,25 +36,27 @@ from topomerge.datasets.pairs.grid_pairs import (
 from topomerge.datasets.pairs.pairs import Pair, PairSettings, make_pair
 from topomerge.datasets.plans import splits
 from topomerge.datasets.plans.floorplans import Refusal, iter_plans, plan_names
-from topomerge.datasets.plans.sealed import SEALED_FOLDERS, is_sealed, is_sealed_file
+from topomerge.datasets.plans.sealed import SEALED_FOLDERS, is_sealed
 from topomerge.datasets.public.sources import iter_public_pairs
 from topomerge.datasets.simulation.floor_truth import judge
 
 from benchmarks.extraction.scans import Case
 from benchmarks.extraction.sources import simulated
 from benchmarks.merging.register import ours, outcome
+from benchmarks.sealed_grids import pair_of_halves, robot_halves
+from benchmarks.sealed_ranking import SENSOR_PAIRS, building_ranks, ranks, table
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.statistics import exact_interval, interval_text
 from topomerge.training.belief_hypotheses import fair
-from topomerge.types import Array, Sim3
+from topomerge.types import Sim3
 
 Row = dict[str, Any]
+PARTS = ("rooms", "merges", "ranking")
 SENSORS_OF_ROOMS = ("tls", "lidar", "depth", "tablet", "laser2d")
 VISITED_ROOMS = {"procedural": 8, "plan": 12}  # rooms a map
 VAST = 500.0  # m2; a plan with such a hall is not furnished: it takes minutes
 LONGEST_ITEM = 600.0  # s
-HALF = 0.65  # share of a robot's grid that each of its halves shows
 FULL_SETS, SMALL_SETS = [60, 20, 30], [2]  # pairs of grids of each set
 LEAST_COMMON = 40.0  # m2 in common: with less nobody asks for a merge
 
@@ -63,7 +66,7 @@ class SealedItem:
     """One thing to measure.
 
     Args:
-        part: rooms or merges.
+        part: of `PARTS`.
         group: the row of the tables that it belongs to.
         make: what gives its rows; it can be sent to another process.
         arguments: of `make`.
@@ -91,13 +94,18 @@ def items_of(split: str, data: Path | None, public: Sequence[tuple[str, Path]], 
         for folder, name in sealed_plans(data):
             out.append(SealedItem("merges", "real plans", plan_pair_rows, (folder, name)))
             out.append(SealedItem("rooms", "real plans", plan_room_rows, (folder, name)))
+            out.append(SealedItem("ranking", "real plans", plan_ranks, (folder, name)))
         out.append(SealedItem("merges", "robots' grids", robot_rows, (data,)))
+        out.append(SealedItem("ranking", "robots' grids", robot_ranks, (data,)))
     first = splits.seeds(split)[0]
     kinds, sensors = (BUILDING_KINDS[-1:], SENSORS_OF_ROOMS[:1]) if small else (BUILDING_KINDS, SENSORS_OF_ROOMS)
     for i, sensor in enumerate(sensors):
         for k, kind in enumerate(kinds):
             case = Case(sensor, "procedural", kind, sensor, first + 100 + 10 * i + k, rooms=VISITED_ROOMS["procedural"])
             out.append(SealedItem("rooms", sensor, room_rows, (case,)))
+    for i, scanners in enumerate(SENSOR_PAIRS[:1] if small else SENSOR_PAIRS):
+        for k, kind in enumerate(kinds):
+            out.append(SealedItem("ranking", "procedural", building_ranks, (kind, first + 200 + 10 * i + k, scanners)))
     return out
 
 
@@ -105,7 +113,7 @@ def measured(item: SealedItem) -> list[Row]:
     """The rows of an item; of one that fails, one that says why."""
     about = {"part": item.part, "group": item.group}
     try:
-        with one_thread(), time_limit(LONGEST_ITEM * (8 if item.make in (robot_rows, public_rows) else 1)):
+        with one_thread(), time_limit(LONGEST_ITEM * (8 if item.make in (robot_rows, robot_ranks, public_rows) else 1)):
             return [about | row for row in item.make(*item.arguments)]
     except Exception as error:  # one bad item never ends a run
         text = " ".join(str(error).split())[:150]
@@ -159,6 +167,13 @@ def plan_pair_rows(folder: Path, name: str) -> list[Row]:
     return [merge_row(_grids(make_pair(building, settings, 1, source=source)), physical_building(source, name))]
 
 
+def plan_ranks(folder: Path, name: str) -> list[Row]:
+    """The ranking of rooms between these scans."""
+    source, building = _plan(folder, name)
+    settings = PairSettings(overlap=0.5, sensors=("tls", "depth"), rooms=VISITED_ROOMS["plan"])
+    return ranks(make_pair(building, settings, 1, source=source), physical_building(source, name))
+
+
 def grid_rows(item: GridItem) -> list[Row]:
     """A pair of grids, made in a folder that goes with it."""
     with tempfile.TemporaryDirectory() as folder:
@@ -185,17 +200,13 @@ def public_rows(source: str, folder: Path) -> list[Row]:
 def robot_rows(data: Path) -> list[Row]:
     """Halves of each sealed grid of known scale, and halves of grids of two places."""
     halves, out = [], []
-    folder = data / SEALED_FOLDERS["strands"][0]
-    for number, path in enumerate(sorted(p for p in folder.rglob("*.yaml") if is_sealed_file(p))):
-        try:
-            a, b = cut(read_flat(path), number)
-        except InputError as error:
-            out.append({"failed": f"{path.stem}: {' '.join(str(error).split())[:100]}"})
+    for number, (name, flats) in enumerate(robot_halves(data).items()):
+        if isinstance(flats, str):
+            out.append({"failed": flats})
             continue
-        place = physical_building("strands", path.stem)
-        halves.append((place, a, b))
-        pair = flat_pair(path.stem, a, b, Sim3(), ("laser2d", "laser2d"), "strands", place, number)
-        out.append(merge_row(_grids(pair), place))
+        place = physical_building("strands", name)
+        halves.append((place, *flats))
+        out.append(merge_row(_grids(pair_of_halves(name, flats, place, number)), place))
     firsts = {place: (a, b) for place, a, b in reversed(halves)}
     for number, (one, other) in enumerate(combinations(sorted(firsts), 2)):
         flats = firsts[one][0], firsts[other][1]
@@ -205,22 +216,13 @@ def robot_rows(data: Path) -> list[Row]:
     return out
 
 
-def cut(flat: Flat, seed: int) -> tuple[Flat, Flat]:
-    """Two parts of a floor, each `HALF` of its free floor, cut across at any angle.
-
-    Raises:
-        InputError: no free floor.
-    """
-    if not len(flat.free):
-        raise InputError("no free floor in it")
-    angle = np.random.default_rng(seed).uniform(0, np.pi)
-    across = np.array([np.cos(angle), np.sin(angle)])
-    low, high = np.quantile(flat.free @ across, [1 - HALF, HALF])
-    return _part(flat, lambda p: p @ across <= high), _part(flat, lambda p: p @ across >= low)
-
-
-def _part(flat: Flat, inside: Callable[[Array], Array]) -> Flat:
-    return replace(flat, walls=flat.walls[inside(flat.walls)], free=flat.free[inside(flat.free)], poses=None)
+def robot_ranks(data: Path) -> list[Row]:
+    """The ranking of rooms between both halves of each sealed grid."""
+    out = []
+    for number, (name, flats) in enumerate(robot_halves(data).items()):
+        place = physical_building("strands", name)
+        out += [{"failed": flats}] if isinstance(flats, str) else ranks(pair_of_halves(name, flats, place, number), place)
+    return out
 
 
 def _grids(pair: Pair) -> GridPair:
@@ -254,27 +256,36 @@ def kind_of_merge(row: Row) -> str:
 
 
 def tables(rows: Sequence[Row]) -> Iterator[str]:
-    """Lines in Markdown: rooms, merges, and what could not be measured."""
+    """Lines in Markdown: of each part that was measured, and what could not be."""
     fine = [row for row in rows if "failed" not in row]
-    rooms = [row for row in fine if row["part"] == "rooms"]
+    for part, lines in (("rooms", room_table), ("merges", merge_table), ("ranking", table)):
+        if some := [row for row in fine if row["part"] == part]:
+            yield from (*lines(some), "")
+    lost = [row for row in rows if "failed" in row]
+    yield f"Not measured: {len(lost)}{'.' if not lost else ':'}"
+    yield from (f"- {row['part']}, {row['group']}: {row['failed']}" for row in lost)
+
+
+def room_table(rooms: Sequence[Row]) -> Iterator[str]:
+    """Rooms by sensor."""
     yield from ("| rooms, maps of | maps | IoU | MCC | recall | precision |", "|---|---|---|---|---|---|")
     made = [row for row in rooms if row["group"] != "real plans"]
     for group, some in [*by_key(rooms, lambda row: row["group"]), ("all made buildings", made)]:
         scores = [interval_text([r[k] for r in some], [r["place"] for r in some]) for k in ("iou", "mcc", "recall", "precision")]
         yield f"| {group} | {len(some)} | {' | '.join(scores)} |"
-    yield ""
+
+
+def merge_table(rows: Sequence[Row]) -> Iterator[str]:
+    """Merges by kind of pair."""
     yield "| merges | pairs | buildings | right | 0.1 m, 1° | right and believed | believed, wrong | such buildings, 95 % |"
     yield "|" + "---|" * 8
-    for group, some in by_key([row for row in fine if row["part"] == "merges"], kind_of_merge):
+    for group, some in by_key(rows, kind_of_merge):
         wrong = sum(r["believed"] and not r["right"] for r in some)
         sums = [sum(r[k] for r in some) for k in ("right", "fine")] + [sum(r["right"] and r["believed"] for r in some)]
         places = {r["place"] for r in some}
         low, high = exact_interval(len({r["place"] for r in some if r["believed"] and not r["right"]}), len(places))
         cells = (len(some), len(places), *sums, wrong, f"{100 * low:.0f}–{100 * high:.0f} %")
         yield f"| {group} | {' | '.join(map(str, cells))} |"
-    lost = [row for row in rows if "failed" in row]
-    yield from ("", f"Not measured: {len(lost)}{'.' if not lost else ':'}")
-    yield from (f"- {row['part']}, {row['group']}: {row['failed']}" for row in lost)
 
 
 def by_key(rows: Sequence[Row], key: Callable[[Row], str]) -> list[tuple[str, list[Row]]]:

@@ -38,7 +38,7 @@ class LossSettings:
     faint: float = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # not frozen: fabric fills a copy of it in half precision
 class Truth:
     """What belongs together in a batch of N rooms.
 
@@ -155,4 +155,5 @@ class Objective(nn.Module):
 
     def forward(self, tensors: dict[str, Tensor], truth: Truth) -> dict[str, Tensor]:
         embedding, dustbin = self.network(tensors)
-        return matching_loss(self.settings, embedding, dustbin, self.network.temperature, truth)
+        with torch.autocast(embedding.device.type, enabled=False):  # a small temperature magnifies what 8 bits leave out
+            return matching_loss(self.settings, embedding.float(), dustbin.float(), self.network.temperature, truth)

@@ -70,8 +70,8 @@ class DoorsEncoder(nn.Module):
         count, doors = crops.shape[:2]
         there = crops.flatten(2).amax(dim=2) > 0
         if self.training:  # only those that are there: two of three are not
-            rows = crops.new_zeros((count * doors, self.out.in_features // 2), dtype=torch.float32)
-            rows = rows.masked_scatter(there.flatten()[:, None], self.each(crops[there]).relu())
+            those = self.each(crops[there]).relu()
+            rows = those.new_zeros((count * doors, self.out.in_features // 2)).masked_scatter(there.flatten()[:, None], those)
         else:  # one shape for all maps, as other runtimes need it
             rows = self.each(crops.flatten(0, 1)).relu() * there.flatten()[:, None]
         rows = rows.unflatten(0, (count, doors))

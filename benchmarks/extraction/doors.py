@@ -1,6 +1,6 @@
 """Doors by how they stand: which are there, and of which nothing is, with walls looked at and without.
 
-``python -m benchmarks.extraction.doors --write docs/results/rooms.md`` scans buildings of the validation list by a laser
+``python -m benchmarks.extraction.doors --write docs/results/topology.md`` scans buildings of the validation list by a laser
 scanner and a depth camera at 2.5 cm (``--dev``: of the training list, to develop on), most doors with frames, and makes a
 map of each with and without `extraction.elevations`. With ``--painted`` no door has a frame, and maps are made with the
 colours or intensities of the scan and without. Scans are kept under ``cache/scans/``.

@@ -1,6 +1,6 @@
 """Walls against the truth: how far their faces are off, how much of the true walls is there, how much is none, doors in them.
 
-``python -m benchmarks.extraction.walls --write docs/results/rooms.md`` scans simulated buildings of the validation list
+``python -m benchmarks.extraction.walls --write docs/results/topology.md`` scans simulated buildings of the validation list
 (``--dev``: of the training list, to develop on), makes maps of them and judges `topomerge.structure`. Scans are kept under
 ``cache/scans/``.
 

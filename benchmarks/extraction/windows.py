@@ -1,8 +1,8 @@
 """Windows of maps against the true ones: which are there, of which nothing is, and how far off they are.
 
-``python -m benchmarks.extraction.windows --write docs/results/rooms.md`` scans buildings of the validation list with five sensors
-and makes a map of each: those of the benchmark of doors by a laser scanner and a depth camera, others by a walked laser, a
-tablet and a camera. It also judges the class `window` by places, on the cached walls of scans that trained nothing, where
+``python -m benchmarks.extraction.windows --write docs/results/topology.md`` scans buildings of the validation list with five
+sensors and makes a map of each: those of the benchmark of doors by a laser scanner and a depth camera, others by a walked laser,
+a tablet and a camera. It also judges the class `window` by places, on the cached walls of scans that trained nothing, where
 ``cache/walls`` has them (`python train.py task=wall_segmentation` makes them). Scans are kept under ``cache/scans/``.
 
 A true window of a visited room is there if the map has one that shares half of both their widths, along the same wall. Windows of

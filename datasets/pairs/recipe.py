@@ -20,9 +20,10 @@ from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.embedding import graph
 from topomerge.errors import InputError
 
-LEAST_PLAN_ROOMS = 5  # of a real plan: fewer have no two parts
-LEAST_PLAN_AREA = 45.0  # m2 of a real plan: the rooms of a tiny flat are hardly told apart
+LEAST_PLAN = (5, 45.0)  # rooms, m2 of a real plan: fewer have no two parts, and those of a tiny flat are hardly told apart
+LEAST_HOME = (4, 25.0)  # of a home that a robot mapped: there are few, and to learn from them is what they are for
 LARGEST_ROOM = 2500.0  # m2; an airport's hall takes minutes to furnish
+ONE_STOREY = ("r2v", "ipa", "home")  # sources without sibling storeys
 PLACES = {**splits.FOLDERS, "ipa": splits.TEST_ONLY["ipa"][0]}  # source -> folder; IPA's are for the test only
 MOST_DRIFT = 10.0  # times the usual one
 SIDES = "abcdef"  # names of the maps of a building in a file
@@ -37,7 +38,7 @@ class Recipe:
         name: of the manifest.
         split: train, validation or test.
         folder: of the real data; may be empty where `sources` is procedural only.
-        sources: weight of each: procedural, r2v, campus, mall, rmf; for the test also ipa.
+        sources: weight of each: procedural, r2v, campus, mall, rmf, home; for the test also ipa.
         kinds: weight of each kind of procedural building.
         overlaps: shares of rooms in common, drawn alike often.
         sensors: weight of each, drawn for each map by itself.
@@ -134,16 +135,18 @@ def library(recipe: Recipe) -> Library:
             raise InputError(f"sources.{source}: is for the test only, not for {recipe.split}")
         wanted = None if source in splits.TEST_ONLY else set(splits.members(recipe.split, source))
         folder = Path(recipe.folder) / PLACES[source]
-        plans = {n: p for n, p in iter_plans(folder, wanted) if not isinstance(p, Refusal) and _fits(p)}
+        least = LEAST_HOME if source == "home" else LEAST_PLAN
+        plans = {n: p for n, p in iter_plans(folder, wanted) if not isinstance(p, Refusal) and _fits(p, *least)}
         if not plans:
             raise InputError(f"sources.{source}: no plan of split {recipe.split} in {recipe.folder}")
         out[source] = {name: (plan,) for name, plan in plans.items()}
-        if source not in ("r2v", "ipa") and (recipe.stacks > 0 or recipe.hard.get("other-storey", 0) > 0):  # of one storey
+        stacked = recipe.stacks > 0 or recipe.hard.get("other-storey", 0) > 0
+        if stacked and source not in ONE_STOREY:
             stacks = iter_stacks(folder, dict(plans))
             out[source] |= {name: stack.plans for name, stack in stacks if isinstance(stack, Stack)}
     return out
 
 
-def _fits(plan: Plan) -> bool:
+def _fits(plan: Plan, rooms: int, area: float) -> bool:
     areas = [shapely.Polygon(room.polygon).area for room in plan.rooms]
-    return len(areas) >= LEAST_PLAN_ROOMS and sum(areas) >= LEAST_PLAN_AREA and max(areas) <= LARGEST_ROOM
+    return len(areas) >= rooms and sum(areas) >= area and max(areas) <= LARGEST_ROOM

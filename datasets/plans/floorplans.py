@@ -9,6 +9,7 @@
 | `*.vectormap.json` | line maps of UT-AMRL | `plans.amrl` |
 | `locations.yaml`, `*_gt_segmentation.png` | robot grids with true rooms: UTexas BWI, IPA | `plans.grid` |
 | `*.ifc` | building models with spaces | `plans.ifc` |
+| `*.json` that begin as Valetudo's | homes by vacuum robots, with the robots' rooms | `plans.robot_home` |
 
 Reasons of refusals start with: not closed, crosses itself, overlapping rooms, zero-width doors, no doors, no walls, absurd
 scale, no scale, too few rooms, disconnected, missing file, wrong version, bad line, damaged ..., absurd size, not read, not a
@@ -30,6 +31,7 @@ import numpy as np
 import shapely
 from topomerge.datasets.core.physical import STRANGERS, named_storey
 from topomerge.datasets.core.plan import Flight, Plan, PlanRoom
+from topomerge.datasets.plans.robot_home import is_robot_home
 from topomerge.datasets.plans.sealed import refuse_file
 from topomerge.datasets.plans.sketch import Sketch, finish
 
@@ -199,7 +201,8 @@ def _reader(path: Path) -> str:
     name = path.as_posix()
     if NOT_PLANS.search(name):
         return ""
-    return next((module for pattern, module in READERS if re.search(pattern, name)), "")
+    module = next((module for pattern, module in READERS if re.search(pattern, name)), "")
+    return "robot_home" if not module and path.suffix == ".json" and is_robot_home(path) else module
 
 
 def _read(path: Path, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[tuple[str, Plan | Refusal]]:

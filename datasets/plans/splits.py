@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from topomerge.datasets.core.physical import physical_building
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.plans.sealed import SEALED, is_sealed, read_list, refuse_split
 
@@ -28,6 +29,7 @@ FOLDERS = {  # source -> folder of the real data
     "campus": "plans_schools_offices",
     "mall": "plans_malls",
     "rmf": "sim_rmf_buildings",
+    "home": "homes_vacuum_robots",
 }
 TEST_ONLY = {
     "utexas": ("utexas_gdc_floors", "utexas_amrl_vectormaps"),  # one building by two surveys
@@ -102,6 +104,8 @@ def relatives(source: str, plans: Mapping[str, Plan]) -> Iterator[list[str]]:
         by.setdefault((len(areas), *np.round(areas / areas.sum(), 2).tolist()), []).append(name)
         if source == "r2v":
             by.setdefault(name.rpartition("/")[0], []).append(name)
+        if source == "home":
+            by.setdefault(physical_building(source, name), []).append(name)
     yield from by.values()
 
 

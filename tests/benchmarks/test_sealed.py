@@ -126,10 +126,10 @@ def test_what_is_counted(measures: ModuleType) -> None:
     assert any(line.startswith("| procedural: twin wing, which nobody can tell apart | 1 |") for line in lines)
 
 
-def test_halves_of_a_floor_share_the_middle(measures: ModuleType) -> None:
+def test_halves_of_a_floor_share_the_middle() -> None:
     x, y = (a.ravel() for a in np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 10, 0.1)))
     flat = Flat(np.zeros((1, 2)), np.column_stack([x, y]), 0.1)
-    a, b = measures.cut(flat, 3)
+    a, b = importlib.import_module("benchmarks.sealed_grids").cut(flat, 3)
     both = len({tuple(p) for p in a.free.tolist()} & {tuple(p) for p in b.free.tolist()})
     assert len(a.free) == pytest.approx(0.65 * len(flat.free), rel=0.03) == pytest.approx(len(b.free), rel=0.03)
     assert both == pytest.approx(0.3 * len(flat.free), rel=0.1)
@@ -173,10 +173,18 @@ def test_real_sites_are_measured_within_the_gate_only(tmp_path: Path, measures: 
     assert [row["kind"] for row in rows] == ["overlap", "overlap", "other-building"]
     assert [row["place"] for row in rows] == ["strands/home_x", "strands/home_y", "strands/home_x + strands/home_y"]
     assert rows[0]["common"] > 20 and rows[2]["err"] is None
+    ranking = measures.SealedItem("ranking", "robots' grids", measures.robot_ranks, (data,))
+    assert all("sealed" in row["failed"] for row in measures.measured(ranking))
+    with sealed.sealed_run():
+        ranked = measures.measured(ranking)
+    assert [row["embedder"] for row in ranked] == ["learned", "engineered"] * (len(ranked) // 2) and ranked
+    assert all(0 <= row["first"] <= row["five"] <= row["queries"] and row["queries"] >= 2 for row in ranked)
+    lines = "\n".join(measures.tables([*ranked, {**ranked[0], "place": "another", "first": 0}]))
+    assert f"| robots' grids | learned | {len(ranked) // 2 + 1} |" in lines and "| merges |" not in lines
 
 
 @pytest.mark.slow
 def test_a_small_run_from_end_to_end(tmp_path: Path, module: ModuleType) -> None:
     assert module.main(["--small", "--jobs", "2", "--page", str(tmp_path / "a.md")]) == 0
     text = (tmp_path / "a.md").read_text(encoding="utf-8")
-    assert "| tls | 1 |" in text and "| procedural:" in text
+    assert "| tls | 1 |" in text and "| procedural:" in text and "| procedural | learned | 1 |" in text

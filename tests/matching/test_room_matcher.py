@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -15,6 +16,10 @@ from topomerge.io import archive
 from topomerge.io.weight_files import VARIABLE
 from topomerge.matching import room_matcher
 from topomerge.matching.room_matcher import (
+    AGREEMENT,
+    LEVEL_GAP,
+    VOTE_UNIT,
+    VOTERS,
     RoomsSeen,
     agreement,
     certainty_of_turns,
@@ -97,6 +102,24 @@ def test_pairs_that_are_moved_alike_agree_and_those_of_another_storey_do_not() -
     assert votes[0, 1, 0] == 0.0 and votes[1, 0].max() == 0.0
     off = agreement(np.eye(4), a, replace(b, places=b.places + np.array([[0.75, 0], [0, 0], [0, 0], [0, 0]])))
     assert off[0, 0, 0] == pytest.approx(np.log1p(3 * 2 * 0.75**2)) and off[1, 1, 0] == pytest.approx(np.log1p(3 * (1 + 0.75**2)))
+
+
+def test_votes_are_sums_over_all_pairs_of_pairs() -> None:
+    rng = np.random.default_rng(0)
+    n, m = 9, 7
+    a, b = (
+        RoomsSeen(np.zeros((k, 4)), rng.uniform(0, 12, (k, 2)), 3.0 * rng.integers(0, 2, k), np.zeros((k, 3))) for k in (n, m)
+    )
+    likely = rng.uniform(0, 1, (n, m))
+    expected = np.zeros((n, m, len(AGREEMENT)))
+    voters = sorted(product(range(n), range(m)), key=lambda pair: -likely[pair])[: VOTERS * (n + m)]
+    for i, j in product(range(n), range(m)):
+        for u, v in voters:
+            apart = np.linalg.norm((a.places[i] - b.places[j]) - (a.places[u] - b.places[v]))
+            level = abs((a.heights[i] - b.heights[j]) - (a.heights[u] - b.heights[v])) < LEVEL_GAP
+            if i != u and j != v and level:
+                expected[i, j] += [max(1 - (apart / width) ** 2, 0) ** 2 * likely[u, v] for width in AGREEMENT]
+    assert expected.max() > 0 and np.allclose(agreement(likely, a, b), np.log1p(VOTE_UNIT * expected))
 
 
 def without(*parts: str) -> RoomMatcher:

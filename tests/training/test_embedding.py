@@ -135,6 +135,11 @@ def test_other_losses_train(settings, kind):
     assert np.isfinite(fit(replace(settings, epochs=1), quiet)["train/loss"])
 
 
+def test_half_precision_trains(settings):
+    """Fabric once refused the truth of a batch, so that no run with `precision=bf16-mixed` took a step."""
+    assert np.isfinite(fit(replace(settings, epochs=1, precision="bf16-mixed"), quiet)["train/loss"])
+
+
 @pytest.mark.longer
 def test_a_run_is_a_folder(settings, tmp_path):
     best = fit(replace(settings, name="a", tensorboard=True), quiet)

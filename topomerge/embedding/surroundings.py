@@ -67,8 +67,9 @@ def _cut(map_sheet: Mapping[str, Array], middles: Array, number: Array, side: in
     out = np.zeros((len(middles), side, side, len(CROP_PLANES)), np.uint8)
     for k, (x, y) in enumerate(middles):
         out[k, ..., :-1] = planes[x : x + reach : step, y : y + reach : step]
-        own = room[x : x + reach, y : y + reach] == number[k]
-        out[k, ..., -1] = own.reshape(side, step, side, step).sum(axis=(1, 3)) * 255 // step**2
+        own = (room[x : x + reach, y : y + reach] == number[k]).astype(np.uint16)
+        parts = [own[i::step, j::step] for i in range(step) for j in range(step)]
+        out[k, ..., -1] = sum(parts[1:], parts[0]) * 255 // step**2
     return out
 
 
@@ -77,9 +78,9 @@ def _means(planes: Array, step: int) -> Array:
     if step == 1:
         return planes
     total = planes.astype(np.uint16)
-    for axis in (0, 1):
-        wide = total.shape[axis] - step + 1
-        total = np.sum([np.take(total, range(k, k + wide), axis) for k in range(step)], axis=0, dtype=np.uint16)
+    for _ in (0, 1):
+        parts = [total[k : len(total) - step + 1 + k] for k in range(step)]
+        total = sum(parts[1:], parts[0]).swapaxes(0, 1)
     return np.asarray(total // step**2, np.uint8)
 
 

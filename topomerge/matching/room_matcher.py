@@ -20,6 +20,7 @@ from topomerge import numpy_nn as nn
 from topomerge.embedding.turns import FACTS, QUARTERS, Rows, TurnedRows
 from topomerge.errors import InputError
 from topomerge.io.weight_files import weights_file
+from topomerge.kernels.votes import summed_votes
 from topomerge.types import Array
 
 MATCHER_FILE = "room_matcher.npz"
@@ -136,11 +137,11 @@ def odds_of(a: RoomsSeen, b: RoomsSeen, w: Mapping[str, Array]) -> RoomOdds:
     rows, columns = _partners(0, states, cosine, agreement(likely, a, b), w)
     layer = 1
     while f"{layer}.query.w" in w:
-        votes = agreement(np.sqrt(rows[:, :-1] * columns[:, :-1].T), a, b)
+        agreed = agreement(np.sqrt(rows[:, :-1] * columns[:, :-1].T), a, b)
         states = [_within(f"{layer}", state, m, w) for state, m in zip(states, (a, b), strict=True)]
-        states = _across(f"{layer}", states, votes, w)
+        states = _across(f"{layer}", states, agreed, w)
         states = [state + _each(f"{layer}", state, w) for state in states]
-        rows, columns = _partners(layer, states, cosine, votes, w)
+        rows, columns = _partners(layer, states, cosine, agreed, w)
         layer += 1
     return RoomOdds(rows, columns)
 
@@ -162,20 +163,13 @@ def agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
     """
     n, m = likely.shape
     out = np.zeros((n * m, len(AGREEMENT)))
-    way = (a.places[:, None] - b.places[None]).reshape(-1, 2)
-    rise = (a.heights[:, None] - b.heights[None]).ravel()
+    way = (a.places[:, None] - b.places[None]).reshape(-1, 2).astype(np.float64)
+    rise = (a.heights[:, None] - b.heights[None]).ravel().astype(np.float64)
     order = np.argsort(-likely, axis=None, kind="stable")
     voters, voted = order[: min(VOTERS * (n + m), MOST_VOTERS)], np.sort(order[:MOST_VOTED])
-    step = max(MOST_VOTED * ROWS_AT_ONCE // max(len(voters), 1), 1)
-    for start in range(0, len(voted), step):
-        pair = voted[start : start + step]
-        apart = ((way[pair, None] - way[None, voters]) ** 2).sum(axis=2)
-        vote = np.abs(rise[pair, None] - rise[None, voters]) < LEVEL_GAP
-        vote = vote & (pair[:, None] // m != voters[None] // m) & (pair[:, None] % m != voters[None] % m)
-        vote = vote * likely.ravel()[voters]
-        for k, width in enumerate(AGREEMENT):
-            near = np.maximum(1 - apart / width**2, 0) ** 2
-            out[pair, k] = np.log1p(VOTE_UNIT * (near * vote).sum(axis=1))
+    room = np.stack(np.divmod(np.arange(n * m), m), axis=1)
+    chance = likely.ravel().astype(np.float64)
+    out[voted] = np.log1p(VOTE_UNIT * summed_votes(way, rise, room, chance, voted, voters, np.array(AGREEMENT), LEVEL_GAP))
     return out.reshape(n, m, len(AGREEMENT))
 
 

@@ -55,4 +55,5 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "amrl": lambda folder: write.amrl(folder / "a.vectormap.json"),
     "bwi": lambda folder: write.bwi(folder / "1"),
     "ipa": write.ipa,
+    "valetudo": write.valetudo,
 }

@@ -148,6 +148,21 @@ def ipa(folder: Path) -> Path:
     return folder / "flat_gt_segmentation.png"
 
 
+def valetudo(folder: Path, rooms: int = 2) -> Path:
+    """A row of rooms of 4 m by 3 m in pixels of 5 cm, walls of 0.1 m, doors of 0.9 m."""
+    layers, walls = [], []
+    for k in range(rooms):
+        first = 200 + 82 * k
+        layers.append({"type": "segment", "compressedPixels": [n for r in range(100, 160) for n in (first, r, 80)]})
+        walls += [n for r in range(100, 160) if k == rooms - 1 or not 120 <= r < 138 for n in (first + 80, r, 2)]
+        layers[-1]["compressedPixels"] += [n for r in range(120, 138) if k < rooms - 1 for n in (first + 80, r, 2)]
+    walls += [n for r in (98, 99, 160, 161) for n in (198, r, 82 * rooms + 2)] + [n for r in range(100, 160) for n in (198, r, 2)]
+    layers.append({"type": "wall", "compressedPixels": walls})
+    path = folder / "home.json"
+    path.write_text(json.dumps({"__class": "ValetudoMap", "pixelSize": 5, "layers": layers}))
+    return path
+
+
 def ifc(path: Path, spaces: int = 2) -> Path:
     """Spaces of 5 by 4 m, 0.2 m apart, and between the first two a door of 1 m around y = 3."""
     import ifcopenshell

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,6 +37,26 @@ def test_r2v_opening_to_the_balcony_is_a_window(tmp_path: Path) -> None:
     assert len(plan.rooms) == 2
     (glass,) = (o for o in plan.openings if o.kind == "window")
     assert glass.start[0] == pytest.approx(300 * 0.75 / 40)
+
+
+def test_a_home_that_a_robot_mapped(tmp_path: Path) -> None:
+    (plan,) = read_plans(write.valetudo(tmp_path))
+    assert areas(plan) == pytest.approx([12, 12], rel=0.05)
+    middle, width = door(plan)
+    assert middle == pytest.approx([14.1, -6.45], abs=0.06) and width == pytest.approx(0.9, abs=0.06)  # x right, y up
+    assert [o.kind for o in plan.openings] == ["door"]
+
+
+def test_what_a_robot_drove_around_is_no_hole_in_a_room(tmp_path: Path) -> None:
+    path = write.valetudo(tmp_path)
+    about = json.loads(path.read_text())
+    runs = np.array(about["layers"][0]["compressedPixels"]).reshape(-1, 3).tolist()
+    table = [[x, y, n] for x, y, n in runs if n < 80 or not 125 <= y < 135]  # 0.5 m of the floor under a table of 1 m
+    table += [part for x, y, n in runs if n == 80 and 125 <= y < 135 for part in ([x, y, 30], [x + 50, y, 30])]
+    about["layers"][0]["compressedPixels"] = [n for run in table for n in run]
+    path.write_text(json.dumps(about))
+    (plan,) = read_plans(path)
+    assert areas(plan) == pytest.approx([12, 12], rel=0.05)
 
 
 def test_campus(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -161,6 +162,18 @@ def test_absurdly_large_archive_is_not_read_to_its_end(tmp_path: Path, monkeypat
     monkeypatch.setattr("topomerge.datasets.plans.r2v.ARCHIVE_BYTES", 1 << 20)
     path = pack(tmp_path / "all.tar.xz", {"zeros.bin": bytes(2 << 20), "a.txt": write.r2v(tmp_path / "a.txt").read_bytes()})
     assert reason(path).startswith("absurd size")
+
+
+def test_robots_homes_refusals(tmp_path: Path) -> None:
+    path = write.valetudo(tmp_path, 1)
+    assert reason(path).startswith("no doors")
+    about = json.loads(path.read_text())
+    path.write_text(json.dumps({**about, "layers": about["layers"][1:]}))
+    assert reason(path).startswith("too few rooms: the robot tells none apart")
+    path.write_text(path.read_text()[:-1])
+    assert isinstance(reason(path), str)
+    (tmp_path / "other.json").write_text('{"class": "of something else"}')
+    assert [name for name, _ in iter_plans(tmp_path)] == ["home"]
 
 
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,29 +11,13 @@ from topomerge.datasets.real.robot_homes import home_truth
 from topomerge.datasets.simulation.floor_truth import TRUTH_CELL, judge
 
 import topomerge as tm
+from tests.datasets.plans import plan_files as write
 from topomerge.errors import InputError
 from topomerge.io import read_points
 
-CELL = 5  # cm
-
-
-def home(folder: Path, rooms: int = 2) -> Path:
-    """A row of rooms of 4 m by 3 m in pixels of 5 cm, walls of 0.1 m, doors of 0.9 m."""
-    layers, walls = [], []
-    for k in range(rooms):
-        first = 200 + 82 * k
-        layers.append({"type": "segment", "compressedPixels": [n for r in range(100, 160) for n in (first, r, 80)]})
-        walls += [n for r in range(100, 160) if k == rooms - 1 or not 120 <= r < 138 for n in (first + 80, r, 2)]
-        layers[-1]["compressedPixels"] += [n for r in range(120, 138) if k < rooms - 1 for n in (first + 80, r, 2)]
-    walls += [n for r in (98, 99, 160, 161) for n in (198, r, 82 * rooms + 2)] + [n for r in range(100, 160) for n in (198, r, 2)]
-    layers.append({"type": "wall", "compressedPixels": walls})
-    path = folder / "home.json"
-    path.write_text(json.dumps({"__class": "ValetudoMap", "pixelSize": CELL, "layers": layers}))
-    return path
-
 
 def test_the_rooms_stand_where_the_map_is_read(tmp_path: Path) -> None:
-    path = home(tmp_path, 3)
+    path = write.valetudo(tmp_path, 3)
     cloud = read_points(path)
     truth, rooms = home_truth(path, cloud.points.astype(float))
     assert [r.name for r in rooms] == ["room 1", "room 2", "room 3"] and np.allclose(
@@ -49,7 +32,7 @@ def test_the_rooms_stand_where_the_map_is_read(tmp_path: Path) -> None:
 
 def test_a_robot_that_tells_no_rooms_apart_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="tells 1 rooms apart"):
-        home_truth(home(tmp_path, 1), np.zeros((1, 3)))
+        home_truth(write.valetudo(tmp_path, 1), np.zeros((1, 3)))
 
 
 def test_maps_of_one_home_are_one_building() -> None:
