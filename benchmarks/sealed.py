@@ -26,7 +26,7 @@ from pathlib import Path
 from topomerge.datasets.core.script import exit_status
 from topomerge.datasets.plans.sealed import SEALED, sealed_run
 
-from benchmarks.sealed_measures import PARTS, Row, SealedItem, items_of, measured, tables
+from benchmarks.sealed_measures import SEALED_PARTS, Row, SealedItem, items_of, measured, tables
 from topomerge import __version__
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
@@ -47,7 +47,7 @@ def sealed_rows(item: SealedItem, split: str) -> list[Row]:
 
 
 def run(
-    split: str, data: Path | None, public: Sequence[tuple[str, Path]], jobs: int, small: bool, parts: Sequence[str] = PARTS
+    split: str, data: Path | None, public: Sequence[tuple[str, Path]], jobs: int, small: bool, parts: Sequence[str] = SEALED_PARTS
 ) -> list[Row]:
     """Measure everything of these parts, in the order of the items."""
     from joblib import Parallel, delayed
@@ -133,7 +133,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--again", action="store_true", help="measure a version that was measured; the block says so")
     parser.add_argument("--small", action="store_true", help="a few items of training seeds")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="what is measured; everything")
+    parser.add_argument("--parts", nargs="+", choices=SEALED_PARTS, default=list(SEALED_PARTS), help="what is measured")
     parser.add_argument("--public", nargs="*", default=[], metavar="SOURCE=FOLDER", help="published sets")
     parser.add_argument("--page", type=Path, help="where the block goes; docs/results/sealed.md")
     return parser.parse_args(words)

@@ -52,7 +52,7 @@ from topomerge.training.belief_hypotheses import fair
 from topomerge.types import Sim3
 
 Row = dict[str, Any]
-PARTS = ("rooms", "merges", "ranking")
+SEALED_PARTS = ("rooms", "merges", "ranking")
 SENSORS_OF_ROOMS = ("tls", "lidar", "depth", "tablet", "laser2d")
 VISITED_ROOMS = {"procedural": 8, "plan": 12}  # rooms a map
 VAST = 500.0  # m2; a plan with such a hall is not furnished: it takes minutes
@@ -66,7 +66,7 @@ class SealedItem:
     """One thing to measure.
 
     Args:
-        part: of `PARTS`.
+        part: of `SEALED_PARTS`.
         group: the row of the tables that it belongs to.
         make: what gives its rows; it can be sent to another process.
         arguments: of `make`.

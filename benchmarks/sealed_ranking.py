@@ -31,7 +31,7 @@ Row = dict[str, Any]
 RANKED = ("learned", "engineered")
 SENSOR_PAIRS = (("tls", "depth"), ("lidar", "tablet"), ("depth", "laser2d"), ("tls", "lidar"))
 RANKED_ROOMS, RANKED_OVERLAP = 10, 0.5
-COLUMNS = ("recall@1", "recall@1_single", "recall@5")
+RANKED_METRICS = ("recall@1", "recall@1_single", "recall@5")
 
 
 def building_ranks(kind: str, seed: int, sensors: tuple[str, str]) -> list[Row]:
@@ -80,6 +80,6 @@ def table(rows: Sequence[Row]) -> list[str]:
         for name in RANKED:
             some = [row for row in rows if row["group"] == group and row["embedder"] == name]
             sizes = [len(some), len({row["place"] for row in some}), sum(row["queries"] for row in some)]
-            scores = [cell(value(some, column)) for column in COLUMNS]
+            scores = [cell(value(some, column)) for column in RANKED_METRICS]
             out.append(f"| {' | '.join([group, name, *map(str, sizes), *scores])} |")
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -20,7 +21,7 @@ import numpy as np
 import pytest
 
 import topomerge
-from tests.io.export_maps import two_floors
+from tests.io.export_maps import doubted, two_floors
 from topomerge.cli.main import main as cli
 
 Run = Callable[..., tuple[int, str, str]]
@@ -109,7 +110,22 @@ BAD = [
     (("a.tmap", "--to", "graphml", "-o", "x", "--storey", "1"), "geojson and ros"),
     (("a.tmap", "--to", "graphml", "-o", "x", "--storey", "one"), "whole number"),
     (("a.tmap", "-o", "x"), "--to"),
+    (("a.tmap", "--to", "ply", "-o", "x", "--min-confidence", "1.5"), "from 0 to 1"),
+    (("a.tmap", "--to", "ply", "-o", "x", "--min-confidence=-0.5"), "from 0 to 1"),
+    (("a.tmap", "--to", "ply", "-o", "x", "--min-confidence", "nan"), "from 0 to 1"),
+    (("a.tmap", "--to", "tf2", "-o", "x", "--min-confidence", "0.5"), "means nothing for tf2"),
 ]
+
+
+def test_only_what_is_likely_enough(run: Run) -> None:
+    topomerge.save_map(doubted(), "a.tmap")
+    words = ("export", "a.tmap", "--to", "geojson,ros", "-o", "out", "--min-confidence")
+    assert run(*words, "0.5")[1].startswith("5 rooms, 3 doors and stairs -> ")
+    features = json.loads(Path("out/a.geojson").read_text())["features"]
+    assert sorted(f["id"] for f in features if f["properties"]["kind"] == "room") == [f"room {r}" for r in range(5)]
+    assert all(f["properties"].get("confidence", 1) >= 0.5 for f in features)
+    assert run(*words, "1")[1].startswith("0 rooms, 0 doors and stairs -> "), "nothing is so sure"
+    assert run(*words, "0")[1].startswith("6 rooms, 5 doors and stairs -> ")
 
 
 def test_an_origin_in_the_south(run: Run) -> None:

@@ -152,7 +152,7 @@ def test_a_second_scan_is_for_merge(run: Run) -> None:
     ("words", "message"),
     [
         ("merge a.tmap b.tmap -o m --descriptor nowhere", "--descriptor: unknown descriptor 'nowhere'"),
-        ("merge a.tmap b.tmap -o m --poses rooms --scale free", "--poses: poses of rooms alone are for two maps of one scale"),
+        ("merge a.tmap b.tmap -o m --poses surfaces --scale free", "--poses: poses of rooms alone are for two maps of one scale"),
         ("merge a.tmap b.tmap -o m --voxel-size 0.2", "--voxel-size: is for clouds, of no use to a .tmap"),
         ("match a.tmap b.tmap --k 1000", "--k: steps of context "),
         ("match a.tmap b.tmap --k 1", "--k: steps of context are for descriptors of single rooms"),

@@ -80,6 +80,7 @@ def test_rank_counts_of_both_directions() -> None:
     assert counts["five"] == 7
     assert counts["reciprocal"] == pytest.approx(3 + 2 + 1 / 4 + 1 / 5)
     assert counts["queries_twin"] == 1 and counts["first_twin"] == 0
+    assert counts["queries_glimpsed"] == counts["queries"] - 4 and counts["first_glimpsed"] == counts["first"] - 2
     assert (counts["queries_whole"], counts["first_whole"]) == (4, 2)  # rooms 0 and 3 of a, 1 and 2 of b, both entered
 
 

@@ -8,10 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.scenes import two_rooms
+from tests.extraction.elevations.doors import SHUT_DOOR, flush_door
+from tests.scenes import Scene, two_rooms
 from topomerge.extraction.extract import extract
-from topomerge.extraction.walked_doors import room_changes, rooms_under, with_walked_doors
-from topomerge.types import PointCloud
+from topomerge.extraction.walked_doors import SHUT_LATER_CHANCE, room_changes, rooms_under, with_walked_doors
+from topomerge.types import PointCloud, TopometricMap
 
 HEIGHT = 1.4
 
@@ -33,7 +34,7 @@ def way(*corners, step=0.3):
 
 
 THROUGH = way((1, 2), (6, 2))  # through the door at (4, 2)
-INTO_THE_WALL = way((1, 4), (6, 4))
+THROUGH_WALLS = way((1, 4), (6, 4), (6, 0.3), (1, 0.3))
 
 
 def test_rooms_are_those_of_the_floor_below(map):
@@ -63,15 +64,65 @@ def test_a_door_that_nothing_shows_is_added(map):
     assert door["centre"][:2] == pytest.approx([4, 2], abs=0.4) and door["direction"] == pytest.approx(0, abs=0.01)
 
 
+def test_a_door_whose_lintel_the_way_meets_once_is_open(map):
+    high = THROUGH[::-1] + (0, 0, 0.75)
+    assert with_walked_doors(replace(map, edges=map.edges[:0]), high)[0].edges["open"].tolist() == [False]
+    proven, _ = with_walked_doors(replace(map, edges=map.edges[:0]), np.concatenate([THROUGH, high]))
+    assert proven.edges["open"].tolist() == [True]
+
+
 @pytest.mark.parametrize("back", [1, -1])
 def test_there_and_back_is_one_door(map, back):
     proven, _ = with_walked_doors(replace(map, edges=map.edges[:0]), np.concatenate([THROUGH, THROUGH[::-1]])[::back])
     assert len(proven.edges) == 1
 
 
-def test_a_way_through_walls_is_of_another_building(map):
-    proven, doubt = with_walked_doors(map, INTO_THE_WALL)
+@pytest.mark.parametrize(
+    "places",
+    [THROUGH_WALLS, way((1, 4), (12, 4))],
+    ids=["in two places", "off the floors"],
+)
+def test_a_way_through_walls_is_of_another_building(map, places):
+    proven, doubt = with_walked_doors(map, places)
     assert proven is map and "through walls" in doubt
+
+
+@pytest.mark.parametrize("back", [False, True], ids=["there", "there and back"])
+def test_one_thin_place_that_a_way_leads_through_is_a_door_that_was_shut_later(map, back):
+    places = way((1, 4), (6, 4))
+    proven, doubt = with_walked_doors(map, np.concatenate([places, places[::-1]]) if back else places)
+    added = proven.edges[~proven.edges["open"]]
+    assert not doubt and len(proven.edges) == 2 and added["rooms"].tolist() == [[0, 1]]
+    assert added["centre"][0, :2] == pytest.approx([4, 4], abs=0.1) and added["width"] == [0.9] and added["kind"] == ["door"]
+    assert added["confidence"] == [SHUT_LATER_CHANCE] and np.array_equal(added["lower"], added["centre"])
+
+
+def test_few_places_of_a_good_way_through_a_wall_are_one_door_only_if_they_are_one(map):
+    good = np.concatenate([THROUGH, THROUGH[::-1]] * 4)
+    once, twice = (with_walked_doors(map, np.concatenate([good, more])) for more in (way((1, 2), (1, 4), (6, 4)), THROUGH_WALLS))
+    assert not once[1] and once[0].edges["open"].tolist() == [True, False]
+    assert not twice[1] and twice[0].edges["open"].tolist() == [True]
+
+
+def by_its_plan(scene: Scene) -> TopometricMap:
+    """The map by the plan alone."""
+    return extract(scene.points(), walls=False)
+
+
+@pytest.mark.parametrize(("deep", "doors"), [(0.02, 1), (0.4, 0)], ids=["a board", "a cupboard"])
+def test_what_is_thick_is_no_door(deep, doors):
+    scene = Scene().shell(0, 0, 7, 5).wall((4, 0), (4, 5))
+    scene.box(4.1, 1.5, 0, 4.1 + deep, 2.5, 2.2)
+    map = by_its_plan(scene)
+    proven, doubt = with_walked_doors(map, way((1, 2), (6, 2)))
+    assert len(map.rooms) == 2 and len(proven.edges) == doors and bool(doubt) == (not doors)
+
+
+@pytest.mark.parametrize(("y", "doors"), [(3.1, 1), (4.2, 2)], ids=["beside it", "away from it"])
+def test_a_way_through_the_wall_beside_a_door_drifted(y, doors):
+    map = by_its_plan(two_rooms().wall((4, 2.7), (7, 2.7)))
+    proven, doubt = with_walked_doors(map, way((1, y), (6, y)))
+    assert len(map.rooms) == 3 and len(map.edges) == 1 and len(proven.edges) == doors and bool(doubt) == (doors == 1)
 
 
 @pytest.mark.parametrize(
@@ -90,11 +141,24 @@ def test_what_changes_no_room_changes_nothing(map, places):
     assert proven is map and not doubt
 
 
-def test_the_extraction_takes_the_places_of_the_file():
-    points = two_rooms().points()
-    poses = np.tile(np.eye(4), (len(THROUGH), 1, 1))
-    poses[:, :3, 3] = THROUGH
+def walked(points: np.ndarray, places: np.ndarray) -> PointCloud:
+    """A cloud of points in any order, seen from places in theirs."""
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
     which = np.sort(np.arange(len(points)) % len(poses)).astype(np.int32)
     order = np.random.default_rng(0).permutation(len(points))
-    map = extract(PointCloud(points[order], poses=poses, pose_of=which), walls=False)
+    return PointCloud(points[order], poses=poses, pose_of=which)
+
+
+def test_the_extraction_takes_the_places_of_the_file():
+    map = extract(walked(two_rooms().points(), THROUGH), walls=False)
     assert map.edges["confidence"].tolist() == [0.98]
+
+
+@pytest.mark.parametrize("doors", [(SHUT_DOOR,), (SHUT_DOOR, 4.0)], ids=["the only door", "one of two"])
+def test_a_leaf_across_a_doorway_that_somebody_walked_through_is_a_shut_door(doors):
+    points = flush_door(doors)
+    map = extract(walked(points, way((1, SHUT_DOOR), (6, SHUT_DOOR))))
+    (door,) = map.edges[~map.edges["open"]]
+    assert len(extract(points).edges) == len(doors) - 1 and len(map.edges) == len(doors) and not map.warnings
+    assert door["centre"][:2] == pytest.approx([4, SHUT_DOOR], abs=0.1) and door["width"] == pytest.approx(0.9)

@@ -9,7 +9,7 @@ import shapely
 
 from tests.scenes import Scene, stair
 from tests.scenes_map import EDGE, boxes, building
-from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
+from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, STOREY_DTYPE, WINDOW_DTYPE, Array, TopometricMap, VoxelGrid
 
 GRID = (432100.0, 5812300.0, 40.0)  # m, as in UTM
 AT = (2.0, -3.0, 0.5)
@@ -30,6 +30,22 @@ def two_floors(at: tuple[float, float, float] = AT) -> TopometricMap:
     edges["lower"][stairs], edges["upper"][stairs] = middle + (-1.0, 0.0, -1.4), middle + (1.0, 0.0, 1.6)
     edges["centre"][stairs] = middle + (0.0, 0.0, 0.1)
     return replace(joined, edges=edges)
+
+
+def doubted() -> TopometricMap:
+    """`two_floors` with three windows of room 0: a sure one outdoors, one outdoors whose sill and head nobody saw, and a doubtful
+    one into the corridor. Room 1 and the door of room 0 are doubtful; room 3 is outside."""
+    map = two_floors()
+    rooms, edges, windows = map.rooms.copy(), map.edges.copy(), np.zeros(3, WINDOW_DTYPE)
+    rooms["confidence"], rooms["outside"] = [0.9, 0.3, 0.8, 0.7, 0.95, 0.6], [0, 0, 0, 0.8, 0, 0.5]
+    edges["confidence"] = [0.4, 0.9, 0.85, 0.75, 0.65]
+    low, high = rooms["lo"][0], rooms["hi"][0]
+    x, y, _ = (low + high) / 2
+    windows["rooms"] = [(0, -1), (0, -1), (0, 2)]
+    windows["centre"] = [(low[0] - EDGE / 2, y, low[2]), (x, low[1] - EDGE / 2, low[2]), (x + 1.2, high[1] + EDGE / 2, low[2])]
+    windows["direction"], windows["width"] = [0.0, np.pi / 2, np.pi / 2], [1.2, 0.9, 0.6]
+    windows["sill"], windows["head"], windows["confidence"] = [0.9, np.nan, 1.0], [2.1, np.nan, 2.0], [0.88, 0.77, 0.2]
+    return replace(map, rooms=rooms, edges=edges, windows=windows)
 
 
 def nothing() -> TopometricMap:

@@ -14,7 +14,7 @@ import pytest
 import shapely
 
 import topomerge
-from tests.io.export_maps import AT, GRID, flat, nothing, rectangles, stair_scene, two_floors, without_doors
+from tests.io.export_maps import AT, GRID, doubted, flat, nothing, rectangles, stair_scene, two_floors, without_doors
 from tests.io.indoorgml_structure import CORE, GML, check, is_closed, positions, volume
 from tests.io.test_export_plans import with_areas, write
 from tests.scenes import HEIGHT, THICK, corridor, two_rooms
@@ -28,7 +28,7 @@ def courtyard() -> TopometricMap:
     return flat(plan)
 
 
-@pytest.mark.parametrize("make", [two_floors, nothing, without_doors, courtyard, lambda: two_floors(GRID)])
+@pytest.mark.parametrize("make", [two_floors, nothing, without_doors, courtyard, doubted, lambda: two_floors(GRID)])
 def test_indoorgml_has_the_structure_of_its_schema(tmp_path, make):
     map = make()
     root = xml.parse(write(map, "indoorgml", tmp_path / "a.gml")).getroot()
@@ -196,7 +196,9 @@ RULES = [pytest.param(False, id="types"), pytest.param(True, id="rules", marks=p
 
 
 @pytest.mark.parametrize("rules", RULES)
-@pytest.mark.parametrize("make", [two_floors, courtyard, nothing, without_doors, lambda: topomerge.extract(two_rooms().points())])
+@pytest.mark.parametrize(
+    "make", [two_floors, courtyard, nothing, without_doors, doubted, lambda: topomerge.extract(two_rooms().points())]
+)
 def test_ifc_is_valid(tmp_path, make, rules):
     ifcopenshell = pytest.importorskip("ifcopenshell")
     validate = importlib.import_module("ifcopenshell.validate")

@@ -14,9 +14,10 @@ from torch_geometric.loader import DataLoader
 from tests.graphs import pair
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.embedding.schema import column
+from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.training import turned_views
 from topomerge.training.batches import ChangedPairs, MapPair, make_batch, map_pair
-from topomerge.training.packed import GraphPair
+from topomerge.training.packed import Graph, GraphPair
 from topomerge.training.settings import Augment
 from topomerge.training.turned_views import changed_sheet, mirrored, with_views
 
@@ -114,6 +115,25 @@ def test_a_mirrored_map_has_mirrored_crops_ways_and_turns():
     assert torch.equal(other["edge_attr"][:, sine], -seen["edge_attr"][:, sine])
     assert torch.equal(other["edge_attr"][:, cosine], seen["edge_attr"][:, cosine])
     assert all(torch.equal(mirrored(other)[name], seen[name]) for name in ORIENTED_NAMES)
+
+
+def mirrored_sheet(graph: Graph) -> Graph:
+    """The map itself in a mirror: its sheet is drawn from the other side, and middles and doors lie there."""
+    out = {**graph, "sheet": graph["sheet"].flip(1), "sheet_room": graph["sheet_room"].flip(1)}
+    for name in ("anchor", "door_anchor"):
+        x, y = graph[name].unbind(dim=-1)
+        out[name] = torch.stack([x, graph["sheet"].shape[1] - y], dim=-1)
+    for name in ("pos", "edge_pos"):
+        out[name] = graph[name] * torch.tensor([1.0, -1.0, 1.0])
+    return out
+
+
+@pytest.mark.parametrize("part", [*CROP_SHAPES, "edge_way"])
+def test_crops_and_ways_of_a_mirrored_sheet_are_the_mirrored_ones(part):
+    one = pair(1).a
+    seen = with_views(mirrored_sheet(one), [part])[part]
+    assert torch.equal(seen, mirrored(with_views(one, [part]))[part])
+    assert not torch.equal(seen, with_views(one, [part])[part])
 
 
 def test_what_another_sensor_saw_has_the_same_walls_but_in_patches():

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.io.export_maps import doubted
 from tests.scenes import two_rooms
 from tests.scenes_map import HEIGHT, building
 from tests.viz.chromium import browser
@@ -68,6 +69,21 @@ def test_every_room_and_door_is_in_plan_and_table() -> None:
     assert len(page.all("g", "door")) == len(map.edges) + 1  # the stairs stand on both storeys
     assert len(page.all("svg", "plan")) == 2
     assert [p["data-room"] for p in page.all("path", "glimpsed")] == ["0"]
+
+
+def test_what_is_shown_says_how_sure_it_is() -> None:
+    map = doubted()
+    page = Page(report_html(map))
+    sure = [f"{odds:.3f}" for odds in map.rooms["confidence"]]
+    for tag, name in (("path", "room"), ("g", "label"), ("circle", "node"), ("tr", None)):
+        said = {a["data-room"]: a["data-sure"] for a in page.all(tag, name) if "data-room" in a}
+        assert said == {str(r): odds for r, odds in enumerate(sure)}
+    doors = ["0.400", "0.300", "0.600", "0.600", "0.600"]  # no surer than their rooms
+    for tag, name in (("g", "door"), ("tr", None)):
+        said = {a["data-edge"]: a["data-sure"] for a in page.all(tag, name) if "data-edge" in a}
+        assert said == {str(i): odds for i, odds in enumerate(doors)}
+    assert sorted(a["data-sure"] or "" for a in page.all("path", "link")) == sorted([*doors, doors[-1]]), "stairs: on each storey"
+    assert [a["data-sure"] for a in page.all("g", "window")] == ["0.880", "0.770", "0.200"]
 
 
 def test_one_file_without_a_network() -> None:
@@ -220,10 +236,10 @@ def browse(page: Path, *more: str) -> tuple[str, list[str]]:
     return done.stdout, [line for line in lines if "GPU stall due to ReadPixels" not in line]  # of software drawing
 
 
-def with_probe(text: str) -> str:
-    digest = base64.b64encode(hashlib.sha256(PROBE.encode()).digest()).decode()
+def with_probe(text: str, probe: str = PROBE) -> str:
+    digest = base64.b64encode(hashlib.sha256(probe.encode()).digest()).decode()
     text = text.replace("script-src ", f"script-src 'sha256-{digest}' ")
-    return text.replace("</body>", f"<script>{PROBE}</script></body>")
+    return text.replace("</body>", f"<script>{probe}</script></body>")
 
 
 @pytest.mark.longer
@@ -242,6 +258,37 @@ def test_in_a_browser(tmp_path: Path) -> None:
     assert seen["areas"] == sorted(seen["areas"], reverse=True)
     assert seen["theme"] == "rgb(19, 21, 23)"
     assert seen["scene"] == "shown" and seen["moves"]
+
+
+SLIDE = """
+window.addEventListener("load", () => setTimeout(() => {
+  const slider = document.querySelector("input[data-sure]");
+  const numbers = (words, name) => [...document.querySelectorAll(words)].filter((one) => one.getClientRects().length)
+    .map((one) => one.dataset[name]).sort().join(" ");
+  const state = () => [numbers(".plan path.room", "room"), numbers(".plan g.door", "edge"), numbers(".plan g.window", "sure"),
+    numbers(".plan path.link", "sure"), numbers("#plan tr[data-room]", "room"), numbers("#doors tr[data-edge]", "edge")];
+  const seen = [0, 50, 90].map((least) => {
+    slider.value = least;
+    slider.dispatchEvent(new Event("change", { bubbles: true }));
+    return state();
+  });
+  document.title = JSON.stringify(seen);
+}, 500));
+"""
+
+
+@pytest.mark.longer
+def test_the_slider_hides_what_is_less_sure(tmp_path: Path) -> None:
+    page = tmp_path / "a.html"
+    page.write_text(with_probe(report_html(doubted()), SLIDE), encoding="utf-8")
+    text, console = browse(page, "--dump-dom")
+    assert console == []
+    title = re.search("<title>(.*?)</title>", text)
+    assert title
+    none, half, most = json.loads(title[1].replace("&quot;", '"'))
+    assert none == ["0 1 2", "0 1 4", "0.200 0.770 0.880", "0.300 0.400 0.600", "0 1 2", "0 1 2 3 4"]  # the table: of all storeys
+    assert half == ["0 2", "4", "0.770 0.880", "0.600", "0 2", "2 3 4"]
+    assert most == ["0", "", "", "", "0", ""]
 
 
 @pytest.mark.longer

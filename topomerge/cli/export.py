@@ -8,7 +8,7 @@ from typing import Any
 
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import check_inputs, check_outputs, output_folder, say_line, warn, write_all
-from topomerge.cli.options import count, given, quiet
+from topomerge.cli.options import count, given, quiet, share
 from topomerge.errors import InputError
 
 
@@ -16,6 +16,7 @@ def export_command(args: argparse.Namespace) -> int:
     """`topomerge export`: a map in the formats of other tools."""
     from topomerge.io.exports import formats, outputs
     from topomerge.io.maps import load_map
+    from topomerge.types import confident
 
     names = formats(args.to)
     options = _export_options(args, names)
@@ -23,6 +24,7 @@ def export_command(args: argparse.Namespace) -> int:
     path, folder = _place(args, names, source)
     topomap = load_map(source)
     warn(topomap.warnings)
+    topomap = confident(topomap, getattr(args, "min_confidence", 0.0))
     with output_folder(path.parent):
         files = [file for name in names for file in outputs(topomap, name, path, folder, **options)]
         check_outputs([file for file, _ in files], [source])
@@ -48,6 +50,8 @@ def _export_options(args: argparse.Namespace, names: list[str]) -> dict[str, Any
         able = [name for name, form in FORMATS.items() if key in form.options]
         if not set(able) & set(names):
             raise InputError(f"--{key}: means nothing for {', '.join(names)}; it is for {' and '.join(able)}")
+    if names == ["tf2"] and given(args, "min_confidence"):
+        raise InputError("--min-confidence: means nothing for tf2, which holds no rooms; leave it out")
     if "origin" in options:
         from topomerge.io.exports.geojson import parse_origin
 
@@ -123,6 +127,12 @@ EXPORT = Command(
         ),
         option("--frames", metavar="NAME,NAME", help="tf2: names of the maps' frames, in their order (default: their files')"),
         option("--storey", type=count, metavar="N", help="geojson, ros: only this storey"),
+        option(
+            "--min-confidence",
+            type=share,
+            metavar="P",
+            help="leave out rooms, doors, stairs and windows that are less likely than P, 0 to 1 (default 0: none)",
+        ),
         quiet(),
     ),
     paths=("input", "output"),

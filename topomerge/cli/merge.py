@@ -87,7 +87,7 @@ def _check_choices(args: argparse.Namespace) -> None:
     check_descriptor(args)
     with about("--poses"):
         check_poses(args.poses, len(args.inputs), args.scale_of_b)
-        if args.poses == "rooms":
+        if args.poses == "surfaces":
             check_open3d()
 
 
@@ -118,9 +118,10 @@ MERGE = Command(
         ),
         option(
             "--poses",
-            choices=("search", "rooms"),
+            choices=("search", "rooms", "surfaces"),
             default="search",
-            help="rooms: poses from the surfaces of matched rooms only, as in the thesis (two maps)",
+            help="rooms: from matched rooms alone, without a search of walls; surfaces: from the surfaces of each matched pair "
+            "of rooms, as in the thesis (two maps of one scale)",
         ),
         option("--rigid", action="store_true", help="do not bend the maps to remove their drift"),
         option(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.evaluation.score import GROUPS, WHOLE, Row
+from topomerge.evaluation.score import GLIMPSED, GROUPS, WHOLE, Row
 from topomerge.statistics import FEWEST_GROUPS, exact_interval
 from topomerge.types import Array
 
@@ -52,7 +52,7 @@ RATIOS: dict[str, Ratio] = {
     **{f"recall@1{g}": (f"first{g}", f"queries{g}") for g in GROUPS},
     **{f"recall@5{g}": (f"five{g}", f"queries{g}") for g in GROUPS},
     **{f"MRR{g}": (f"reciprocal{g}", f"queries{g}") for g in GROUPS},
-    f"recall@1{WHOLE}": (f"first{WHOLE}", f"queries{WHOLE}"),
+    **{f"recall@1{g}": (f"first{g}", f"queries{g}") for g in (WHOLE, GLIMPSED)},
     "recall@1_after": ("first_after", "queries"),
     "recall@1_single_after": ("first_single_after", "queries_single"),
     "recall@5_after": ("five_after", "queries"),

@@ -29,7 +29,7 @@ NEAR_POSE, FINE_POSE = (0.5, 5.0), (0.1, 1.0)  # m, degrees
 SHARED = 80.0  # m2 in common, from which on maps should be merged
 AREAS = (("<40", 40.0), ("40-80", 80.0), ("80-200", 200.0), (">200", np.inf))  # m2
 OVERLAPS = ((0.0, "0"), (0.175, "0.1"), (0.375, "0.25"), (0.625, "0.5"), (1.0, "0.75"))  # share: up to, name
-WHOLE = "_whole"
+WHOLE, GLIMPSED = "_whole", "_glimpsed"  # rooms that both maps entered, and those that one of them only looked into
 GROUPS = ("", "_twin", "_single")  # rooms that have a near-identical one in the other map, and those that have none
 
 
@@ -168,8 +168,8 @@ def ranks_of(cost: Array, matches: Array) -> tuple[Array, Array]:
 
 def rank_counts(pair: EvaluationPair, cost: Array) -> Row:
     """`queries`: rooms of either map with a true partner in the other; `first`, `five`: whose partner ranks first, within five;
-    `reciprocal`: sum of 1 / rank; each also with and without a twin, and (`_whole`) where neither room was looked into only.
-    `chance`: first ones to be expected of a draw."""
+    `reciprocal`: sum of 1 / rank; each also with and without a twin, and where neither room was looked into only (`_whole`), or
+    one was (`_glimpsed`). `chance`: first ones to be expected of a draw."""
     rank, twin, entered, chance = [], [], [], 0.0
     for side, c, m in ((0, cost, pair.matches), (1, cost.T, pair.matches[:, ::-1])):
         rooms, room_ranks = ranks_of(c, m)
@@ -180,7 +180,7 @@ def rank_counts(pair: EvaluationPair, cost: Array) -> Row:
         chance += len(m) / max(c.shape[1], 1)
     r, t, w = np.concatenate(rank), np.concatenate(twin).astype(bool), np.concatenate(entered)
     out: Row = {"pairs": 1, "chance": chance}
-    for name, queries in zip((*GROUPS, WHOLE), (t | True, t, ~t, w), strict=True):
+    for name, queries in zip((*GROUPS, WHOLE, GLIMPSED), (t | True, t, ~t, w, ~w), strict=True):
         out[f"queries{name}"] = int(queries.sum())
         out[f"first{name}"] = int((r[queries] == 1).sum())
         out[f"five{name}"] = int((r[queries] <= 5).sum())

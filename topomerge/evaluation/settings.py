@@ -59,7 +59,7 @@ class Evaluation:
         slow_k: "consistent" is run for these k only.
         merge: merge the maps, too, with each of the `mergers` among the descriptors, at k = 0, and each run.
         walls_alone: and by registration of walls and free space alone, without descriptors of rooms.
-        poses: of the merges: "search", or "rooms" (of matched rooms alone, as the thesis fuses).
+        poses: of the merges: "search", "rooms" (of matched rooms alone), "surfaces" (of each pair of rooms, as in the thesis).
         baseline: variant that the others are compared with.
         titles: call runs by what they are made of and not by their folders: "scalars, gat, infonce".
         tables: those of the short report, of `TABLES`.

@@ -23,13 +23,13 @@ BY = {
     "source": "Source",
     "seen": "Sources that training data came from, and unseen sources",
 }
-RANKING = ("recall@1", "recall@1_single", "recall@1_twin", "recall@1_whole", "recall@5", "MRR")
+RANKING = ("recall@1", "recall@1_single", "recall@1_twin", "recall@1_whole", "recall@1_glimpsed", "recall@5", "MRR")
 AFTER = ("recall@1_after", "recall@1_single_after", "recall@5_after")
 MATCHING = ("precision", "recall", "F1", "F1_single", "F1_twin", "strict recall")
 MERGING = ("right poses", "right finely", "every room", "rooms", "merged", "merged finely", "refused")
 METRIC_NAMES = {
     "recall@1": "recall@1", "recall@1_single": "without twin", "recall@1_twin": "with twin",
-    "recall@1_whole": "entered", "recall@5": "recall@5", "MRR": "MRR",
+    "recall@1_whole": "entered", "recall@1_glimpsed": "looked into", "recall@5": "recall@5", "MRR": "MRR",
     "recall@1_after": "after consensus: recall@1", "recall@1_single_after": "without twin", "recall@5_after": "recall@5",
     "precision": "precision", "recall": "recall", "F1": "F1", "F1_single": "F1 without twin", "F1_twin": "F1 with twin",
     "strict recall": "one-to-one recall", "right poses": "best pose right", "merged": "merged right",

@@ -169,7 +169,8 @@ class _Shades:
         if values is None or not len(chunk):
             return
         drawn = self._rng.random(len(chunk))
-        has = values.any(axis=1) if values.ndim == 2 else np.isfinite(values)
+        numbers = np.isfinite(values)
+        has = values.any(axis=1) & numbers.all(axis=1) if values.ndim == 2 else numbers  # no colour: black, or no number
         rows = np.flatnonzero(has & (drawn < self._share) & np.isfinite(chunk.points).all(axis=1))
         points = (chunk.points[rows] + chunk.shift).astype(np.float64)
         self._parts.append((drawn[rows], points, values[rows]))

@@ -15,7 +15,7 @@ from topomerge.io.maps import load_map
 from topomerge.types import TopometricMap
 
 MERGE_SCALES = ("fixed", "free")
-POSE_SOURCES = ("search", "rooms")
+POSE_SOURCES = ("search", "rooms", "surfaces")
 FEW_MAPS = 11  # of which each is registered with all others
 LINK_BELIEVED = (0.8, 0.9)  # of few maps; of more, where those that look most alike are sought out among many strangers
 UNIT_SPAN = 300.0  # m, and
@@ -89,10 +89,10 @@ def risk_threshold(risk: float) -> float:
 
 
 def check_poses(poses: str, count: int, scale: str) -> None:
-    """Raise InputError for another word than those of `POSE_SOURCES`; rooms alone give the poses of two maps of one scale."""
+    """Raise InputError for another word than those of `POSE_SOURCES`; without the search, poses are of two maps of one scale."""
     if poses not in POSE_SOURCES:
-        raise InputError(f"poses must be {' or '.join(POSE_SOURCES)}, not {poses!r}")
-    if poses == "rooms" and (count > 2 or scale != "fixed"):
+        raise InputError(f"poses must be {', '.join(POSE_SOURCES[:-1])} or {POSE_SOURCES[-1]}, not {poses!r}")
+    if poses != "search" and (count > 2 or scale != "fixed"):
         raise InputError("poses of rooms alone are for two maps of one scale; leave them out (--poses search)")
 
 

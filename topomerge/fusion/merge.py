@@ -58,19 +58,20 @@ def merge(
             gives that of a stated risk.
         embedder: "learned" (default), "engineered", "shapedna", "feather", the folder of a trained one, or a callable
             map -> (R, D), for the matching of rooms.
-        poses: "search": of walls and of matched rooms (default); "rooms": of each matched pair of rooms by its surfaces alone, as
-            the thesis does (two maps of one scale; with `embedder="shapedna"` its whole way).
+        poses: "search": of walls and of matched rooms (default); "rooms": of matched rooms alone; "surfaces": of each matched
+            pair of rooms by its surfaces, as the thesis does (with `embedder="shapedna"` its whole way). The last two are for two
+            maps of one scale.
         rigid: do not bend the maps.
         same: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
 
     Raises:
         InputError: no list, fewer than two maps, something that is no map, one map twice, a map without cells, maps in different
-            units, another word for the scale, the poses or what the maps are of, or poses of rooms without Open3D (`pip install
-            topomerge[open3d]`).
+            units, another word for the scale, the poses or what the maps are of, or poses of surfaces without Open3D (`pip
+            install topomerge[open3d]`).
     """
     check_list(maps, "merge")
     check_poses(poses, len(maps), scale)
-    if poses == "rooms":
+    if poses == "surfaces":
         check_open3d()
     read = [loaded(map) for map in maps]
     check_scale(scale)
@@ -199,14 +200,14 @@ class _Clock:
 
 
 def _room_hypotheses(a: TopometricMap, b: TopometricMap, settings: _Settings, clock: _Clock) -> list[Sim3]:
-    """Poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "rooms") of each by its surfaces."""
+    """Poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "surfaces") of each by itself."""
     if not len(a.rooms) or not len(b.rooms):
         return []
     if registration_order(b) < registration_order(a):  # as registration: nothing may depend on which comes first
         return [h.inverse() for h in _room_hypotheses(b, a, settings, clock)]
     describe = _timed(settings.embedder, clock)
     with clock("match"):
-        if settings.poses == "rooms":
+        if settings.poses == "surfaces":
             return _surface_hypotheses(a, b, match(a, b, describe, "growing"))
         return [h.transform for h in match(a, b, describe, scale_free=settings.scale == "free").alternatives]
 

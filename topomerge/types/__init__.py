@@ -8,6 +8,7 @@ from topomerge.types.arrays import Array
 from topomerge.types.cloud import PointCloud, TrueRoom
 from topomerge.types.grid import VoxelGrid
 from topomerge.types.similarity import Sim3
+from topomerge.types.some_rooms import confident, of_rooms
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
     EDGE_DTYPE,
@@ -35,6 +36,8 @@ __all__ = [
     "TopometricMap",
     "TrueRoom",
     "VoxelGrid",
+    "confident",
     "mostly_unseen",
+    "of_rooms",
     "with_outline_odds",
 ]

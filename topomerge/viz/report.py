@@ -173,7 +173,7 @@ def plan_view(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], col
         boxes.append(element("label", box, f" {name}"))
     if len(map.rooms):
         slider = element("input", type="range", min=0, max=90, step=10, value=0, data_sure="")
-        boxes.append(element("label", "minimum confidence of listed rooms: ", slider))
+        boxes.append(element("label", "minimum confidence: ", slider))
     groups = [("choices", choices), ("layers", boxes), ("zoom", zoom_buttons())]
     bar = element("div", *(element("div", *parts, class_=name) for name, parts in groups if parts), class_="controls")
     figures = [

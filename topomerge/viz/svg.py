@@ -19,6 +19,7 @@ from topomerge.viz.outline import room_outlines, seen_outline, wall_outline
 from topomerge.viz.plan import Place, StoreyPlan, places
 from topomerge.viz.scene import hex_colour
 from topomerge.viz.sheet import Sheet
+from topomerge.viz.sureness import edge_sureness, room_sureness, window_sureness
 
 SCREEN = (840, 560)  # pixels that the drawing is expected to have: the page's script knows better
 PLAN_MARGIN = 0.04  # of the longer side, around the building
@@ -34,7 +35,8 @@ def plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], col
         colours: (R, 3) uint8 of the rooms; neighbours differ if None.
 
     Returns:
-        `<svg class="plan" data-storey=…>` elements. Rooms, their labels and their nodes in the graph carry `data-room`.
+        `<svg class="plan" data-storey=…>` elements. Rooms, their labels and their nodes in the graph carry `data-room`, and all
+        that is not certain `data-sure`.
     """
     colours = room_colours(map) if colours is None else colours
     named = [places(plan, sheet.frame) for plan in plans]
@@ -112,10 +114,11 @@ def _room(map: TopometricMap, sheet: Sheet, room: int, path: str, colour: str) -
     about = map.rooms[room]
     kind = "room glimpsed" if about["glimpsed"] else "room"
     words = f"Room {room}, {about['area']:.1f} m²"
-    shape = element("path", class_=kind, d=path, fill=colour, fill_rule="evenodd", data_room=sheet.id(room), aria_label=words)
+    drawn = {"d": path, "fill_rule": "evenodd", "data_sure": room_sureness(about)}
+    shape = element("path", class_=kind, **drawn, fill=colour, data_room=sheet.id(room), aria_label=words)
     if not about["glimpsed"]:
         return shape
-    return Markup(shape + element("path", class_="over", d=path, fill_rule="evenodd"))
+    return Markup(shape + element("path", class_="over", **drawn))
 
 
 def _label(map: TopometricMap, sheet: Sheet, room: int, place: Place) -> Markup:
@@ -124,7 +127,8 @@ def _label(map: TopometricMap, sheet: Sheet, room: int, place: Place) -> Markup:
     number = element("text", str(room), class_="number")
     area = element("text", f"{map.rooms['area'][room]:.1f} m²", class_="size")
     clear = round(100 * place.clear)
-    return element("g", number, area, class_="label", transform=f"translate({x} {y})", data_room=sheet.id(room), data_clear=clear)
+    about = {"data_room": sheet.id(room), "data_clear": clear, "data_sure": room_sureness(map.rooms[room])}
+    return element("g", number, area, class_="label", transform=f"translate({x} {y})", **about)
 
 
 def _ends(edge: Any) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -152,8 +156,12 @@ def _doors(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
             continue
         state = f"door {edge['kind']} {'open' if edge['open'] else 'shut'}"
         lines = [_line(sheet, *_ends(edge), class_=name) for name in ("gap", "leaf")]
-        parts.append(element("g", *lines, class_=state, data_edge=f"{sheet.key}{i}"))
+        parts.append(element("g", *lines, class_=state, **_edge_data(map, sheet, i)))
     return parts
+
+
+def _edge_data(map: TopometricMap, sheet: Sheet, i: int) -> dict[str, str]:
+    return {"data_edge": f"{sheet.key}{i}", "data_sure": edge_sureness(map, map.edges[i])}
 
 
 def _stairs(map: TopometricMap, sheet: Sheet, storey: int, i: int, labelled: set[int]) -> Markup:
@@ -173,7 +181,7 @@ def _stairs(map: TopometricMap, sheet: Sheet, storey: int, i: int, labelled: set
         words.append(element("text", f"{'up ' if level > storey else 'down ' if level < storey else ''}to {other}"))
     x, y = sheet.at(spot)
     place = element("g", *words, class_="to", transform=f"translate({x} {y})")
-    return element("g", *parts, place, class_=f"door {edge['kind']}", data_edge=f"{sheet.key}{i}")
+    return element("g", *parts, place, class_=f"door {edge['kind']}", **_edge_data(map, sheet, i))
 
 
 def _flight(lower: tuple[int, int], upper: tuple[int, int], width: float, treads: bool) -> list[Markup]:
@@ -201,11 +209,12 @@ def _graph(map: TopometricMap, sheet: Sheet, storey: int, named: dict[int, Place
         spots = [sheet.at((named[room].x, named[room].y)) for room in rooms]
         spots.insert(1, sheet.at(edge["centre"]))
         path = "M" + "L".join(f"{x} {y}" for x, y in spots)
-        parts.append(element("path", class_=f"link {edge['kind']}", d=path))
+        parts.append(element("path", class_=f"link {edge['kind']}", d=path, data_sure=edge_sureness(map, edge)))
     for room, place in sorted(named.items()):
         if map.rooms["storey"][room] == storey:
             x, y = sheet.at((place.x, place.y))
-            parts.append(element("circle", class_="node", cx=x, cy=y, data_room=sheet.id(room)))
+            about = {"data_room": sheet.id(room), "data_sure": room_sureness(map.rooms[room])}
+            parts.append(element("circle", class_="node", cx=x, cy=y, **about))
     return parts
 
 
@@ -213,12 +222,16 @@ def _narrows(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
     """Where rooms narrow: thin dashed lines between their areas."""
     if not len(map.narrows):
         return []
-    on_storey = map.rooms["storey"][map.areas["room"][map.narrows["rooms"][:, 0]]] == storey
-    return [_line(sheet, *_ends(edge), class_="narrow") for edge in map.narrows[on_storey]]
+    rooms = map.rooms[map.areas["room"][map.narrows["rooms"][:, 0]]]
+    shown = [(edge, room) for edge, room in zip(map.narrows, rooms, strict=True) if room["storey"] == storey]
+    return [_line(sheet, *_ends(edge), class_="narrow", data_sure=room_sureness(room)) for edge, room in shown]
 
 
 def _windows(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
     """Thin double lines in a gap of the wall, as in floor plans."""
     on_storey = map.rooms["storey"][map.windows["rooms"][:, 0]] == storey
-    lines = [[_line(sheet, *_ends(w), class_=name) for name in ("gap", "frame", "pane")] for w in map.windows[on_storey]]
-    return [element("g", *parts, class_="window") for parts in lines]
+    parts = []
+    for window in map.windows[on_storey]:
+        lines = [_line(sheet, *_ends(window), class_=name) for name in ("gap", "frame", "pane")]
+        parts.append(element("g", *lines, class_="window", data_sure=window_sureness(map, window)))
+    return parts

@@ -13,6 +13,7 @@ from topomerge.io.palette import room_colours
 from topomerge.types import TopometricMap
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.scene import hex_colour
+from topomerge.viz.sureness import edge_sureness, room_sureness
 
 ROOM_WORDS = {  # of `room_words`, and why
     "outside": "probably outdoors",
@@ -55,7 +56,7 @@ def share_bar(share: float) -> Markup:
 
 
 def rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | None = None) -> Markup:
-    """All rooms, or some of them; rows carry `data-room` and `data-storey`."""
+    """All rooms, or some of them; rows carry `data-room`, `data-storey` and `data-sure`."""
     names = ("room", "storey", "area m²", "height m", "seen", "entered", "confidence", "doors")
     columns = [*((name, "number") for name in names), ("leads to", "text")]
     several_storeys = len(map.storeys) > 1
@@ -81,7 +82,7 @@ def rooms_table(map: TopometricMap, key: str = "", only: Iterable[int] | None = 
             cell(str(doors[i]), int(doors[i])),
             cell(leads, kind="text"),
         ]
-        place = {"data_room": f"{key}{i}", "data_storey": int(room["storey"]), "data_sure": f"{room['confidence']:.3f}"}
+        place = {"data_room": f"{key}{i}", "data_storey": int(room["storey"]), "data_sure": room_sureness(room)}
         rows.append(element("tr", *cells, **place, tabindex=0))
     return table(columns, rows, "Rooms")
 
@@ -95,7 +96,7 @@ def _neighbours(map: TopometricMap) -> list[list[int]]:
 
 
 def doors_table(map: TopometricMap, key: str = "") -> Markup:
-    """All doors, openings, stairs and ramps; rows carry `data-edge`."""
+    """All doors, openings, stairs and ramps; rows carry `data-edge` and `data-sure`."""
     words, numbers = ("kind", "between", "storey", "state"), ("width m", "height m", "confidence", "x m", "y m")
     columns = [("no.", "number"), *((name, "text") for name in words), *((name, "number") for name in numbers)]
     rows = []
@@ -115,7 +116,8 @@ def doors_table(map: TopometricMap, key: str = "") -> Markup:
             measure(edge["centre"][0], 2),
             measure(edge["centre"][1], 2),
         ]
-        rows.append(element("tr", *cells, data_edge=f"{key}{i}", data_storey=" ".join(texts(storeys)), tabindex=0))
+        place = {"data_edge": f"{key}{i}", "data_storey": " ".join(texts(storeys)), "data_sure": edge_sureness(map, edge)}
+        rows.append(element("tr", *cells, **place, tabindex=0))
     return table(columns, rows, "Doors, openings and stairs")
 
 

@@ -122,3 +122,9 @@ def test_plans_with_equal_rooms_are_never_apart(source: str, data_dir: Path) -> 
     plans = {name: plan for name, plan in iter_plans(folder) if isinstance(plan, Plan)}
     for group in splits.relatives(source, plans):
         assert len({splits.split_of(source, name) for name in group}) == 1, group
+
+
+def test_homes_that_extraction_was_chosen_by_are_no_test() -> None:
+    dealt = splits.deal("home", [[f"home {k}"] for k in range(20)])
+    assert not dealt["test"] and len(dealt["validation"]) >= 4 and len(dealt["train"]) + len(dealt["validation"]) == 20
+    assert splits.members("train", "home") and not splits.members("test", "home")

@@ -9,8 +9,8 @@ import pytest
 import torch
 from topomerge.models.colour_network import ColourNetwork, exported_colours
 
-from tests.extraction.elevations.doors import SHUT_DOOR
-from tests.scenes import DOOR, THICK, Scene
+from tests.extraction.elevations.doors import SHUT_DOOR, flush_door
+from tests.scenes import DOOR
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.colour_network import INPUTS, colour_inputs, read_network, with_colours
 from topomerge.extraction.elevations.doorways import SHUT, coloured_both_ways, coloured_classes, place_classes
@@ -121,14 +121,6 @@ def test_a_damaged_network_is_refused(tmp_path):
         read_network(tmp_path / "colour_network.npz")
 
 
-def flush_door() -> np.ndarray:
-    """Two rooms; in the wall between them an open door, and a shut one that is as thick as the wall."""
-    scene = Scene().shell(0, 0, 7, 5).wall((4, 0), (4, 5), doors=(SHUT_DOOR, 4.0))
-    half = DOOR[0] / 2 - 0.005
-    scene.box(4 - THICK / 2, SHUT_DOOR - half, 0.005, 4 + THICK / 2, SHUT_DOOR + half, DOOR[1] - 0.005)
-    return scene.points()
-
-
 def painted_door(points: np.ndarray, top: float = DOOR[1], low: float = 0.0) -> np.ndarray:
     on = (np.abs(points[:, 0] - 4) < 0.1) & (np.abs(points[:, 1] - SHUT_DOOR) < DOOR[0] / 2)
     rng = np.random.default_rng(0)
@@ -165,3 +157,21 @@ def test_intensities_speak_for_a_flush_door_whatever_they_are_counted_in():
 def test_what_hangs_on_a_wall_is_no_door():
     points = flush_door()
     assert not len(shut_doors(PointCloud(points, colors=painted_door(points, top=1.9, low=1.1))))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("lacking", [slice(None), slice(0, 1)], ids=["all", "one of three"])
+def test_colours_that_are_no_numbers_say_nothing(lacking: slice):
+    points = flush_door()
+    colours = painted_door(points).astype(np.float32)
+    colours[:, lacking] = np.nan
+    assert np.array_equal(extract(PointCloud(points, colors=colours)).edges, extract(PointCloud(points)).edges)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_door_shows_by_the_colours_that_are_numbers():
+    points = flush_door()
+    colours = painted_door(points).astype(np.float32)
+    colours[::3] = np.nan
+    (door,) = shut_doors(PointCloud(points, colors=colours))
+    assert door["centre"][:2] == pytest.approx([4, SHUT_DOOR], abs=0.1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.extraction.elevations.doors import SHUT_DOOR, extracted, niche, three_doors, wide_opening
+from tests.extraction.elevations.doors import SHUT_DOOR, cupboard_and_board, extracted, three_doors, wide_opening
 from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
 from topomerge.errors import InputError
@@ -197,5 +197,5 @@ def test_without_a_look_at_walls_the_shut_door_is_none():
 
 
 def test_a_cupboard_and_a_board_are_no_doors():
-    map = extracted(niche(two_rooms()).points(0.003))
+    map = extracted(cupboard_and_board(two_rooms()).points(0.003))
     assert len(map.edges) == 1 and map.edges["open"].all()

@@ -121,4 +121,4 @@ def test_geojson_and_a_building_model_hold_them(map, tmp_path: Path):
 
 def test_the_plan_draws_them(map):
     page = report_html(map)
-    assert page.count('<g class="window">') == 3 and "sign-window" in page
+    assert page.count('<g class="window" data-sure') == 3 and "sign-window" in page

@@ -59,20 +59,22 @@ def test_no_matches_give_no_pose(flats):
 
 
 @pytest.mark.longer
-def test_merge_by_rooms_alone(flats):
-    result = tm.merge(flats, poses="rooms")
+@pytest.mark.parametrize("poses", ["rooms", "surfaces"])
+def test_merge_by_rooms_alone(flats, poses):
+    result = tm.merge(flats, poses=poses)
     metres, degrees = off(result.registration.transform, MOVE.inverse(), tuple(MOVE.apply(np.array([[6.0, 4.0, 1.0]]))[0]))
     assert metres < 0.1 and degrees < 0.5
-    back = tm.merge(flats[::-1], poses="rooms")
+    back = tm.merge(flats[::-1], poses=poses)
     assert np.allclose((result.registration.transform @ back.registration.transform).matrix, np.eye(4), atol=1e-6)
 
 
 def test_merge_by_rooms_is_for_two_maps_of_one_scale(flats):
-    with pytest.raises(InputError, match="two maps of one scale"):
-        tm.merge(flats, poses="rooms", scale="free")
-    with pytest.raises(InputError, match="two maps of one scale"):
-        tm.merge([*flats, flats[0]], poses="rooms")
-    with pytest.raises(InputError, match="search or rooms, not 'thesis'"):
+    for poses in ("rooms", "surfaces"):
+        with pytest.raises(InputError, match="two maps of one scale"):
+            tm.merge(flats, poses=poses, scale="free")
+        with pytest.raises(InputError, match="two maps of one scale"):
+            tm.merge([*flats, flats[0]], poses=poses)
+    with pytest.raises(InputError, match="search, rooms or surfaces, not 'thesis'"):
         tm.merge(flats, poses="thesis")
 
 
@@ -85,4 +87,5 @@ def test_the_same_maps_give_the_same_poses(flats, partners):
 def test_without_open3d_the_message_says_what_to_install(flats, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(InputError, match=r"need Open3D: pip install topomerge\[open3d\]"):
-        tm.merge(flats, poses="rooms")
+        tm.merge(flats, poses="surfaces")
+    assert tm.merge(flats, poses="rooms").registration.transform is not None

@@ -38,7 +38,7 @@ def check_open3d() -> None:
     try:
         import open3d  # noqa: F401
     except ImportError as error:
-        raise InputError("poses of rooms (--poses rooms) need Open3D: pip install topomerge[open3d]") from error
+        raise InputError("poses of surfaces (--poses surfaces) need Open3D: pip install topomerge[open3d]") from error
 
 
 def fpfh(points: Array, normals: Array) -> Features:

@@ -87,13 +87,14 @@ def outputs(map: TopometricMap, name: str, path: Path, folder: bool, **options: 
     return [(path.with_name(path.name + form.suffixes[0]) if folder else path, partial(module.save, map, **given))]
 
 
-def save_export(map: TopometricMap, name: str, path: str | Path, **options: Any) -> list[Path]:
+def save_export(map: TopometricMap, name: str, path: str | Path, min_confidence: float = 0.0, **options: Any) -> list[Path]:
     """Write a map in the format of another tool.
 
     Args:
         map: any map.
         name: graphml, geojson, indoorgml, dsg, ros, rviz, tf2, ply, las or ifc.
         path: the file; for ros the folder, which is made.
+        min_confidence: rooms, doors, stairs and windows that are less likely are left out, 0 to 1; 0: none.
         options: `storey` (geojson, ros) a number; `origin` (geojson) "latitude,longitude" or "latitude,longitude,heading";
             `transforms` (tf2) as `topomerge.io.exports.tf2.frame_poses` gives them.
 
@@ -103,6 +104,8 @@ def save_export(map: TopometricMap, name: str, path: str | Path, **options: Any)
     Raises:
         InputError: an unknown format, a missing package, a wrong option, or the path can't be written.
     """
+    from topomerge.types import confident
+
     if name not in FORMATS:
         raise InputError(f"{name}: is no format that can be written; choose from {', '.join(FORMATS)}")
     if isinstance(options.get("origin"), str):
@@ -110,7 +113,7 @@ def save_export(map: TopometricMap, name: str, path: str | Path, **options: Any)
     unknown = ", ".join(sorted(set(options) - set(FORMATS[name].options)))
     if unknown:
         raise InputError(f"{unknown}: means nothing for {name}")
-    files = outputs(map, name, Path(path), False, **options)
+    files = outputs(confident(map, min_confidence), name, Path(path), False, **options)
     if FORMATS[name].folder:
         Path(path).mkdir(parents=True, exist_ok=True)
     for place, save in files:

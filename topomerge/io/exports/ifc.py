@@ -16,6 +16,7 @@ import shapely
 
 from topomerge.io.atomic import replacing
 from topomerge.io.exports.ifc_model import Model
+from topomerge.io.listing import room_words
 from topomerge.structure.floors import is_flight, room_levels
 from topomerge.structure.plan_structure import plan_structure
 from topomerge.structure.walls import wall_part
@@ -56,8 +57,9 @@ def save(map: TopometricMap, path: Path) -> None:
         if i in openings and (k := int(openings[i]["wall"])) >= 0:
             model.hole(openings[i], structure.walls[k], walls[k], element)
         model.contain(storey, [element])
-        for r in (a, b):
-            model.bound(i, spaces[r], element)
+        model.say_of_edge(i, edge, element)
+        for r, other in ((a, b), (b, a)):
+            model.bound(i, spaces[r], element, spaces[other].PredefinedType)
     for k, pane in enumerate(structure.windows):
         rooms = [r for r in map.windows["rooms"][k].tolist() if r >= 0]
         storey = storeys[int(map.rooms["storey"][rooms[0]])]
@@ -65,8 +67,9 @@ def save(map: TopometricMap, path: Path) -> None:
         if (w := int(pane["wall"])) >= 0:
             model.pane_hole(k, pane, structure.walls[w], walls[w], element)
         model.contain(storey, [element])
-        for r in rooms:
-            model.bound(f"window {k}", spaces[r], element, "INTERNAL" if len(rooms) > 1 else "NOTDEFINED")
+        for n, r in enumerate(rooms):
+            side = spaces[rooms[1 - n]].PredefinedType if len(rooms) > 1 else "NOTDEFINED"
+            model.bound(f"window {k}", spaces[r], element, side)
     with replacing(path) as beside:
         model.file.write(str(beside))
 
@@ -89,7 +92,8 @@ class _Building(Model):
             "ObjectPlacement": self.place(storey.ObjectPlacement, 0, 0, 0),
             "Representation": self.prisms(floor, low, high - low),
         }
-        space = self.root("IfcSpace", f"room {r}", CompositionType="ELEMENT", PredefinedType="INTERNAL", **body)
+        side = "EXTERNAL" if "outside" in room_words(room) else "INTERNAL"
+        space = self.root("IfcSpace", f"room {r}", CompositionType="ELEMENT", PredefinedType=side, **body)
         quantities = [self.new("IfcQuantityArea", Name="GrossFloorArea", AreaValue=float(room["area"]))]
         if seen:
             quantities.append(self.new("IfcQuantityLength", Name="Height", LengthValue=float(room["height"])))
@@ -181,6 +185,12 @@ class _Building(Model):
         body = self._box(width, height or IFC_LINTEL)
         return self.root("IfcDoor", f"door {i}", ObjectPlacement=at, Representation=body, **attributes)
 
+    def say_of_edge(self, i: int, edge: Any, element: Any) -> None:
+        """How likely a door, an opening or a flight is one, and whether one could walk through."""
+        facts = [self._fact("Confidence", "IfcReal", float(edge["confidence"]))]
+        facts.append(self._fact("Open", "IfcBoolean", bool(edge["open"])))
+        self._define(element, self._set("IfcPropertySet", f"Topomerge_{str(edge['kind']).title()}", i, HasProperties=facts))
+
     def _box(self, width: float, height: float) -> Any:
         """What fills an opening, along x from 0."""
         middle = self.new("IfcAxis2Placement2D", Location=self.point(width / 2, 0))
@@ -231,7 +241,7 @@ class _Building(Model):
         return self.new("IfcExtrudedAreaSolid", **swept)
 
     def bound(self, i: int | str, space: Any, element: Any, side: str = "INTERNAL") -> None:
-        """A space is bounded by an element, which leads out of it."""
+        """A space is bounded by an element, which leads out of it, to a space on the other side that is INTERNAL or EXTERNAL."""
         attributes = {"RelatingSpace": space, "RelatedBuildingElement": element, "InternalOrExternalBoundary": side}
         kind = "VIRTUAL" if element.is_a("IfcVirtualElement") else "PHYSICAL"
         self.root("IfcRelSpaceBoundary", f"{i} {space.GlobalId}", PhysicalOrVirtualBoundary=kind, **attributes)

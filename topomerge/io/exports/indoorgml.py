@@ -23,7 +23,7 @@ from topomerge.io.exports.markup import text, write_xml
 from topomerge.structure.floors import inside, is_flight, jambs, room_levels
 from topomerge.structure.plan_structure import PlanStructure, plan_structure
 from topomerge.structure.walls import wall_part
-from topomerge.types import Array, TopometricMap
+from topomerge.types import ROOM_ODDS, Array, TopometricMap
 
 CORE, GML = "http://www.opengis.net/indoorgml/1.0/core", "http://www.opengis.net/gml/3.2"
 LINK, SCHEMA = "http://www.w3.org/1999/xlink", "http://www.w3.org/2001/XMLSchema-instance"
@@ -106,7 +106,7 @@ def _cell(member: Any, map: TopometricMap, r: int, floor: shapely.MultiPolygon, 
     room = map.rooms[r]
     cell = _new(member, "CellSpace", f"C{r}")
     facts = {"storey": int(room["storey"]), "area": f"{room['area']:.2f}", "height": f"{room['height']:.2f}"}
-    _head(cell, f"room {r}", **facts)
+    _head(cell, f"room {r}", **facts, **{name: f"{room[name]:.2f}" for name in ROOM_ODDS})
     if not floor.is_empty:
         _solid(cell, f"C{r}", max(floor.geoms, key=lambda part: part.area), *level.tolist())
     _link(cell, "duality", f"S{r}")
@@ -181,7 +181,8 @@ def _polygon(parent: Any, id: str, rings: list[Array]) -> None:
 def _boundary(member: Any, i: int, edge: Any) -> None:
     boundary = _new(member, "CellSpaceBoundary", f"B{i}")
     kind = str(edge["kind"])
-    _head(boundary, f"{kind} {i}", kind=kind, width=f"{edge['width']:.2f}", open=str(bool(edge["open"])).lower())
+    facts = {"kind": kind, "width": f"{edge['width']:.2f}", "open": str(bool(edge["open"])).lower()}
+    _head(boundary, f"{kind} {i}", **facts, confidence=f"{edge['confidence']:.2f}")
     _link(boundary, "duality", f"T{i}")
     a, b = jambs(edge)
     up = np.array([0.0, 0.0, float(edge["height"]) or UNSEEN_LINTEL])
@@ -223,7 +224,7 @@ def _transition(member: Any, i: int, edge: Any, points: list[Array]) -> None:
     flight = [edge["lower"], edge["upper"]] if points[a][2] <= points[b][2] else [edge["upper"], edge["lower"]]
     way = np.array([points[a], *(flight if is_flight(edge) else [edge["centre"]]), points[b]])
     transition = _new(member, "Transition", f"T{i}")
-    _head(transition, f"{edge['kind']} {i}")
+    _head(transition, f"{edge['kind']} {i}", confidence=f"{edge['confidence']:.2f}")
     _new(transition, "weight").text = f"{np.linalg.norm(np.diff(way, axis=0), axis=1).sum():.4f}"
     for r in (a, b):
         _link(transition, "connects", f"S{r}")

@@ -118,17 +118,19 @@ function startPlan(view) {
     for (const button of view.querySelectorAll("button[data-storey]")) {
       button.setAttribute("aria-pressed", String(Number(button.dataset.storey) === storey));
     }
-    filterRows();
+    filterParts();
     redraw();
   }
 
-  function filterRows() {
+  function filterParts() { // rows of rooms of other storeys; rows and parts of the plan that are less sure than asked for
     const all = view.querySelector('input[data-layer="all"]');
     const least = Number(view.querySelector("input[data-sure]")?.value ?? 0) / 100;
-    for (const label of view.querySelectorAll(".label")) {
-      const away = !(all && all.checked) && !figures[shown].contains(label);
-      for (const element of places.get(placeOf(label)) || []) {
-        if (element.matches("tr")) element.classList.toggle("off", away || Number(element.dataset.sure ?? 1) < least);
+    const unsure = (element) => Number(element.dataset.sure ?? 1) < least;
+    for (const part of sheet.querySelectorAll("[data-sure]")) part.classList.toggle("unsure", unsure(part));
+    for (const part of sheet.querySelectorAll(".label, .door")) {
+      const away = part.matches(".label") && !(all && all.checked) && !figures[shown].contains(part);
+      for (const element of places.get(placeOf(part)) || []) {
+        if (element.matches("tr")) element.classList.toggle("off", away || unsure(element));
       }
     }
   }
@@ -157,7 +159,7 @@ function startPlan(view) {
   });
   view.addEventListener("change", (event) => {
     if (event.target.dataset.layer) sheet.classList.toggle("hide-" + event.target.dataset.layer, !event.target.checked);
-    if (event.target.dataset.layer === "all" || event.target.dataset.sure !== undefined) filterRows();
+    if (event.target.dataset.layer === "all" || event.target.dataset.sure !== undefined) filterParts();
   });
   sheet.addEventListener("wheel", (event) => {
     if (!sheet.contains(document.activeElement) && !event.ctrlKey) return; // the page scrolls until one has clicked here
