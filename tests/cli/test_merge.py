@@ -123,7 +123,7 @@ def test_bad_folders(run: Run, folder: Path) -> None:
 
 
 @pytest.mark.longer
-def test_the_report_in_a_browser(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_report_in_a_browser(folder: Path, tmp_path: Path) -> None:
     """The slider fades one map, rooms that are one light up together, and nothing is said on the console."""
     from tests.viz import test_report as report
 
@@ -145,8 +145,7 @@ addEventListener("load", () => setTimeout(() => {
 """
     text = (folder / "merged" / "report.html").read_text(encoding="utf-8")
     page = tmp_path / "report.html"
-    monkeypatch.setattr(report, "PROBE", probe)
-    page.write_text(report.with_probe(text), encoding="utf-8")
+    page.write_text(report.with_probe(text, probe), encoding="utf-8")
     shown, console = report.browse(page, "--dump-dom", "--disable-3d-apis")
     assert console == []
     title = re.search("<title>(.*?)</title>", shown)

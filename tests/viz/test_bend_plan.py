@@ -128,10 +128,9 @@ addEventListener("load", () => setTimeout(() => {
 """
 
 
-def test_the_slider_bends_the_outlines_in_a_browser(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "PROBE", PROBE)
+def test_the_slider_bends_the_outlines_in_a_browser(text: str, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
-    page.write_text(report.with_probe(text), encoding="utf-8")
+    page.write_text(report.with_probe(text, PROBE), encoding="utf-8")
     shown, console = report.browse(page, "--dump-dom", "--disable-3d-apis")
     assert console == []
     title = re.search("<title>(.*?)</title>", shown)
