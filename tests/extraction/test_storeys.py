@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+import topomerge as tm
 from topomerge.extraction.storeys import find_storeys
 from topomerge.types import Array, VoxelGrid
 
@@ -53,3 +57,16 @@ def test_storeys_one_above_the_other() -> None:
     floors = [(floor((0, 100), (0, 80), z), LOW) for z in (2, 32, 62)]
     storeys, _ = storeys_of([*floors, (flight(20, (80, 92), 4, 32), LOW), (flight(20, (80, 92), 34, 62), LOW)])
     assert np.allclose(storeys["floor"], (0.25, 3.25, 6.25), atol=0.02)
+
+
+@pytest.mark.data
+@pytest.mark.longer
+def test_a_real_atrium_has_two_storeys_and_ways_between_them(data_dir: Path) -> None:
+    """Galleries about a hall: it came out with three storeys once."""
+    path = data_dir / "scans_real_3d" / "atrium_two_storeys_2cm.laz"
+    if not path.is_file():
+        pytest.skip(f"TOPOMERGE_DATA has no {path.parent.name}")
+    map = tm.extract(tm.read_points(path))
+    assert len(map.storeys) == 2 and 5.0 < float(np.diff(map.storeys["floor"])[0]) < 6.5
+    between = map.rooms["storey"][map.edges["rooms"]]
+    assert (between[:, 0] != between[:, 1]).sum() >= 2 and set(map.rooms["storey"].tolist()) == {0, 1}
