@@ -162,16 +162,20 @@ def _plan(folder: Path, name: str) -> tuple[str, Any]:
 
 def plan_pair_rows(folder: Path, name: str) -> list[Row]:
     """Two scans of a plan, half of their rooms in common."""
-    source, building = _plan(folder, name)
-    settings = PairSettings(overlap=0.5, sensors=("tls", "depth"), rooms=VISITED_ROOMS["plan"])
-    return [merge_row(_grids(make_pair(building, settings, 1, source=source)), physical_building(source, name))]
+    pair = _plan_pair(folder, name)
+    return [merge_row(_grids(pair), physical_building(pair.source, name))]
 
 
 def plan_ranks(folder: Path, name: str) -> list[Row]:
     """The ranking of rooms between these scans."""
+    pair = _plan_pair(folder, name)
+    return ranks(pair, physical_building(pair.source, name))
+
+
+def _plan_pair(folder: Path, name: str) -> Pair:
     source, building = _plan(folder, name)
     settings = PairSettings(overlap=0.5, sensors=("tls", "depth"), rooms=VISITED_ROOMS["plan"])
-    return ranks(make_pair(building, settings, 1, source=source), physical_building(source, name))
+    return make_pair(building, settings, 1, source=source)
 
 
 def grid_rows(item: GridItem) -> list[Row]:

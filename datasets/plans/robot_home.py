@@ -17,7 +17,8 @@ from topomerge.datasets.plans.sketch import Sketch
 
 from topomerge.errors import InputError
 from topomerge.io.json_map import what_is_in
-from topomerge.io.valetudo import is_robot_map, robot_rooms
+from topomerge.io.valetudo import RobotMap, is_robot_map, robot_rooms
+from topomerge.types import Array
 
 SMALLEST_HOME_ROOM = 0.8  # m2
 HOME_CAVITY = 0.3  # m; narrower strips of a room are left out
@@ -51,9 +52,7 @@ def robot_home(path: Path) -> Sketch:
     if not is_robot_map(about):
         raise InputError("not a robot's map: its class is not ValetudoMap")
     drawn = robot_rooms(path, about)
-    sizes = np.bincount(drawn.rooms.ravel()) * drawn.resolution**2
-    large = np.flatnonzero(sizes >= SMALLEST_HOME_ROOM)
-    labels = flood(np.where(np.isin(drawn.rooms, large[large > 0]), drawn.rooms, 0), drawn.free)
+    labels, _ = spread_rooms(drawn)
     result = Sketch(height=2.8, ceiling=2.5, inset=HOME_INSET)
     names = {k: name for k, name in enumerate(drawn.names, 1) if name}
     index = add_rooms(result, labels, names, drawn.resolution, drawn.origin, SMALLEST_HOME_ROOM, HOME_CAVITY / 2)
@@ -65,6 +64,14 @@ def robot_home(path: Path) -> Sketch:
         add_contacts(result, [c for c in touching if (np.hypot(*(c[2][1] - c[2][0])) > WIDEST_LEAF) == wide], index, kind)
     guess_kinds(result, "")
     return result
+
+
+def spread_rooms(drawn: RobotMap) -> tuple[Array, Array]:
+    """(h, w) the robot's rooms of `SMALLEST_HOME_ROOM` and more, spread over the floor around them, 0: none; and the numbers (k,)
+    of these rooms."""
+    sizes = np.bincount(drawn.rooms.ravel())[1:] * drawn.resolution**2
+    large = 1 + np.flatnonzero(sizes >= SMALLEST_HOME_ROOM)
+    return flood(np.where(np.isin(drawn.rooms, large), drawn.rooms, 0), drawn.free), large
 
 
 def _without_furniture(shape: shapely.Polygon) -> shapely.Polygon:

@@ -9,7 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from topomerge.datasets.plans.raster import NARROW_CONTACT, contacts, flood, outline
+from topomerge.datasets.plans.raster import NARROW_CONTACT, contacts, outline
+from topomerge.datasets.plans.robot_home import spread_rooms
 from topomerge.datasets.simulation.floor_truth import OUTSIDE_ROOMS, TRUTH_CELL, TRUTH_MARGIN, Truth, judged
 
 from topomerge.errors import InputError
@@ -17,7 +18,6 @@ from topomerge.io.json_map import what_is_in
 from topomerge.io.valetudo import is_robot_map, robot_rooms
 from topomerge.types import Array, TrueRoom
 
-SMALLEST_HOME_ROOM = 0.8  # m2
 FEWEST_HOME_ROOMS = 2
 HOME_HEIGHT = 2.5  # m
 INSIDE = 0.01  # m, from a corner of a column into it
@@ -37,13 +37,11 @@ def home_truth(path: Path, points: Array) -> tuple[Truth, tuple[TrueRoom, ...]]:
     if not is_robot_map(about):
         raise InputError(f"{path}: is no map of Valetudo; give one that a robot drew")
     drawn = robot_rooms(path, about)
-    sizes = np.bincount(drawn.rooms.ravel())[1:] * drawn.resolution**2
-    large = 1 + np.flatnonzero(sizes >= SMALLEST_HOME_ROOM)
+    labels, large = spread_rooms(drawn)
     if len(large) < FEWEST_HOME_ROOMS:
         raise InputError(f"{path}: the robot tells {len(large)} rooms apart, so nothing is true about it; take another map")
-    number = np.full(len(sizes) + 1, -1)
+    number = np.full(int(drawn.rooms.max()) + 1, -1)
     number[large] = np.arange(len(large))
-    labels = flood(np.where(np.isin(drawn.rooms, large), drawn.rooms, 0), drawn.free)
     touching = [c for c in contacts(labels, drawn.resolution, drawn.origin) if np.hypot(*(c[2][1] - c[2][0])) >= NARROW_CONTACT]
     doors = [[number[a], number[b], *ends.mean(axis=0), 0.0] for a, b, ends in touching]
     truth = Truth(
