@@ -56,10 +56,8 @@ def as_cells(wall: Array, door: Array) -> Array:
     return np.concatenate([*level, walls, lintels]).astype(np.int64)
 
 
-def measure(rooms: int) -> None:
-    """One size."""
-    import resource
-
+def two_maps(rooms: int) -> tuple[VoxelGrid, VoxelGrid, Array]:
+    """Three quarters of a floor each, of which the second one is turned; and its points (n, 3), m."""
     wall, door = floor_plan(rooms)
     cells = as_cells(wall, door)
     quarter = wall.shape[0] // 4
@@ -67,6 +65,14 @@ def measure(rooms: int) -> None:
     points = TURNED_POSE.apply((cells[cells[:, 0] > quarter] + 0.5) * CELL_EDGE)
     base = np.floor(points.min(axis=0) / CELL_EDGE).astype(np.int64)
     b = VoxelGrid.from_cells(np.unique(np.floor(points / CELL_EDGE).astype(np.int64) - base, axis=0), base * CELL_EDGE, CELL_EDGE)
+    return a, b, points
+
+
+def measure(rooms: int) -> None:
+    """One size."""
+    import resource
+
+    a, b, points = two_maps(rooms)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     began = time.process_time()
     registration = register(a, b)

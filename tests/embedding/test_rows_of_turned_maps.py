@@ -84,3 +84,24 @@ def test_an_oblique_map_stands_as_the_wing_with_more_wall_does(describe: Learned
     assert abs((off + 45) % 90 - 45) < 0.5
     rows = rows_of(describe, oblique)
     assert len(rows) == 6 and np.isfinite(rows).all()
+
+
+def test_rows_at_the_true_scale_are_those_of_the_map_in_metres(describe: Learned, map: TopometricMap) -> None:
+    """A map that was made half as large again, its heights as they were, as a drawing without scale is raised."""
+    larger = flat() * (1.5, 1.5, 1.0)
+    other = extract(larger.astype(np.float32), voxel_size=CELL)
+    away = np.linalg.norm(1.5 * map.rooms["centroid"][:, None, :2] - other.rooms["centroid"][None, :, :2], axis=2)
+    partner = away.argmin(axis=1)
+    assert sorted(partner.tolist()) == list(range(len(map.rooms)))
+    rows = rows_of(describe, map)
+    cosine = {}
+    for scale in (1 / 1.5, 1.0):
+        at_scale = describe.at_scale(other, scale)
+        assert isinstance(at_scale, TurnedRows)
+        cosine[scale] = (rows * at_scale.rows[partner]).sum(axis=2).mean()
+        assert at_scale.places == pytest.approx(scale * np.asarray(describe(other).places))  # type: ignore[union-attr]
+    assert cosine[1 / 1.5] > 0.9 > cosine[1.0] + 0.05
+
+
+def test_at_scale_one_rows_are_as_they_are(describe: Learned, map: TopometricMap) -> None:
+    assert np.array_equal(describe.at_scale(map, 1.0).rows, rows_of(describe, map))  # type: ignore[union-attr]

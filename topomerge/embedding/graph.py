@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from topomerge.embedding.schema import EDGE_KINDS
+from topomerge.embedding.schema import EDGE_KINDS, LENGTH_POWERS, columns_of_power
 from topomerge.errors import InputError
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import Array, TopometricMap, mostly_unseen
@@ -79,6 +79,17 @@ def graph_arrays(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> 
         "pos": np.ascontiguousarray(map.rooms["centroid"]),
         "edge_pos": np.ascontiguousarray(doors["centre"]),
     }
+
+
+def resized(arrays: Mapping[str, Array], scale: float) -> dict[str, Array]:
+    """The arrays of the graph of a map whose unit is so many m long."""
+    out = dict(arrays)
+    for name in LENGTH_POWERS.keys() & out.keys():
+        factor = np.ones(out[name].shape[1])
+        for power in (1, 2, 3):
+            factor[columns_of_power(name, power)] = scale**power
+        out[name] = (out[name] * factor).astype(out[name].dtype)
+    return out | {name: out[name] * scale for name in ("room_points", "pos", "edge_pos")}
 
 
 def _groups(labels: Array, count: int) -> list[Array]:

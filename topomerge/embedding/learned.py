@@ -16,7 +16,7 @@ import numpy as np
 
 from topomerge.embedding.door_layout import door_layout
 from topomerge.embedding.forward import Forward
-from topomerge.embedding.graph import POINTS_PER_ROOM, graph_arrays
+from topomerge.embedding.graph import POINTS_PER_ROOM, graph_arrays, resized
 from topomerge.embedding.network import TABLE_PARTS, Network, tensors
 from topomerge.embedding.point_features import point_features, point_spectra
 from topomerge.embedding.rooms_around import with_rooms_around
@@ -78,6 +78,11 @@ class Learned:
 
     def __call__(self, map: TopometricMap) -> Rows:
         return self.graph(self.arrays(map))[0]
+
+    def at_scale(self, map: TopometricMap, scale: float) -> Rows:
+        """What the embedder gives for a map of unknown scale whose unit is taken for so many m."""
+        arrays = resized(self.arrays(map), scale)
+        return self.graph(arrays if self.network.turns == 1 else arrays | sheet_arrays(map, scale))[0]
 
     def matchability(self, map: TopometricMap) -> Array:
         """(R,) float64: how alike a room of another map must at least be, as a cosine, before it is rather this one than none."""

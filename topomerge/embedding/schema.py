@@ -84,6 +84,7 @@ LENGTH_POWERS = {  # tensor -> column -> power of a length in its unit: how it g
         "area": 2, "height": 1, "volume": 3, "length": 1, "width": 1, "floor_spread": 1, "door_width": 1, "reach": 1,
     },
     "edge_attr": {"width": 1, "height": 1, "distance": 1, "climb": 1, "from_middle": 1, "to_middle": 1},
+    "door_attr": {"distance": 1},
 }  # fmt: skip
 
 

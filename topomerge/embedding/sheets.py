@@ -53,11 +53,15 @@ class Sheet:
     turn: Array
 
 
-def sheet(map: TopometricMap) -> Sheet:
-    """The sheet of a map; the same map gives the same one."""
+def sheet(map: TopometricMap, scale: float = 1.0) -> Sheet:
+    """The sheet of a map; the same map gives the same one.
+
+    Args:
+        scale: m that the unit of a map of unknown scale is taken for; heights stay as they are.
+    """
     storeys: list[Sheet] = []
     for s in range(len(map.storeys)):
-        storeys.append(_storey(map, s, storeys[0].turn[0] if storeys else np.pi / 4))
+        storeys.append(_storey(map, s, storeys[0].turn[0] if storeys else np.pi / 4, scale))
     height = sum(len(s.room) + GAP for s in storeys)
     width = max((s.room.shape[1] for s in storeys), default=0)
     planes, room = np.zeros((height, width, len(SHEET_PLANES)), np.uint8), np.full((height, width), -1, np.int16)
@@ -72,34 +76,36 @@ def sheet(map: TopometricMap) -> Sheet:
     return Sheet(planes, room, anchor, doors, np.array([s.turn[0] for s in storeys]))
 
 
-def sheet_arrays(map: TopometricMap) -> dict[str, Array]:
+def sheet_arrays(map: TopometricMap, scale: float = 1.0) -> dict[str, Array]:
     """The sheet of a map by the names that it has among the tensors of a graph."""
-    drawn = sheet(map)
+    drawn = sheet(map, scale)
     places = {"anchor": drawn.anchor, "door_anchor": drawn.doors, "turn": drawn.turn}
     return {"sheet": drawn.planes, "sheet_room": drawn.room, **places}
 
 
-def _storey(map: TopometricMap, storey: int, near: float) -> Sheet:
+def _storey(map: TopometricMap, storey: int, near: float, scale: float) -> Sheet:
     """One storey by itself, turned by the direction of its walls that is no more than pi/4 from another, rad; anchors of other
     storeys' rooms mean nothing."""
     grid, nav = map.grid, map.navigable
     masks, ceiling = _columns(map, storey)
     turn = wall_direction(_middles(grid.origin, np.argwhere(masks[0]), grid.edge))
     turn = near + (turn - near + np.pi / 4) % (np.pi / 2) - np.pi / 4
-    wall, low, high, explored = (_points(grid.origin, np.argwhere(mask), grid.edge, turn) for mask in masks)
+    origin, edge = scale * grid.origin, scale * grid.edge
+    wall, low, high, explored = (_points(origin, np.argwhere(mask), edge, turn) for mask in masks)
     inside = np.flatnonzero((map.navigable_room >= 0) & (map.rooms["storey"][np.maximum(map.navigable_room, 0)] == storey))
-    ground = _points(nav.origin, nav.cells[inside, :2], nav.edge, turn)
+    ground = _points(scale * nav.origin, nav.cells[inside, :2], scale * nav.edge, turn)
     label = np.repeat(map.navigable_room[inside], len(ground) // max(len(inside), 1))
     raster = _raster(np.concatenate([explored, ground]))
-    shares = [raster.share(points, _spacing(grid.edge)) for points in (wall, low, high, explored)]
+    shares = [raster.share(points, _spacing(edge)) for points in (wall, low, high, explored)]
     columns = np.argwhere(np.isfinite(ceiling))
-    roofs = _points(grid.origin, columns, grid.edge, turn)
+    roofs = _points(origin, columns, edge, turn)
     heights = np.repeat(ceiling[tuple(columns.T)], len(roofs) // max(len(columns), 1))
     ceilings = np.minimum(raster.mean(roofs, heights) / CEILING_UNIT, 255).round()
-    doors = 255 * raster.near(_turned(_doors(map, storey), turn), DOOR_RADIUS)
-    planes = np.stack([shares[0], raster.share(ground, _spacing(nav.edge)), *shares[1:], ceilings, doors], axis=-1)
-    anchor = (_turned(map.rooms["centroid"][:, :2], turn) - raster.corner) / SHEET_PIXEL
-    doors_of = (_turned(_doors_of_rooms(map).reshape(-1, 2), turn).reshape(-1, MOST_DOORS, 2) - raster.corner) / SHEET_PIXEL
+    doors = 255 * raster.near(_turned(scale * _doors(map, storey), turn), DOOR_RADIUS)
+    planes = np.stack([shares[0], raster.share(ground, _spacing(scale * nav.edge)), *shares[1:], ceilings, doors], axis=-1)
+    middles, of_rooms = scale * map.rooms["centroid"], scale * _doors_of_rooms(map).reshape(-1, 2)
+    anchor = (_turned(middles[:, :2], turn) - raster.corner) / SHEET_PIXEL
+    doors_of = (_turned(of_rooms, turn).reshape(-1, MOST_DOORS, 2) - raster.corner) / SHEET_PIXEL
     rooms = raster.label(ground, label, np.column_stack([map.rooms["centroid"], map.rooms["area"]]))
     return Sheet(planes.astype(np.uint8), rooms, anchor.astype(np.float32), doors_of.astype(np.float32), np.array([turn]))
 

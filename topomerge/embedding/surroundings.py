@@ -14,6 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from topomerge.kernels.crops import cut
 from topomerge.types import Array
 
 # Parts of a geometry that read crops, and the names of these among the tensors of a graph.
@@ -34,22 +35,23 @@ CROP_SHAPES = {  # of each room
 TIE = 1e-3  # pixels: what lies on a border falls to the same side wherever a map's origin is
 
 
-def crops(map_sheet: Mapping[str, Array], part: str = CROP_PART) -> Array:
-    """(R, *CROP_SHAPES[part]) uint8: the surroundings of each room; of doors that it does not have, nothing.
+def crops(map_sheet: Mapping[str, Array], part: str = CROP_PART, rooms: Array | None = None) -> Array:
+    """(n, *CROP_SHAPES[part]) uint8: the surroundings of rooms; of doors that one does not have, nothing.
 
     Args:
         map_sheet: what `sheets.sheet_arrays` gave; "door_anchor" is read for crops of doors only.
+        rooms: (n,) numbers of those that are wanted; all if left out.
     """
     anchor = np.asarray(map_sheet["anchor"])
-    number = np.arange(len(anchor))
+    number = np.arange(len(anchor)) if rooms is None else np.asarray(rooms)
     if part == CROP_PART:
-        return _cut(map_sheet, anchor, number, CROP)
+        return _cut(map_sheet, anchor[number], number, CROP)
     if part == WIDE_PART:
-        return _cut(map_sheet, anchor, number, WIDE_CROP, WIDE_STEP)
-    doors = np.asarray(map_sheet["door_anchor"])[:, :DOOR_CROPS]
+        return _cut(map_sheet, anchor[number], number, WIDE_CROP, WIDE_STEP)
+    doors = np.asarray(map_sheet["door_anchor"])[number, :DOOR_CROPS]
     there = np.isfinite(doors).all(axis=2)
-    out = np.zeros((len(anchor), *CROP_SHAPES[DOOR_PART]), np.uint8)
-    out[there] = _cut(map_sheet, doors[there], np.nonzero(there)[0], DOOR_CROP)
+    out = np.zeros((len(number), *CROP_SHAPES[DOOR_PART]), np.uint8)
+    out[there] = _cut(map_sheet, doors[there], number[np.nonzero(there)[0]], DOOR_CROP)
     return out
 
 
@@ -59,29 +61,10 @@ def _cut(map_sheet: Mapping[str, Array], middles: Array, number: Array, side: in
     Args:
         step: pixels of the sheet on a side of each of theirs, which are means.
     """
-    planes, room, reach = map_sheet["sheet"], map_sheet["sheet_room"], side * step
-    middles = np.clip(np.floor(middles + (0.5 + TIE)).astype(int), 0, room.shape)
-    half = reach // 2
-    planes, room = np.pad(planes, ((half, half), (half, half), (0, 0))), np.pad(room, half, constant_values=-1)
-    planes = _means(planes, step)
-    out = np.zeros((len(middles), side, side, len(CROP_PLANES)), np.uint8)
-    for k, (x, y) in enumerate(middles):
-        out[k, ..., :-1] = planes[x : x + reach : step, y : y + reach : step]
-        own = (room[x : x + reach, y : y + reach] == number[k]).astype(np.uint16)
-        parts = [own[i::step, j::step] for i in range(step) for j in range(step)]
-        out[k, ..., -1] = sum(parts[1:], parts[0]) * 255 // step**2
+    planes, room = (np.ascontiguousarray(map_sheet[name]) for name in ("sheet", "sheet_room"))
+    corner = np.clip(np.floor(middles + (0.5 + TIE)).astype(np.int64), 0, room.shape) - side * step // 2
+    out: Array = cut(planes, room, corner, np.asarray(number, np.int64), side, step)
     return out
-
-
-def _means(planes: Array, step: int) -> Array:
-    """(H - step + 1, W - step + 1, n) uint8 means of the squares that begin at each pixel of planes (H, W, n)."""
-    if step == 1:
-        return planes
-    total = planes.astype(np.uint16)
-    for _ in (0, 1):
-        parts = [total[k : len(total) - step + 1 + k] for k in range(step)]
-        total = sum(parts[1:], parts[0]).swapaxes(0, 1)
-    return np.asarray(total // step**2, np.uint8)
 
 
 def quarter_turned_crops(part: str, shown: Array, turns: int) -> Array:

@@ -205,7 +205,7 @@ def _room_hypotheses(a: TopometricMap, b: TopometricMap, settings: _Settings, cl
         return []
     if registration_order(b) < registration_order(a):  # as registration: nothing may depend on which comes first
         return [h.inverse() for h in _room_hypotheses(b, a, settings, clock)]
-    describe = _timed(settings.embedder, clock)
+    describe = _Timed(settings.embedder, clock)
     with clock("match"):
         if settings.poses == "surfaces":
             return _surface_hypotheses(a, b, match(a, b, describe, "growing"))
@@ -223,11 +223,19 @@ def _surface_hypotheses(a: TopometricMap, b: TopometricMap, matching: Matching) 
     return [pose for pose, _ in room_poses(a, b, rooms, weights)]
 
 
-def _timed(embedder: str | Descriptor, clock: _Clock) -> Descriptor:
-    describe = make_embedder(embedder)
+class _Timed:
+    """A descriptor whose seconds are those of embedding."""
 
-    def timed(m: TopometricMap) -> Rows:
-        with clock("embed"):
-            return describe(m)
+    def __init__(self, embedder: str | Descriptor, clock: _Clock) -> None:
+        self.describe, self.clock = make_embedder(embedder), clock
+        if hasattr(self.describe, "at_scale"):
+            self.at_scale = self._at_scale
 
-    return timed
+    def __call__(self, map: TopometricMap) -> Rows:
+        with self.clock("embed"):
+            return self.describe(map)
+
+    def _at_scale(self, map: TopometricMap, scale: float) -> Rows:
+        with self.clock("embed"):
+            rows: Rows = self.describe.at_scale(map, scale)  # type: ignore[attr-defined]
+            return rows

@@ -22,6 +22,7 @@ from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.result import Matching
 from topomerge.matching.room_matcher import RoomOdds, certainty_of_turns, room_odds
 from topomerge.matching.scores import assign_certain
+from topomerge.matching.unknown_scale import odds_at_best_scale
 from topomerge.types import Array, TopometricMap
 
 METHODS = ("consistent", "attention", "growing", "assignment", "thesis")
@@ -87,7 +88,11 @@ def match(
     if method == "assignment":
         pairs = assign(cost, 2 * usual_best(cost) if largest_cost is None else largest_cost)
         return Matching(pairs, similarity[tuple(pairs.T)], statistics=statistics)
-    odds = room_odds(*rows) if method in ("attention", "consistent") and not scale_free else ()
+    odds: tuple[RoomOdds, ...] = ()
+    if method in ("attention", "consistent") and not scale_free:
+        odds = room_odds(*rows)
+    elif method == "consistent" and hasattr(describe, "at_scale"):
+        statistics["scale"], odds = odds_at_best_scale(describe.at_scale, rows[0], b)
     if method == "attention":
         return _by_attention(a, b, odds, statistics)
     if method == "consistent":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ from topomerge.models.losses import Truth
 from topomerge.models.yaw import turn
 from topomerge.training.packed import INDICES, Graph, GraphPair
 from topomerge.training.settings import Augment
-from topomerge.training.turned_views import changed_sheet, mirrored, quarters_between, with_views
+from topomerge.training.turned_views import changed_sheet, mirrored, quarters_between, room_crops, ways_of
 
 METRES_PER_MILLIMETRE = 0.001
 ORIENTED = {*CROP_SHAPES, "edge_way"}  # tensors that depend on how a map is turned
@@ -92,6 +93,11 @@ class ChangedPairs(Dataset[MapPair]):
         generator = torch.Generator().manual_seed(self.seed_of(number))
         return map_pair(self.pairs[number], self.names, self.augment, generator)
 
+    def batch(self, numbers: Sequence[int]) -> MapPair:
+        """Pairs of these numbers as a batch."""
+        batch: MapPair = Batch.from_data_list([self[number] for number in numbers])
+        return batch
+
 
 def make_batch(
     pairs: Sequence[GraphPair], names: Sequence[str], augment: Augment | None = None, generator: torch.Generator | None = None
@@ -112,17 +118,18 @@ def map_pair(
     """A pair as one graph; see `make_batch`. While training, maps whose turn matters stand alike, and b comes once more, turned
     wrongly: none of its rooms there is one of a."""
     graphs, rows = [], []
-    for graph, true in zip(_viewed(pair, names, augment, generator), pair.true, strict=True):
-        tensors = {name: graph[name] for name in {*names, "edge_index"}}
+    views, oriented = _views(pair, names, augment, generator), bool(ORIENTED & set(names))
+    for view, true in zip(views, pair.true, strict=True):
+        tensors = {name: view.graph[name] for name in {*names, "edge_index"} - CROP_SHAPES.keys()}
         present = torch.arange(len(true))
         if augment is not None:
             assert generator is not None
             tensors, present = changed(tensors, len(true), augment, generator)
         elif "room_points" in tensors:
             tensors["room_points"] = tensors["room_points"].float() * METRES_PER_MILLIMETRE
-        graphs.append(tensors)
+        graphs.append(view.placed(tensors | room_crops(view.graph, names, present)) if oriented else tensors)
         rows.append(present)
-    if augment is not None and generator is not None and ORIENTED & set(names):
+    if augment is not None and generator is not None and oriented:
         graphs.append(quarter_turned(graphs[1], int(torch.randint(1, 4, (1,), generator=generator))))
     links = torch.zeros((len(pair.true[0]), len(pair.true[1])), dtype=torch.bool)
     links[pair.matches[:, 0], pair.matches[:, 1]] = True
@@ -154,20 +161,34 @@ def _joined(graphs: Sequence[Graph], rooms: Sequence[int], names: Sequence[str])
     return out
 
 
-def _viewed(
+@dataclass(frozen=True)
+class _View:
+    """A map with ways, whose sheet no crops were cut out of yet, and how it is turned and mirrored."""
+
+    graph: Graph
+    quarters: int = 0
+    mirror: bool = False
+
+    def placed(self, tensors: Graph) -> Graph:
+        """Tensors of this map as it is turned."""
+        turned = quarter_turned(tensors, self.quarters)
+        return mirrored(turned) if self.mirror else turned
+
+
+def _views(
     pair: GraphPair, names: Sequence[str], augment: Augment | None, generator: torch.Generator | None
-) -> tuple[Graph, Graph]:
-    """Both maps with the tensors that depend on how they are turned, if any are read: as they are, or, while training, changed,
-    turned alike, and both turned and mirrored at random."""
+) -> tuple[_View, _View]:
+    """Both maps as they are; while training, those whose turn matters are changed, turned alike, and both turned and mirrored at
+    random."""
     if not ORIENTED & set(names):
-        return pair.a, pair.b
+        return _View(pair.a), _View(pair.b)
     if augment is None or generator is None:
-        return with_views(pair.a, names), with_views(pair.b, names)
-    a, b = (with_views(changed_sheet(graph, augment.shift, generator), names) for graph in (pair.a, pair.b))
+        return _View({**pair.a, **ways_of(pair.a, names)}), _View({**pair.b, **ways_of(pair.b, names)})
+    a, b = (changed_sheet({**graph, **ways_of(graph, names)}, augment, generator) for graph in (pair.a, pair.b))
     more, quarters = torch.randint(0, 4, (2,), generator=generator).tolist()
     true = quarters_between(pair)
-    a, b = quarter_turned(a, more), quarter_turned(b, more + (quarters if true is None else true))
-    return (mirrored(a), mirrored(b)) if torch.rand((), generator=generator) < 0.5 else (a, b)
+    mirror = bool(torch.rand((), generator=generator) < 0.5)
+    return _View(a, more, mirror), _View(b, more + (quarters if true is None else true), mirror)
 
 
 def seen_well(links: Tensor, a: Tensor, b: Tensor) -> list[Tensor]:

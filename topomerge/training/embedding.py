@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch_geometric.loader import DataLoader
 
 from topomerge.checkpoint import load_state
 from topomerge.errors import InputError
@@ -25,7 +24,7 @@ from topomerge.models.weights import read_embedder, save_embedder
 from topomerge.training.batches import ChangedPairs, MapPair
 from topomerge.training.embedding_pictures import show_embedder
 from topomerge.training.log import Log
-from topomerge.training.loop import Loop, Schedule, State, made_beside, mixed, pace
+from topomerge.training.loop import Loop, Schedule, State, made_by_threads, mixed, pace
 from topomerge.training.packed import EXTRAS, GraphPair, load_pairs
 from topomerge.training.run_folder import export_files, write_settings
 from topomerge.training.settings import Augment, Training, check, to_dict
@@ -87,7 +86,7 @@ class EmbeddingJob:
         self.augment: Augment | None = None if settings.overfit else settings.augment
 
     def batches(self, state: State) -> Generator[MapPair, None, None]:
-        """Those of the state's epoch from its step on, each made while the one before it is worked on."""
+        """Those of the state's epoch from its step on, made by threads while the ones before are worked on."""
         self.objective.train()
         settings = self.settings
         shuffle = torch.Generator().manual_seed(mixed(settings.seed, state.epoch))
@@ -97,7 +96,7 @@ class EmbeddingJob:
         rank, world, size = self.fabric.global_rank, self.fabric.world_size, settings.batch
         steps = [order[k * size * world :][: size * world][rank::world] for k in range(state.step, self.steps)]
         pairs = ChangedPairs(self.train, self.network.tensors, self.augment, lambda pair: mixed(settings.seed, state.epoch, pair))
-        yield from made_beside(iter(DataLoader(pairs, batch_sampler=steps, generator=shuffle)))
+        yield from made_by_threads(pairs.batch, steps, settings.threads)
 
     def step(self, batch: MapPair, state: State) -> dict[str, float]:
         """One step of the optimizer; the losses."""

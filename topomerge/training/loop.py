@@ -12,8 +12,9 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +28,7 @@ from topomerge.training.log import Clock, Log
 
 Say = Callable[[str], None]
 T = TypeVar("T")
+K = TypeVar("K")
 
 
 @dataclass
@@ -212,6 +214,18 @@ def made_beside(batches: Iterator[T]) -> Generator[T, None, None]:
         while (batch := coming.result()) is not None:
             coming = beside.submit(next, batches, None)
             yield batch
+
+
+def made_by_threads(make: Callable[[K], T], keys: Iterable[K], threads: int) -> Generator[T, None, None]:
+    """What is made of each key, in their order; so many threads are one piece each ahead of what is worked on."""
+    with ThreadPoolExecutor(threads) as pool:
+        coming: deque[Future[T]] = deque()
+        for key in keys:
+            coming.append(pool.submit(make, key))
+            if len(coming) > threads:
+                yield coming.popleft().result()
+        while coming:
+            yield coming.popleft().result()
 
 
 def pace(done: float, warmup: float) -> float:

@@ -101,7 +101,7 @@ def view(graph: Graph, network: Embedder, number: int, seed: int) -> View:
     """A map as it is (0), or changed; mirrored where the number is odd."""
     generator, augment = torch.Generator().manual_seed(seed), Augment()
     places = along_walls({name: graph[name].numpy() for name in ("pos", "turn")})
-    seen = with_views(changed_sheet(graph, augment.shift, generator) if number else graph, network.tensors)
+    seen = with_views(changed_sheet(graph, augment, generator) if number else graph, network.tensors)
     if number % 2:
         seen, places = mirrored(seen), places * MIRROR
     tensors, present = {name: seen[name] for name in {*network.tensors, "edge_index"}}, torch.arange(len(places))

@@ -29,6 +29,10 @@ class Augment:
         points: of each room that are taken; 0: all.
         noise: m, standard deviation of points.
         shift: pixels, standard deviation of the middles of rooms on their storeys.
+        walks: share of maps of which only what another walk would have seen is left (`other_sensors.looked_at`).
+        slices: share of those that look like slices; rough: of those whose walls have gaps or are thicker.
+        tilt: degrees, standard deviation of how far the direction of walls is taken wrong; of some maps four times as much.
+        zoom: of a storey's size, likewise, as a logarithm; bend: pixels, of how far places 8 m apart drift.
     """
 
     rooms: float = 0.15
@@ -38,6 +42,12 @@ class Augment:
     points: int = 256
     noise: float = 0.02
     shift: float = 2.0
+    walks: float = 0.25
+    slices: float = 0.15
+    rough: float = 0.3
+    tilt: float = 1.5
+    zoom: float = 0.02
+    bend: float = 0.5
 
 
 @dataclass
@@ -54,6 +64,7 @@ class Training:
     geometry_from: run whose geometry encoder is the start; freeze: `geometry` keeps it as it is.
     overfit: train on one batch, without augmentation, and validate on it.
     resume: go on where the run of this name stopped.
+    threads: that make batches, of each process; beside an accelerator as many as there are cores.
     watch: what is best: a score of validation.
     export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
     """
@@ -76,6 +87,7 @@ class Training:
     watch: str = "recall@1"
     accelerator: str = "cpu"
     devices: int = 1
+    threads: int = 1
     precision: str = "32-true"
     geometry_from: str = ""
     freeze: str = ""
@@ -103,13 +115,14 @@ def check(settings: Training) -> None:
         raise InputError(f"task must be embedding, not {settings.task!r}: the other tasks need Hydra, python train.py task=...")
     check_network(settings.network)
     check_loss(settings.loss)
-    for key, least in (("epochs", 1), ("batch", 1), ("devices", 1), ("limit", 0), ("patience", 0), ("seed", 0)):
+    for key, least in (("epochs", 1), ("batch", 1), ("devices", 1), ("threads", 1), ("limit", 0), ("patience", 0), ("seed", 0)):
         if getattr(settings, key) < least:
             raise InputError(f"{key} must be {least} or more, not {getattr(settings, key)}")
     for key in ("rate", "clip"):
         if not getattr(settings, key) > 0:
             raise InputError(f"{key} must be above 0, not {getattr(settings, key)}")
     shares = {"warmup": settings.warmup, "augment.rooms": settings.augment.rooms, "augment.edges": settings.augment.edges}
+    shares |= {f"augment.{name}": getattr(settings.augment, name) for name in ("walks", "slices", "rough")}
     for key, value in shares.items():
         if not 0 <= value < 1:
             raise InputError(f"{key} must be 0 or more and below 1, not {value}")
