@@ -4,11 +4,15 @@
 ``cache/evaluation/heldout.jsonl``, which ``python -m topomerge.datasets.pairs.build data=heldout cache=cache/evaluation`` makes)
 the first map of each pair stands in the atlas, and the second map of each pair that has a room in common is looked for: compared
 with all maps, and with those on a shortlist. Below the table: how many of these pairs an atlas of more maps would register.
+
+``--real CACHE``: real maps are looked for among those of the set and all other real ones (``data=real`` of `evaluate.py`, whose
+cache it shares; TOPOMERGE_DATA names the data).
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -17,9 +21,12 @@ from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.core.physical import physical_building
-from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_set
+from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair, load_set
+from topomerge.datasets.real.maps import real_evaluation_pairs
+from topomerge.datasets.real.sources import REAL_SOURCES
 
 from topomerge.embedding.embedders import embedder
+from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.turns import Rows
 from topomerge.evaluation.tables import write_section
 from topomerge.fusion.atlas.find import SHORTLIST, ranked, shortlist
@@ -55,16 +62,19 @@ def building(pair: EvaluationPair) -> str:
     return physical_building(str(pair.about["source"]), str(pair.about["building"]))
 
 
-def searches(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]], compared: int) -> list[Search]:
+def searches(
+    pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]], compared: int, first: int | None = None
+) -> list[Search]:
     """Look for the second map of each pair that has a room in common among the first maps of all pairs.
 
     Args:
         compared: maps that are compared room by room; with fewer than all by a shortlist.
+        first: pairs of which one is looked for; all if left out.
     """
     of, atlas = [building(pair) for pair in pairs], [a for a, _ in rows]
     places, owner = np.concatenate([vectors(a) for a in atlas]), owners([len(a) for a in atlas])
     out = []
-    for k, pair in enumerate(pairs):
+    for k, pair in enumerate(pairs[:first]):
         if not len(pair.matches):
             continue
         began = time.process_time()
@@ -81,6 +91,17 @@ def searches(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]],
         right = [(best.get(j), j) in true for j in with_partner]
         out.append(Search(of[k], rank, sightings[0].name, float(np.mean(right)), seconds))
     return out
+
+
+def real_searches(
+    pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]], real: Sequence[EvaluationPair], describe: Descriptor
+) -> tuple[list[Search], str]:
+    """Look for the second map of each real pair among the first maps of all pairs; and which ones are not first, in words."""
+    ours = [(describe(a), describe(b)) for a, b in (pair.maps() for pair in real)]
+    those = searches([*real, *pairs], [*ours, *rows], len(real) + len(pairs), len(real))
+    named = [pair for pair in real if len(pair.matches)]
+    late = [f"{pair.about['title']} {s.rank}" for pair, s in zip(named, those, strict=True) if s.rank > 1]
+    return those, f"Not first: {', '.join(late) or 'none'}."
 
 
 def partners_named(pairs: Sequence[tuple[Rows, Rows]]) -> float:
@@ -120,12 +141,23 @@ def table(results: Sequence[tuple[str, Sequence[Search]]], maps: int, buildings:
     return "\n".join([*lines, f"| by chance | {' | '.join(f'{c:.2f}' for c in chance)} | | | |"])
 
 
+def real_pairs(cache: Path) -> list[EvaluationPair]:
+    """All real pairs, extracted where they are missing."""
+    files = real_evaluation_pairs(os.environ.get("TOPOMERGE_DATA", ""), cache, REAL_SOURCES)
+    return [load_evaluation_pair(file) for file in files]
+
+
+def _rooms(pairs: Sequence[EvaluationPair]) -> int:
+    return sum(len(pair.maps()[0].rooms) for pair in pairs)
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Measure, print, and write where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.retrieval", description=__doc__)
     parser.add_argument("manifest", nargs="?", type=Path, default=HELDOUT)
     parser.add_argument("--descriptor", default="learned", help="as of topomerge match")
-    parser.add_argument("--write", type=Path, help="file whose section between the marks `retrieval` is replaced")
+    parser.add_argument("--real", type=Path, metavar="CACHE", help="look for real maps, whose pairs are in this cache")
+    parser.add_argument("--write", type=Path, help="file whose section between the marks `retrieval` (`retrieval-real`) is replaced")
     args = parser.parse_args(words)
     pairs = load_set(args.manifest)
     describe = embedder(args.descriptor)
@@ -133,15 +165,22 @@ def main(words: Sequence[str] | None = None) -> int:
     for pair in pairs:
         a, b = pair.maps()
         rows.append((describe(a), describe(b)))
-    results = [(args.descriptor, searches(pairs, rows, len(pairs)))]
-    if len(pairs) > SHORTLIST:
-        results.append((f"{args.descriptor}, shortlist of {SHORTLIST}", searches(pairs, rows, SHORTLIST)))
-    text = table(results, len(pairs), len({building(pair) for pair in pairs}), sum(len(a) for a, _ in rows))
-    text += f"\n\n{partners_text(pairs, rows)}"
+    if args.real:
+        real = real_pairs(args.real)
+        results, said = real_searches(pairs, rows, real, describe)
+        atlas = [*real, *pairs]
+        text = table([(args.descriptor, results)], len(atlas), len({building(pair) for pair in atlas}), _rooms(atlas))
+        text += f"\n\n{said}"
+    else:
+        compared = [(args.descriptor, searches(pairs, rows, len(pairs)))]
+        if len(pairs) > SHORTLIST:
+            compared.append((f"{args.descriptor}, shortlist of {SHORTLIST}", searches(pairs, rows, SHORTLIST)))
+        text = table(compared, len(pairs), len({building(pair) for pair in pairs}), _rooms(pairs))
+        text += f"\n\n{partners_text(pairs, rows)}"
     command = " ".join(["python -m benchmarks.retrieval", *(sys.argv[1:] if words is None else words)])
     print(text)
     if args.write:
-        write_section(args.write, "retrieval", f"`{command}`\n\n{text}")
+        write_section(args.write, "retrieval-real" if args.real else "retrieval", f"`{command}`\n\n{text}")
     return 0
 
 

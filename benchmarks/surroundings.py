@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.surroundings [MANIFEST] [--limit N] [--write docs/results/learning.md]``: of a cached set of evaluation
 pairs (by default ``cache/evaluation/heldout.jsonl``, as of `retrieval.py`) those with rooms in common and of known scale. Is a
-room's true partner the nearest? Beside it: for how many pairs the quarter turn between the maps is the true one.
+room's true partner the nearest? Beside it: for how many pairs the quarter turn between the maps is the true one. ``--real CACHE``:
+of real pairs (as of `retrieval.py`), by site.
 
 Wrong axes: the embedder that ships; sheet and crops of the second map are drawn in a direction that is off from its walls.
 Untrained: rooms are compared by the correlation of their main crops, pixel by pixel, at the quarter turn of the second map at
@@ -21,7 +22,7 @@ from unittest.mock import patch
 import numpy as np
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_set
 
-from benchmarks.retrieval import HELDOUT, building
+from benchmarks.retrieval import HELDOUT, building, real_pairs
 from topomerge.embedding import sheets
 from topomerge.embedding.learned import Learned, load_embedder
 from topomerge.embedding.surroundings import CROP_PART, CROP_PLANES, crops, quarter_turned_crops
@@ -124,6 +125,20 @@ def table(title: str, named: Sequence[tuple[str, Sequence[Row]]]) -> str:
     return "\n".join(lines)
 
 
+def site_table(rows: Sequence[Row]) -> str:
+    """Recall of each way by site, as Markdown."""
+    ways = (UNTRAINED, LEARNED, BOTH_SEEN)
+    lines = ["| site | pairs | rooms, both directions | " + " | ".join(f"{way}: recall@1 | recall@5" for way in ways) + " |"]
+    lines.append("|" + "---|" * 9)
+    rows = [row for row in rows if row["degrees"] == 0]
+    for site in [*sorted({row["building"] for row in rows}), "all"]:
+        of = [row for row in rows if site in (row["building"], "all")]
+        each = [[row for row in of if row["way"] == way] for way in ways]
+        cells = [cell(value(some, f"recall@{n}"), site == "all") for some in each for n in (1, 5)]
+        lines.append(f"| {site} | {len(each[0])} | {sum(row['queries'] for row in each[0])} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def sections(rows: Sequence[Row]) -> dict[str, str]:
     """Tables by the marks of the sections that they are written to."""
     learned = {d: [row for row in rows if row["way"] == LEARNED and row["degrees"] == d] for d in WRONG_BY}
@@ -138,12 +153,14 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.surroundings", description=__doc__)
     parser.add_argument("manifest", nargs="?", type=Path, default=HELDOUT)
     parser.add_argument("--limit", type=int, help="pairs that are measured, the first ones; all if left out")
-    parser.add_argument("--write", type=Path, help="file whose sections between the marks `axes` and `untrained` are replaced")
+    parser.add_argument("--real", type=Path, metavar="CACHE", help="real pairs, which are in this cache, by site")
+    parser.add_argument("--write", type=Path, help="file whose sections `axes` and `untrained`, or `sites`, are replaced")
     args = parser.parse_args(words)
     describe = load_embedder()
-    rows = [row for pair in usable(load_set(args.manifest))[: args.limit] for row in ranks(pair, describe)]
+    pairs = usable(real_pairs(args.real) if args.real else load_set(args.manifest))[: args.limit]
+    rows = [row for pair in pairs for row in ranks(pair, describe)]
     command = " ".join(["python -m benchmarks.surroundings", *(sys.argv[1:] if words is None else words)])
-    for mark, text in sections(rows).items():
+    for mark, text in ({"sites": site_table(rows)} if args.real else sections(rows)).items():
         print(f"{sizes(rows)}\n\n{text}\n")
         if args.write:
             write_section(args.write, mark, f"`{command}`\n\n{sizes(rows)}\n\n{text}")

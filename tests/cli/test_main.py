@@ -152,11 +152,11 @@ def test_a_second_scan_is_for_merge(run: Run) -> None:
     ("words", "message"),
     [
         ("merge a.tmap b.tmap -o m --descriptor nowhere", "--descriptor: unknown descriptor 'nowhere'"),
-        ("merge a.tmap b.tmap -o m --poses surfaces --scale free", "--poses: poses of rooms alone are for two maps of one scale"),
+        ("merge a.tmap b.tmap -o m --poses surfaces --scale free", "--poses: poses of surfaces are for two maps of one scale"),
         ("merge a.tmap b.tmap -o m --voxel-size 0.2", "--voxel-size: is for clouds, of no use to a .tmap"),
         ("match a.tmap b.tmap --k 1000", "--k: steps of context "),
         ("match a.tmap b.tmap --k 1", "--k: steps of context are for descriptors of single rooms"),
-        ("match a.tmap b.tmap --method attention --scale free", "--method attention needs the embedder that ships"),
+        ("match a.tmap b.tmap --method attention --descriptor feather", "--method attention needs the embedder that ships"),
         ("match a.tmap b.tmap --up y", "--up: is for clouds"),
         ("embed a.tmap -o a.npy --unit mm", "--unit: is for clouds"),
         ("embed a.tmap -o a.npy --descriptor nowhere", "--descriptor: unknown descriptor"),

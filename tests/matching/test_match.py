@@ -38,11 +38,18 @@ def test_attention_matches_rooms_and_their_doors_give_the_pose():
     assert other_way.probability == pytest.approx(result.probability, abs=0.01)
 
 
-@pytest.mark.parametrize("options", [{"embedder": "engineered"}, {"scale_free": True}])
-def test_attention_needs_the_embedder_that_ships_and_one_scale(options):
+@pytest.mark.parametrize("scale_free", [False, True])
+def test_attention_needs_the_embedder_that_ships(scale_free):
     b, _ = turned(uneven(), (7.0, -3.0, 1.5))
-    with pytest.raises(InputError, match="method attention needs the embedder that ships, and maps of one scale"):
-        match(uneven(), b, method="attention", **options)
+    with pytest.raises(InputError, match="method attention needs the embedder that ships; take method consistent"):
+        match(uneven(), b, "engineered", "attention", scale_free=scale_free)
+
+
+def test_attention_at_unknown_scale():
+    b, true = turned(uneven(), (7.0, -3.0, 1.5), 1.3)
+    result = match(uneven(), b, method="attention", scale_free=True)
+    assert {tuple(pair) for pair in result.rooms.tolist()} <= {(k, k) for k in range(4)} and len(result.rooms) >= 3
+    assert result.transform is not None and result.transform.scale == pytest.approx(true.scale, rel=0.03)
 
 
 def test_attention_without_a_likely_match_gives_no_pose():

@@ -135,6 +135,13 @@ def test_other_losses_train(settings, kind):
     assert np.isfinite(fit(replace(settings, epochs=1), quiet)["train/loss"])
 
 
+def test_more_threads_train_the_same_network(settings):
+    runs = [replace(settings, epochs=1, name=f"of_{threads}", threads=threads) for threads in (1, 3)]
+    losses = [fit(run, quiet)["train/loss"] for run in runs]
+    weights = [(run.folder / "best" / "embedder.safetensors").read_bytes() for run in runs]
+    assert losses[0] == losses[1] and weights[0] == weights[1]
+
+
 def test_half_precision_trains(settings):
     """Fabric once refused the truth of a batch, so that no run with `precision=bf16-mixed` took a step."""
     assert np.isfinite(fit(replace(settings, epochs=1, precision="bf16-mixed"), quiet)["train/loss"])

@@ -29,8 +29,8 @@ def match_command(args: argparse.Namespace) -> int:
     check_cloud_options([args.a, args.b], args)
     if args.method != "thesis":  # which has a descriptor and a context of its own
         check_descriptor(args)
-    if args.method == "attention" and (args.descriptor != "learned" or args.scale_of_b == "free"):
-        raise InputError("--method attention needs the embedder that ships, and maps of one scale; take --method consistent")
+    if args.method == "attention" and args.descriptor != "learned":
+        raise InputError("--method attention needs the embedder that ships; take --method consistent")
     if args.report:
         check_outputs([args.report], [args.a, args.b])
         check_suffix("--report", args.report, PAGE_SUFFIXES)

@@ -121,7 +121,7 @@ MERGE = Command(
             choices=("search", "rooms", "surfaces"),
             default="search",
             help="rooms: from matched rooms alone, without a search of walls; surfaces: from the surfaces of each matched pair "
-            "of rooms, as in the thesis (two maps of one scale)",
+            "of rooms, as in the thesis (two maps; surfaces: of one scale)",
         ),
         option("--rigid", action="store_true", help="do not bend the maps to remove their drift"),
         option(

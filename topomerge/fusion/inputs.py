@@ -89,11 +89,14 @@ def risk_threshold(risk: float) -> float:
 
 
 def check_poses(poses: str, count: int, scale: str) -> None:
-    """Raise InputError for another word than those of `POSE_SOURCES`; without the search, poses are of two maps of one scale."""
+    """Raise InputError for another word than those of `POSE_SOURCES`; without the search, there are two maps, and those whose surfaces
+    are aligned are of one scale."""
     if poses not in POSE_SOURCES:
         raise InputError(f"poses must be {', '.join(POSE_SOURCES[:-1])} or {POSE_SOURCES[-1]}, not {poses!r}")
-    if poses != "search" and (count > 2 or scale != "fixed"):
-        raise InputError("poses of rooms alone are for two maps of one scale; leave them out (--poses search)")
+    if poses != "search" and count > 2:
+        raise InputError("poses of rooms alone are for two maps; leave them out (--poses search)")
+    if poses == "surfaces" and scale != "fixed":
+        raise InputError("poses of surfaces are for two maps of one scale; take those of rooms (--poses rooms)")
 
 
 @dataclass(frozen=True)

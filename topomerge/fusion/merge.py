@@ -60,7 +60,7 @@ def merge(
             map -> (R, D), for the matching of rooms.
         poses: "search": of walls and of matched rooms (default); "rooms": of matched rooms alone; "surfaces": of each matched
             pair of rooms by its surfaces, as the thesis does (with `embedder="shapedna"` its whole way). The last two are for two
-            maps of one scale.
+            maps, the last one for maps of one scale.
         rigid: do not bend the maps.
         same: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
 

@@ -56,6 +56,7 @@ class ConsistencySettings:
 
 
 CONSISTENCY = ConsistencySettings()
+NEAR_SCALE = 0.15  # of the logarithm, by which the scale of a pose is off from that at which rooms look alike
 
 
 class Sampled(NamedTuple):
@@ -105,17 +106,20 @@ def candidate_poses(
     return joined_poses(door_poses(a, b, plans, pairs, weight), middle_poses(a, b, plans, pairs, 0.2 * weight))
 
 
-def voted_pose(a: TopometricMap, b: TopometricMap, certain: Array) -> Sim3 | None:
+def voted_pose(a: TopometricMap, b: TopometricMap, certain: Array, scale: float | None = None) -> Sim3 | None:
     """The pose T_ab that most doors and middles of matched rooms vote for, with no look at walls; None where none match.
 
     Args:
         certain: (R_a, R_b) how sure each match is; each votes with that.
+        scale: about that of b, m, if it is not a metre; the pose has its own.
     """
     pairs = np.argwhere(certain > CONSISTENCY.least_voter)
     if not len(pairs):
         return None
     plans = (room_plans(a), room_plans(b))
-    poses = candidate_poses(a, b, plans, pairs, certain[tuple(pairs.T)], False)
+    poses = candidate_poses(a, b, plans, pairs, certain[tuple(pairs.T)], scale is not None)
+    if scale is not None:
+        poses = poses.take(np.flatnonzero(np.abs(np.log(poses.scale / scale)) < NEAR_SCALE))
     if not len(poses):
         return None
     at = np.column_stack([poses.places(plans[1].middle), 6 * np.cos(poses.yaw), 6 * np.sin(poses.yaw)])  # 10 degrees are 1 m

@@ -68,7 +68,7 @@ def match(
             ``"thesis"``: ShapeDNA with one step of context, and growing (embedder and k are the
             thesis' then).
         k: steps of context.
-        scale_free: the scale of b is unknown (only ``"consistent"`` allows for it).
+        scale_free: the scale of b is unknown (``"consistent"`` and ``"attention"`` allow for it).
         largest_cost: of the assignment; pairs above it stay alone. Twice the usual cost of a room's best partner if None.
         growing: limits of the growing.
         options: of the embedder.
@@ -89,10 +89,11 @@ def match(
         pairs = assign(cost, 2 * usual_best(cost) if largest_cost is None else largest_cost)
         return Matching(pairs, similarity[tuple(pairs.T)], statistics=statistics)
     odds: tuple[RoomOdds, ...] = ()
-    if method in ("attention", "consistent") and not scale_free:
-        odds = room_odds(*rows)
-    elif method == "consistent" and hasattr(describe, "at_scale"):
-        statistics["scale"], odds = odds_at_best_scale(describe.at_scale, rows[0], b)
+    if method in ("attention", "consistent"):
+        if scale_free and hasattr(describe, "at_scale"):
+            statistics["scale"], odds = odds_at_best_scale(describe.at_scale, rows[0], b)
+        elif not scale_free:
+            odds = room_odds(*rows)
     if method == "attention":
         return _by_attention(a, b, odds, statistics)
     if method == "consistent":
@@ -109,13 +110,13 @@ def _by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], 
     """Matches of `room_matcher`, and the pose that most of their doors and middles vote for.
 
     Raises:
-        InputError: the rows are of another embedder, or the scale is unknown.
+        InputError: the rows are of another embedder.
     """
     if not odds:
-        raise InputError("method attention needs the embedder that ships, and maps of one scale; take method consistent")
+        raise InputError("method attention needs the embedder that ships; take method consistent")
     certain = max(odds, key=lambda turned: turned.sureness).certainty
     rooms = assign_certain(certain, LEAST_CERTAINTY)
-    pose = voted_pose(a, b, certain)
+    pose = voted_pose(a, b, certain, statistics.get("scale"))
     probability = certain[tuple(rooms.T)]
     ranked = () if pose is None else (PoseHypothesis(pose, float(len(rooms)), 1.0, {}, True, rooms, probability),)
     return Matching(rooms, probability, pose, ranked, statistics)

@@ -42,9 +42,9 @@ class Augment:
     points: int = 256
     noise: float = 0.02
     shift: float = 2.0
-    walks: float = 0.25
-    slices: float = 0.15
-    rough: float = 0.3
+    walks: float = 0.0
+    slices: float = 0.0
+    rough: float = 0.0
     tilt: float = 1.5
     zoom: float = 0.02
     bend: float = 0.5
