@@ -102,3 +102,26 @@ def test_sections_are_written(module: ModuleType, manifest: Path, capsys: pytest
     assert "| 0° | 1.00 | 1.00 | – | 1.00 | 1 of 1 pairs |" in text and f"| {module.UNTRAINED} | 1.00 |" in text
     assert all(f"| {degrees}° |" in text for degrees in module.WRONG_BY)
     assert "| 45° |" in capsys.readouterr().out
+
+
+def test_real_pairs_are_told_by_site(
+    module: ModuleType, manifest: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a made pair in the place of the real ones."""
+    monkeypatch.setattr(module, "real_pairs", lambda cache: module.load_set(manifest))
+    assert module.main(["--real", str(manifest.parent)]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert lines[1].split(" | ")[1:5] == ["1", "8", "1.00", "1.00"]
+    assert lines[-1].startswith("| all | 1 | 8 | ")
+
+
+def test_a_real_map_is_looked_for_among_all_others(module: ModuleType, manifest: Path) -> None:
+    """The map turned by a quarter is found beside another building, and nothing else is looked for."""
+    retrieval = importlib.import_module("benchmarks.retrieval")
+    describe, (pair, other) = load_embedder(), module.load_set(manifest)
+    rows = [tuple(describe(map) for map in other.maps())]
+    other.about["building"] = "office-2"
+    pair.about["title"] = "made"
+    found, late = retrieval.real_searches([other], rows, [pair], describe)
+    assert [(search.rank, search.building) for search in found] == [(1, retrieval.building(pair))]
+    assert late == "Not first: none."
