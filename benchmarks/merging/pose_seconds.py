@@ -37,11 +37,11 @@ def timed(a: TopometricMap, b: TopometricMap, way: str, scale: str) -> dict[str,
     """Seconds of the steps until the pose, and how far it is off, m."""
     seconds, poses = {"rows": 0.0, "match": 0.0}, []
     if way != "walls":
-        describe, began = load_embedder(), time.perf_counter()
+        describe, began = load_embedder(), time.process_time()
         rows = {id(m): describe(m) for m in (a, b)}
-        seconds["rows"], began = time.perf_counter() - began, time.perf_counter()
+        seconds["rows"], began = time.process_time() - began, time.process_time()
         poses = [h.transform for h in match(a, b, lambda m: rows[id(m)], scale_free=scale == "free").alternatives]
-        seconds["match"] = time.perf_counter() - began
+        seconds["match"] = time.process_time() - began
     found = register(a, b, scale=scale, proposed=poses, searched=way != "rooms")
     seconds |= {step: found.seconds.get(step, 0.0) for step in UNTIL_POSE}
     middle = b.rooms["centroid"].mean(axis=0)[None]

@@ -96,7 +96,7 @@ def test_rows_at_the_true_scale_are_those_of_the_map_in_metres(describe: Learned
     rows = rows_of(describe, map)
     cosine = {}
     for scale in (1 / 1.5, 1.0):
-        at_scale = describe.at_scale(other, scale)
+        at_scale = describe.at_scales(other)(scale)
         assert isinstance(at_scale, TurnedRows)
         cosine[scale] = (rows * at_scale.rows[partner]).sum(axis=2).mean()
         assert at_scale.places == pytest.approx(scale * np.asarray(describe(other).places))  # type: ignore[union-attr]
@@ -104,4 +104,4 @@ def test_rows_at_the_true_scale_are_those_of_the_map_in_metres(describe: Learned
 
 
 def test_at_scale_one_rows_are_as_they_are(describe: Learned, map: TopometricMap) -> None:
-    assert np.array_equal(describe.at_scale(map, 1.0).rows, rows_of(describe, map))  # type: ignore[union-attr]
+    assert np.array_equal(describe.at_scales(map)(1.0).rows, rows_of(describe, map))  # type: ignore[union-attr]

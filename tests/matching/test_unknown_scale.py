@@ -9,25 +9,25 @@ from tests.matching.turned_maps import turned
 from tests.scenes_map import building
 from topomerge import load_embedder
 from topomerge.matching.match import match
-from topomerge.matching.unknown_scale import SCALES_TRIED, odds_at_best_scale
-from topomerge.types import TopometricMap
+from topomerge.matching.unknown_scale import COARSE_SCALES, odds_at_best_scale
 
 
-def test_rooms_are_surest_at_the_true_scale():
+@pytest.mark.parametrize("true", [0.6, 0.8, 1.0, 1.5])
+def test_rooms_are_surest_at_the_true_scale(true: float) -> None:
     a, describe = building(3), load_embedder()
-    asked: list[float] = []
+    rows_at, asked = describe.at_scales(a), []
 
-    def at_scale(map: TopometricMap, scale: float):
-        """Rows of a map whose unit is 1.25 m: as they are at 0.8 of what they are in metres."""
+    def rows(scale: float):
+        """Of a map whose unit is so long that it has its true size at `true`."""
         asked.append(scale)
-        return describe.at_scale(map, scale / 0.8)
+        return rows_at(scale / true)
 
-    scale, odds = odds_at_best_scale(at_scale, describe(a), a)
-    assert scale == pytest.approx(0.8, rel=0.08) and len(odds) == 4
-    assert set(SCALES_TRIED) <= set(asked)
+    scale, odds = odds_at_best_scale(describe(a), rows)
+    assert scale == pytest.approx(true, rel=0.11) and len(odds) == 4
+    assert set(COARSE_SCALES) <= set(asked) and len(asked) <= len(COARSE_SCALES) + 3
 
 
-def test_matching_at_unknown_scale_says_which_it_took():
+def test_matching_at_unknown_scale_says_which_it_took() -> None:
     a = building(3)
     b, _ = turned(a, (3.0, 1.0, 0.0), 1.25)
     found = match(a, b, scale_free=True)
@@ -36,7 +36,5 @@ def test_matching_at_unknown_scale_says_which_it_took():
     assert found.transform is not None and found.transform.scale == pytest.approx(0.8, rel=0.05)
 
 
-def test_an_embedder_without_a_matcher_has_no_say():
-    a = building(2)
-    scale, odds = odds_at_best_scale(lambda map, scale: np.eye(len(map.rooms)), np.eye(len(a.rooms)), a)
-    assert scale == 1.0 and odds == ()
+def test_an_embedder_without_a_matcher_has_no_say() -> None:
+    assert odds_at_best_scale(np.eye(3), lambda scale: np.eye(3)) == (1.0, ())

@@ -79,10 +79,15 @@ class Learned:
     def __call__(self, map: TopometricMap) -> Rows:
         return self.graph(self.arrays(map))[0]
 
-    def at_scale(self, map: TopometricMap, scale: float) -> Rows:
-        """What the embedder gives for a map of unknown scale whose unit is taken for so many m."""
-        arrays = resized(self.arrays(map), scale)
-        return self.graph(arrays if self.network.turns == 1 else arrays | sheet_arrays(map, scale))[0]
+    def at_scales(self, map: TopometricMap) -> Callable[[float], Rows]:
+        """What the embedder gives for a map of unknown scale, whose unit is taken for so many m."""
+        of_map = self._graph_arrays(map)
+
+        def rows(scale: float) -> Rows:
+            arrays = resized(of_map, scale)
+            return self.graph(arrays if self.network.turns == 1 else arrays | sheet_arrays(map, scale))[0]
+
+        return rows
 
     def matchability(self, map: TopometricMap) -> Array:
         """(R,) float64: how alike a room of another map must at least be, as a cosine, before it is rather this one than none."""
@@ -126,5 +131,8 @@ class Learned:
 
     def arrays(self, map: TopometricMap) -> dict[str, Array]:
         """What `graph` takes, of a map."""
-        arrays = graph_arrays(map, POINTS_PER_ROOM if self.needs_points else 1)
+        arrays = self._graph_arrays(map)
         return arrays if self.network.turns == 1 else arrays | sheet_arrays(map)
+
+    def _graph_arrays(self, map: TopometricMap) -> dict[str, Array]:
+        return graph_arrays(map, POINTS_PER_ROOM if self.needs_points else 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -228,14 +228,18 @@ class _Timed:
 
     def __init__(self, embedder: str | Descriptor, clock: _Clock) -> None:
         self.describe, self.clock = make_embedder(embedder), clock
-        if hasattr(self.describe, "at_scale"):
-            self.at_scale = self._at_scale
+        if hasattr(self.describe, "at_scales"):
+            self.at_scales = self._at_scales
 
     def __call__(self, map: TopometricMap) -> Rows:
         with self.clock("embed"):
             return self.describe(map)
 
-    def _at_scale(self, map: TopometricMap, scale: float) -> Rows:
-        with self.clock("embed"):
-            rows: Rows = self.describe.at_scale(map, scale)  # type: ignore[attr-defined]
-            return rows
+    def _at_scales(self, map: TopometricMap) -> Callable[[float], Rows]:
+        rows_at: Callable[[float], Rows] = self.describe.at_scales(map)  # type: ignore[attr-defined]
+
+        def timed(scale: float) -> Rows:
+            with self.clock("embed"):
+                return rows_at(scale)
+
+        return timed

@@ -56,7 +56,7 @@ class ConsistencySettings:
 
 
 CONSISTENCY = ConsistencySettings()
-NEAR_SCALE = 0.15  # of the logarithm, by which the scale of a pose is off from that at which rooms look alike
+NEAR_SCALE = 1.16  # factor by which the scale of a pose differs from that at which rooms look most alike
 
 
 class Sampled(NamedTuple):
@@ -69,17 +69,24 @@ class Sampled(NamedTuple):
 
 
 def hypotheses(
-    a: TopometricMap, b: TopometricMap, cost: Array, similarity: Array, scale_free: bool = False, number: int = 10
+    a: TopometricMap,
+    b: TopometricMap,
+    cost: Array,
+    similarity: Array,
+    scale_free: bool = False,
+    number: int = 10,
+    scale: float | None = None,
 ) -> tuple[PoseHypothesis, ...]:
     """Up to `number` ways to lay b onto a, best first.
 
     Args:
         cost, similarity: (R_a, R_b) of the descriptors.
         scale_free: is the scale of b unknown?
+        scale: about what it is then, m, if that is known.
     """
     plans = (room_plans(a), room_plans(b))
     pairs = best_partners(cost, CONSISTENCY.partners)
-    poses = candidate_poses(a, b, plans, pairs, similarity[tuple(pairs.T)] + 1e-3, scale_free)
+    poses = candidate_poses(a, b, plans, pairs, similarity[tuple(pairs.T)] + 1e-3, scale_free, scale)
     if not len(poses):
         return ()
     poses = best_of(poses, _scores(poses, plans, 0)[:, 0] + votes(poses), plans[1].middle, CONSISTENCY.refined)
@@ -98,12 +105,20 @@ def best_of(poses: PoseArrays, score: Array, point: Array, number: int) -> PoseA
 
 
 def candidate_poses(
-    a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], pairs: Array, weight: Array, scale_free: bool
+    a: TopometricMap,
+    b: TopometricMap,
+    plans: tuple[RoomPlans, RoomPlans],
+    pairs: Array,
+    weight: Array,
+    scale_free: bool,
+    scale: float | None = None,
 ) -> PoseArrays:
-    """Poses of all doors of all pairs, and of middles of the rooms."""
-    if scale_free:
+    """Poses of all doors of all pairs, and of middles of the rooms; of unknown scale only those about a scale, if one is given."""
+    if not scale_free:
+        return joined_poses(door_poses(a, b, plans, pairs, weight), middle_poses(a, b, plans, pairs, 0.2 * weight))
+    if scale is None:
         return joined_poses(door_poses(a, b, plans, pairs, weight), scaled_poses(a, b, plans, pairs, weight))
-    return joined_poses(door_poses(a, b, plans, pairs, weight), middle_poses(a, b, plans, pairs, 0.2 * weight))
+    return scaled_poses(a, b, plans, pairs, weight, (scale / NEAR_SCALE, scale * NEAR_SCALE))
 
 
 def voted_pose(a: TopometricMap, b: TopometricMap, certain: Array, scale: float | None = None) -> Sim3 | None:
@@ -117,9 +132,7 @@ def voted_pose(a: TopometricMap, b: TopometricMap, certain: Array, scale: float 
     if not len(pairs):
         return None
     plans = (room_plans(a), room_plans(b))
-    poses = candidate_poses(a, b, plans, pairs, certain[tuple(pairs.T)], scale is not None)
-    if scale is not None:
-        poses = poses.take(np.flatnonzero(np.abs(np.log(poses.scale / scale)) < NEAR_SCALE))
+    poses = candidate_poses(a, b, plans, pairs, certain[tuple(pairs.T)], scale is not None, scale)
     if not len(poses):
         return None
     at = np.column_stack([poses.places(plans[1].middle), 6 * np.cos(poses.yaw), 6 * np.sin(poses.yaw)])  # 10 degrees are 1 m

@@ -19,6 +19,7 @@ ORDERLY = 0.3  # share of walls that keep to two directions, from which on they 
 INTO_ROOM = (0.35, 0.6, 0.9)  # m from a door's middle into its rooms
 WIDTH_GAP = 0.7  # m by which the widths of one door may differ
 SCALE_LIMITS = (0.4, 2.5)  # least and greatest that is tried
+MOST_SPANS = 600  # two doors of a room, of a corridor with many
 DOORS_APART = 0.5  # m, two doors of a room must be farther apart to tell the scale
 
 
@@ -73,17 +74,26 @@ def middle_poses(
 
 
 def scaled_poses(
-    a: TopometricMap, b: TopometricMap, plans: tuple[RoomPlans, RoomPlans], pairs: Array, weight: Array
+    a: TopometricMap,
+    b: TopometricMap,
+    plans: tuple[RoomPlans, RoomPlans],
+    pairs: Array,
+    weight: Array,
+    scales: tuple[float, float] = SCALE_LIMITS,
 ) -> PoseArrays:
     """Poses at a scale of their own: from two doors of one room on two doors of another, the ratio of whose distances it is; and
-    from single doors at the ratio of the rooms' heights."""
+    from single doors at the ratio of the rooms' heights.
+
+    Args:
+        scales: least and greatest.
+    """
     of = [doors_of(m, p) for m, p in zip((a, b), plans, strict=True)]
-    first = _two_doors(of[0], of[1], pairs, weight)
+    first = _two_doors(of[0], of[1], pairs, weight, scales)
     p, q, w = _door_pairs(of[0], of[1], pairs, weight, widths=np.inf)
     i, j = of[0].room[p], of[1].room[q]
     high = np.stack([a.rooms["height"][i], b.rooms["height"][j]])
     ratio = high[0] / np.maximum(high[1], 1e-3)
-    fine = (high > 0).all(axis=0) & (ratio > SCALE_LIMITS[0]) & (ratio < SCALE_LIMITS[1])
+    fine = (high > 0).all(axis=0) & (ratio > scales[0]) & (ratio < scales[1])
     p, q, i, j, ratio = p[fine], q[fine], i[fine], j[fine], ratio[fine]
     yaw = snapped(of[0].into[p] - of[1].into[q], plans)
     second = _put(of[0].centre[p], of[1].centre[q], yaw, ratio, w[fine], _lift(a, b, i, j, ratio))
@@ -114,27 +124,33 @@ def _door_pairs(a: Doors, b: Doors, pairs: Array, weight: Array, widths: float =
     return p, q, likely[p, q]
 
 
-def _two_doors(a: Doors, b: Doors, pairs: Array, weight: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Two doors of one room on two of another: rows of the first doors, yaw, scale, weight."""
-    pairs_of_doors: list[tuple[int, int, float, float, float]] = []
+def _two_doors(a: Doors, b: Doors, pairs: Array, weight: Array, scales: tuple[float, float]) -> tuple[Array, ...]:
+    """Two doors of one room on two of another, at a scale between these: rows of the first doors, yaw, scale, weight."""
+    of_a, of_b = ({int(room): _spans(doors, int(room)) for room in np.unique(k)} for doors, k in ((a, pairs.T[0]), (b, pairs.T[1])))
+    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), *np.zeros((3, 0)))]
     for (i, j), w in zip(pairs.tolist(), weight.tolist(), strict=True):
-        doors_a, doors_b = np.flatnonzero(a.room == i), np.flatnonzero(b.room == j)
-        for p, p2 in _ordered(doors_a):
-            u = complex(*(a.centre[p2] - a.centre[p])[:2])
-            for q, q2 in _ordered(doors_b):
-                v = complex(*(b.centre[q2] - b.centre[q])[:2])
-                if min(abs(u), abs(v)) < DOORS_APART or not SCALE_LIMITS[0] < abs(u) / abs(v) < SCALE_LIMITS[1]:
-                    continue
-                yaw = float(np.angle(u / v))
-                turns = np.array([a.into[p] - b.into[q], a.into[p2] - b.into[q2]]) - yaw
-                if (abs((turns + np.pi) % (2 * np.pi) - np.pi) < 2 * SNAP_ANGLE).all():
-                    pairs_of_doors.append((p, q, yaw, abs(u) / abs(v), w))
-    table = np.array(pairs_of_doors, float).reshape(-1, 5)
-    return table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2], table[:, 3], table[:, 4]
+        (p, p2, u), (q, q2, v) = of_a[i], of_b[j]
+        ratio = abs(u)[:, None] / abs(v)[None]
+        one, other = np.nonzero((ratio > scales[0]) & (ratio < scales[1]))
+        yaw = np.angle(u[one] / v[other])
+        turns = np.stack([a.into[p[one]] - b.into[q[other]], a.into[p2[one]] - b.into[q2[other]]]) - yaw
+        fits = (abs((turns + np.pi) % (2 * np.pi) - np.pi) < 2 * SNAP_ANGLE).all(axis=0)
+        one, other, yaw = one[fits], other[fits], yaw[fits]
+        parts.append((p[one], q[other], yaw, ratio[one, other], np.full(len(one), w)))
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
-def _ordered(rows: Array) -> list[tuple[int, int]]:
-    return [(p, q) for p in rows.tolist() for q in rows.tolist() if p != q]
+def _spans(doors: Doors, room: int) -> tuple[Array, Array, Array]:
+    """Rows of each two doors of a room that are apart, in either order, and the way from the first to the second, x + i y; of very
+    many, some of each length."""
+    own = np.flatnonzero(doors.room == room)
+    first, second = (k.ravel() for k in np.meshgrid(own, own, indexing="ij"))
+    way = (doors.centre[second, :2] - doors.centre[first, :2]) @ np.array([1, 1j])
+    apart = np.flatnonzero(abs(way) >= DOORS_APART)
+    if len(apart) > MOST_SPANS:
+        by_length = apart[np.argsort(abs(way[apart]), kind="stable")]
+        apart = np.sort(by_length[np.linspace(0, len(apart) - 1, MOST_SPANS).astype(int)])
+    return first[apart], second[apart], way[apart]
 
 
 def _put(to: Array, point: Array, yaw: Array, scale: Array, weight: Array, lift: Array) -> PoseArrays:

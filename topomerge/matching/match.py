@@ -90,15 +90,17 @@ def match(
         return Matching(pairs, similarity[tuple(pairs.T)], statistics=statistics)
     odds: tuple[RoomOdds, ...] = ()
     if method in ("attention", "consistent"):
-        if scale_free and hasattr(describe, "at_scale"):
-            statistics["scale"], odds = odds_at_best_scale(describe.at_scale, rows[0], b)
+        if scale_free and hasattr(describe, "at_scales"):
+            statistics["scale"], odds = odds_at_best_scale(rows[0], describe.at_scales(b))
         elif not scale_free:
             odds = room_odds(*rows)
     if method == "attention":
         return _by_attention(a, b, odds, statistics)
     if method == "consistent":
         likely = certainty_of_turns(odds) if odds else similarity
-        ranked = hypotheses(a, b, 1 - likely if odds else cost, likely, scale_free, MOST_HYPOTHESES)
+        ranked = hypotheses(
+            a, b, 1 - likely if odds else cost, likely, scale_free, MOST_HYPOTHESES, statistics.get("scale") if odds else None
+        )
         rooms, probability = marginal(a, b, ranked)
     else:  # one hypothesis wins as a whole, as in the thesis
         ranked = _from_growing(a, b, cost, similarity, growing)

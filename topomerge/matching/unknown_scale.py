@@ -8,27 +8,30 @@ import numpy as np
 
 from topomerge.embedding.turns import Rows
 from topomerge.matching.room_matcher import RoomOdds, room_odds
-from topomerge.types import TopometricMap
 
-SCALES_TRIED = np.exp(np.linspace(np.log(0.5), np.log(2.0), 15))  # steps of a tenth: crops that much too large still look alike
+COARSE_SCALES = tuple(np.exp(np.linspace(np.log(0.5), np.log(2.0), 8)).tolist())  # steps of a fifth: crops still look alike
+FINE_STEP = COARSE_SCALES[1] / COARSE_SCALES[0]
 
-AtScale = Callable[[TopometricMap, float], Rows]
+RowsAt = Callable[[float], Rows]
 
 
-def odds_at_best_scale(at_scale: AtScale, of_a: Rows, b: TopometricMap) -> tuple[float, tuple[RoomOdds, ...]]:
-    """m that the unit of b is taken for, and the partners of the rooms of both maps at each quarter turn then; 1 and none where
-    the rows are of an embedder for which there is no such network.
+def odds_at_best_scale(of_a: Rows, rows_at: RowsAt) -> tuple[float, tuple[RoomOdds, ...]]:
+    """m that the unit of the second map is taken for, and the partners of the rooms of both maps at each quarter turn then; 1 and
+    none where the rows are of an embedder for which there is no such network.
 
     Args:
-        at_scale: map, scale -> rows (`Learned.at_scale`).
         of_a: rows of the first map, whose scale is known.
+        rows_at: scale -> rows of the second one (`Learned.at_scales`).
     """
-    best, sureness = (1.0, room_odds(of_a, at_scale(b, 1.0))), -1.0
-    if not best[1]:
-        return best
-    for scale in SCALES_TRIED.tolist():
-        odds = room_odds(of_a, at_scale(b, scale))
-        surest = max(turned.sureness for turned in odds)
-        if surest > sureness:
-            best, sureness = (scale, odds), surest
-    return best
+    tried: dict[float, tuple[RoomOdds, ...]] = {}
+
+    def sureness(scale: float) -> float:
+        if scale not in tried:
+            tried[scale] = room_odds(of_a, rows_at(scale))
+        return max(turned.sureness for turned in tried[scale])
+
+    if not room_odds(of_a, rows_at(1.0)):
+        return 1.0, ()
+    best = max(COARSE_SCALES, key=sureness)
+    best = max([best, best / FINE_STEP**0.5, best * FINE_STEP**0.5], key=sureness)
+    return best, tried[best]
