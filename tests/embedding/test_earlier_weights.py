@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.scenes_map import building
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.weights import read_weights
 from topomerge.errors import InputError
@@ -68,3 +69,10 @@ def test_a_layer_that_is_missing_is_named(tmp_path):
     (tmp_path / "embedder.json").write_text(json.dumps({**settings, "sha256": other["sha256"]}))
     with pytest.raises(InputError, match=r"embedder\.safetensors: does not fit .*node\.layers\.0\.lin_"):
         load_embedder(tmp_path)
+
+
+def test_rows_for_quarter_turns_stay():
+    """A network of one crop, as shipped before there were crops of two sizes and of doors."""
+    rows = load_embedder(EARLIER / "one_crop")(building(2))
+    with np.load(EARLIER / "expected_rows.npz", allow_pickle=False) as file:
+        assert np.abs(rows.rows - file["one_crop"]).max() < 1e-9
