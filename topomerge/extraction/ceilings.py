@@ -20,15 +20,20 @@ STOREY_REACH = 8.0  # m: how far above a floor something may be, and how far bel
 SHEET_HEIGHT = 0.3  # m: a noisy sheet is this thick
 SLAB_HEIGHT = 0.8  # m: so far below a ceiling's upper side, or a roof's, its lower side may be
 SOLID_SHARE = 0.5  # share of the levels in the metre below that are occupied: a slab is thinner, a wall or a shelf is not
+CARRIED = 0.5, 2.3  # m above the floor, of a sensor
+NOWHERE = np.zeros((0, 3))
 WALLED_SHARE = 0.25  # share of a floor's boundary beside which walls rise
 
 
-def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
+def without_ceilings(grid: VoxelGrid, standing: VoxelGrid, places: Array = NOWHERE) -> VoxelGrid:
     """The standing cells less those on the upper side of a ceiling or of a wall.
 
     A part of the standing cells with nothing above it is a ceiling if below most of it, walls left aside, is empty space and then
     something: of small flats half may lie over walls. The floor of an upper storey whose own ceiling was not scanned looks so,
-    too; but walls rise along its boundary, and along a ceiling's they end.
+    too; but walls rise along its boundary, and along a ceiling's they end. What the sensor was carried over is a roof terrace.
+
+    Args:
+        places: (n, 3) m, where the sensor was; may be empty.
     """
     cells = standing.cells.astype(np.int64)
     thick = max(int(np.ceil(SHEET_HEIGHT / grid.edge)), 1)
@@ -49,7 +54,17 @@ def without_ceilings(grid: VoxelGrid, standing: VoxelGrid) -> VoxelGrid:
     between = bare & ~on_wall
     hollow_area, area = (np.bincount(component[rows], minlength=count) for rows in (between & hollow, between))
     ceiling = (hollow_area > HOLLOW_SHARE * area) & (with_wall < WALLED_SHARE * np.maximum(on_boundary, 1))
+    ceiling[component[rows_below(standing, places)]] = False
     return standing.subset(~(bare & (ceiling[component] | on_wall)))
+
+
+def rows_below(standing: VoxelGrid, places: Array) -> Array:
+    """Rows of the cells over which the sensor was carried, at (n, 3) places, m."""
+    steps = np.arange(*np.rint(np.array(CARRIED) / standing.edge).astype(int))
+    at = np.floor((places[np.isfinite(places).all(axis=1)] - standing.origin) / standing.edge)
+    at = np.unique(at.astype(np.int64), axis=0)
+    rows = standing.rows((at[:, None] - steps[:, None] * (0, 0, 1)).reshape(-1, 3))
+    return rows[rows >= 0]
 
 
 def _on_a_wall(grid: VoxelGrid, cells: Array) -> Array:

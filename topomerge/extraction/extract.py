@@ -74,7 +74,7 @@ def extract(
     if not parts:  # rooms of joined maps are what their parts say
         if len(again.doors) and not isinstance(p, ThesisParameters):
             looks = [(plan, storey.probability) for plan, storey in zip(floor.plans, floor.classified_storeys, strict=True)]
-            signs = OtherSigns(doors=again.doors, looked_at=looks)
+            signs = OtherSigns(doors=again.doors, looked_at=looks, places=scan.places)
             floor = rooms_of_plans(scan.grid, navigable, p.door, p.narrow, p.standing_height, signs)
             made, doubts, again = _with_odds_and_openings(topometric_map(scan.grid, floor, p.standing_height), scan, floor, p)
         if again.one is not None:
@@ -125,7 +125,7 @@ def rooms_and_passages(
         floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
     else:
         scan = scan if flat else with_crossed_cells(scan)
-        signs = OtherSigns(parts, flat=flat, crossed=scan.crossed, raised=not flat and is_raised(scan.grid))
+        signs = OtherSigns(parts, flat=flat, crossed=scan.crossed, raised=not flat and is_raised(scan.grid), places=scan.places)
         floor = rooms_of_plans(scan.grid, navigable, p.slice_door if flat else p.door, p.narrow, p.standing_height, signs)
 
     watch.begin("topology", 0.85)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from topomerge.errors import InputError
 from topomerge.extraction.assumed_floor import any_ceiling, has_floor, with_assumed_floor
-from topomerge.extraction.ceilings import without_ceilings
+from topomerge.extraction.ceilings import NOWHERE, without_ceilings
 from topomerge.extraction.convolution import Kernel, stick
 from topomerge.extraction.dilation import dilate_upwards
 from topomerge.extraction.floors import floor_components, largest_component
@@ -13,7 +13,7 @@ from topomerge.extraction.gaps import bridge_gaps
 from topomerge.extraction.parameters import SharedParameters
 from topomerge.extraction.scan import Scan, reasons
 from topomerge.extraction.unobstructed import unobstructed
-from topomerge.types import VoxelGrid
+from topomerge.types import Array, VoxelGrid
 
 
 def navigable_volume(scan: Scan, p: SharedParameters) -> tuple[Scan, VoxelGrid]:
@@ -27,7 +27,7 @@ def navigable_volume(scan: Scan, p: SharedParameters) -> tuple[Scan, VoxelGrid]:
     """
     with reasons(scan.warnings):
         try:
-            navigable = _navigable(scan.grid, p)
+            navigable = _navigable(scan.grid, p, scan.places)
             if not p.assume or has_floor(scan.grid, navigable, p.standing_height):
                 return scan, navigable
         except InputError:
@@ -35,17 +35,17 @@ def navigable_volume(scan: Scan, p: SharedParameters) -> tuple[Scan, VoxelGrid]:
                 raise
     scan = scan.with_grid(with_assumed_floor(scan.grid, scan.rays), "no floor was seen: one was assumed")
     with reasons(scan.warnings):
-        return scan, _navigable(scan.grid, p)
+        return scan, _navigable(scan.grid, p, scan.places)
 
 
-def _navigable(grid: VoxelGrid, p: SharedParameters) -> VoxelGrid:
+def _navigable(grid: VoxelGrid, p: SharedParameters, places: Array = NOWHERE) -> VoxelGrid:
     """The steps of 2.3 in their order; those between them are beyond the thesis (docs/adr/0003)."""
     body = _stick_kernel(grid.edge, p)
     if p.noise:
         grid = without_flying_cells(grid, p.noise)
     standing = unobstructed(grid, body)  # 2.3.1
     if not p.ceilings:
-        standing = without_ceilings(grid, standing)
+        standing = without_ceilings(grid, standing, places)
     if p.bridge:
         standing = bridge_gaps(grid, standing, body, p.bridge)
     dilated = dilate_upwards(standing, p.dilation)  # 2.3.2

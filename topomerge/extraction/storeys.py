@@ -13,6 +13,9 @@ HIGHEST_CEILING = 30.0  # m
 STOREY_LEAST_HEIGHT = 1.9  # m between floors: nobody stands upright in less
 GALLERY_LEAST_AREA = 10.0  # m2 that lie at its level, of a floor in the air: landings are smaller
 IN_THE_AIR = 1.0  # m below the ceiling of the storey below
+HALF_STOREY = 1.0  # m between floors, where one of them would be above others of its own storey
+STACKED_SHARE = 0.4  # of the floor above others, at its level
+HALF_LEVEL = 0.4  # m above halfway between two floors, up to which a half level is of the lower one
 LEVEL_SHARE = 0.5  # of a floor that lies within a cell of its level; flights, what hangs and mirror images are spread
 
 
@@ -47,13 +50,31 @@ def find_storeys(navigable: VoxelGrid, floor_to_ceiling: Array) -> tuple[Array, 
     if none.any():
         floors = [z for z, gone in zip(floors, none, strict=True) if not gone]
         storeys, storey, _ = _of_floors(navigable, lowest, floors, floor_to_ceiling)
+    while (half := _stacked_level(navigable, lowest, storey[lowest], floors)) is not None:
+        floors = sorted([*floors, half])
+        storeys, storey, _ = _of_floors(navigable, lowest, floors, floor_to_ceiling)
     return storeys, storey
+
+
+def _stacked_level(navigable: VoxelGrid, lowest: Array, storey: Array, floors: list[int]) -> int | None:
+    """The level of floor that lies above other floor of the same storey, as the half levels of one side of a house do; None where
+    there is less of it than of a gallery, or where it is not level."""
+    x, y, z = navigable.cells[lowest].T.astype(np.int64)
+    order = np.lexsort((z, y, x, storey))
+    same = (np.diff(np.column_stack([storey, x, y])[order], axis=0) == 0).all(axis=1)
+    upper = z[order][1:][same & (np.diff(z[order]) * navigable.edge >= STOREY_LEAST_HEIGHT)]
+    area = np.bincount(upper, minlength=3) * navigable.edge**2
+    area[np.abs(np.arange(len(area))[:, None] - floors).min(axis=1) * navigable.edge < HALF_STOREY] = 0
+    level = np.convolve(area, np.ones(3), "same")
+    return int(level.argmax()) if level.max() >= max(GALLERY_LEAST_AREA, STACKED_SHARE * area.sum()) else None
 
 
 def _of_floors(navigable: VoxelGrid, lowest: Array, floors: list[int], floor_to_ceiling: Array) -> tuple[Array, Array, Array]:
     """The storeys of floors at these levels (ascending), the storey of each navigable cell, and how much of a storey's floor,
     m2, lies at its level."""
     halfway = (np.array(floors[:-1]) + np.array(floors[1:])) / 2
+    cut = (np.abs(navigable.cells[lowest, 2] - halfway[:, None]) <= 1.5).sum(axis=1) * navigable.edge**2
+    halfway += np.where(cut >= GALLERY_LEAST_AREA, HALF_LEVEL / navigable.edge, 0)  # half a level up lies a floor of its own
     storey = np.searchsorted(halfway, navigable.cells[:, 2]).astype(np.int32)
     storeys, level = np.zeros(len(floors), STOREY_DTYPE), np.zeros(len(floors))
     for s, z in enumerate(floors):

@@ -76,7 +76,9 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, cr
     if len(above):
         nominal = int(np.median(above[:, 2]))
         upper, _, near = _heights(above[_within(above[:, :2] - low, size)], low, size, nominal)
-        top = np.minimum(top, np.where(near * e < 1.0, upper, nominal) - int(np.ceil(LEAST_SLAB / e)))
+        upper = np.where(near * e < 1.0, upper, nominal)
+        ends = (near * e < 1.0) | ((upper - base) * e >= STOREY_LEAST_HEIGHT)  # not so over half levels
+        top = np.where(ends, np.minimum(top, upper - int(np.ceil(LEAST_SLAB / e))), top)
     profile = np.zeros(size, np.uint64)
     profiles(grid.cells, low, base, top, profile)
     bands = profile_bands(e)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from topomerge.extraction.ceilings import NOWHERE
 from topomerge.extraction.classified_storey import ClassifiedStorey
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.inner_doors import INNER_DOOR_DTYPE, inner_columns, inner_log_odds
@@ -34,6 +35,7 @@ class OtherSigns(NamedTuple):
         flat: is it a slice, in which nothing tells walls from what else stands about?
         crossed: cells that the sensor looked through, where that is known.
         raised: is it a robot's grid or a drawing, whose walls were all raised alike?
+        places: (n, 3) m, where the sensor was.
         looked_at: what `look_at` gave of each storey, where these cells were cut before.
     """
 
@@ -43,6 +45,7 @@ class OtherSigns(NamedTuple):
     crossed: VoxelGrid | None = None
     raised: bool = False
     looked_at: Sequence[tuple[StoreyPlan, Array]] = ()
+    places: Array = NOWHERE
 
 
 NO_SIGNS = OtherSigns()
@@ -96,7 +99,7 @@ def cut_storey(
     parted = inner_columns(plan, others.doors)
     region = regions_of(plan, probability, parted | parted_columns(laid) if laid else parted)
     if k > 0:
-        region = without_upper_sides(grid, plan, region)
+        region = without_upper_sides(grid, plan, region, others.places)
     passages = find_passages(plan, clearance, region, probability)
     by_parts, by_walls = door_log_odds(region, plan.edge, passages, laid), inner_log_odds(plan, passages, others.doors)
     passages = {pair: replace(passage, log_odds=by_parts[pair] + by_walls[pair]) for pair, passage in passages.items()}

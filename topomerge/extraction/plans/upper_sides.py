@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from topomerge.extraction.ceilings import CARRIED, NOWHERE
 from topomerge.extraction.plans.plan import columns_of
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.kernels.columns import hollow_below
@@ -15,7 +16,7 @@ STOREY_BELOW = 1.2, 8.0  # m of empty space under a ceiling: at least, at most
 OPEN_SHARE = 0.25  # of the outline with walls, and of the floor with a ceiling: less, and a floor may be a ceiling
 
 
-def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array) -> Array:
+def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places: Array = NOWHERE) -> Array:
     """The regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls around
     or so thin that nobody is carried, with a storey right below.
 
@@ -23,6 +24,7 @@ def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array) -> Arr
         grid: occupied cells.
         plan: of the upper storey.
         region: (nx, ny) region of each column, -1 none.
+        places: (n, 3) m, where the sensor was: what it was carried over is a floor.
     """
     count = int(region.max(initial=-1)) + 1
     in_region = region >= 0
@@ -33,10 +35,14 @@ def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array) -> Arr
     length = np.maximum(np.bincount(region[outline], minlength=count), 1)
     beside_walls = np.bincount(region[outline], walled[outline], minlength=count) / length
     suspect = covered < OPEN_SHARE
+    low, base = columns_of(plan, grid)
+    at = np.floor((places[np.isfinite(places).all(axis=1)] - grid.origin) / grid.edge).astype(np.int64) - (*low, 0)
+    at = at[((at[:, :2] >= 0) & (at[:, :2] < region.shape)).all(axis=1)]
+    above, of = (at[:, 2] - base[tuple(at[:, :2].T)]) * grid.edge, region[tuple(at[:, :2].T)]
+    suspect[of[(above > CARRIED[0]) & (above < CARRIED[1]) & (of >= 0)]] = False
     if not suspect.any():
         return region
     at = np.argwhere(in_region & suspect[np.where(in_region, region, 0)])
-    low, base = columns_of(plan, grid)
     cells = np.ascontiguousarray(np.column_stack([at + low, base[tuple(at.T)]]))  # each layout is compiled by itself
     heights = (round(height / grid.edge) for height in (SHEET_THICKNESS, *STOREY_BELOW))
     hollow = hollow_below(*grid._bricks, cells, 1, *heights)
