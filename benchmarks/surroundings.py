@@ -7,7 +7,8 @@ of real pairs (as of `retrieval.py`), by site.
 
 Wrong axes: the embedder that ships; sheet and crops of the second map are drawn in a direction that is off from its walls.
 Untrained: rooms are compared by the correlation of their main crops, pixel by pixel, at the quarter turn of the second map at
-which crops are most alike. With them the network that sees both maps, at the turn of which it is surest.
+which crops are most alike. With them the network that sees both maps, at the turn of which it is surest; and as if the scale of the second
+map were not known.
 """
 
 from __future__ import annotations
@@ -30,13 +31,16 @@ from topomerge.embedding.turns import QUARTERS, TurnedRows, quarters_between
 from topomerge.evaluation.groups import value
 from topomerge.evaluation.score import Row, rank_counts
 from topomerge.evaluation.tables import cell, write_section
+from topomerge.matching.consistency import NEAR_SCALE
 from topomerge.matching.costs import descriptor_costs
 from topomerge.matching.room_matcher import room_odds
+from topomerge.matching.unknown_scale import odds_at_best_scale
 from topomerge.types import Array
 
 WRONG_BY = (0, 2, 5, 10, 20, 45)  # degrees
 COMPARED = ("wall", "floor", "low", "high")  # planes that are correlated
 LEARNED, UNTRAINED, BOTH_SEEN = "embedder that ships", "correlation of crops", "network that sees both maps"
+UNSCALED = "network that sees both maps, scale unknown"
 
 
 def usable(pairs: Sequence[EvaluationPair]) -> list[EvaluationPair]:
@@ -69,9 +73,12 @@ def ranks(pair: EvaluationPair, describe: Learned) -> list[Row]:
         out.append({**head, "way": LEARNED, "degrees": degrees, "turned": right, **counts})
     quarters, alike = likenesses(crops(read), crops(other))
     surest = max(room_odds(rows, describe.graph(other)[0]), key=lambda turned: turned.sureness)
-    for way, turn, score in ((UNTRAINED, quarters, alike), (BOTH_SEEN, surest.quarters, surest.certainty)):
+    scale, odds = odds_at_best_scale(rows, describe.at_scales(b))
+    unscaled = max(odds, key=lambda turned: turned.sureness)
+    ways = [(UNTRAINED, quarters, alike), *((way, of.quarters, of.certainty) for way, of in ((BOTH_SEEN, surest), (UNSCALED, unscaled)))]
+    for way, turn, score in ways:
         right = turn == true_quarters(pair, read, other)
-        out.append({**head, "way": way, "degrees": 0, "turned": right, **rank_counts(pair, 1 - score)})
+        out.append({**head, "way": way, "degrees": 0, "turned": right, "scale": scale, **rank_counts(pair, 1 - score)})
     return out
 
 
@@ -142,9 +149,11 @@ def site_table(rows: Sequence[Row]) -> str:
 def sections(rows: Sequence[Row]) -> dict[str, str]:
     """Tables by the marks of the sections that they are written to."""
     learned = {d: [row for row in rows if row["way"] == LEARNED and row["degrees"] == d] for d in WRONG_BY}
-    plain, both = ([row for row in rows if row["way"] == way] for way in (UNTRAINED, BOTH_SEEN))
+    plain, both, free = ([row for row in rows if row["way"] == way] for way in (UNTRAINED, BOTH_SEEN, UNSCALED))
     axes = table("second map's walls taken wrong by", [(f"{d}°", of) for d, of in learned.items()])
-    twins = table("rooms compared by", [(UNTRAINED, plain), (LEARNED, learned[0]), (BOTH_SEEN, both)])
+    twins = table("rooms compared by", [(UNTRAINED, plain), (LEARNED, learned[0]), (BOTH_SEEN, both), (UNSCALED, free)])
+    near = sum(abs(np.log(row["scale"])) < np.log(NEAR_SCALE) for row in free)
+    twins += f"\n\nScale unknown: it is taken within {100 * (NEAR_SCALE - 1):.0f} % of the true one in {near} of {len(free)} pairs."
     return {"axes": axes, "untrained": twins}
 
 

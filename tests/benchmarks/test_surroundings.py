@@ -87,6 +87,7 @@ def test_rows_of_a_pair(module: ModuleType, manifest: Path) -> None:
         *((module.LEARNED, degrees) for degrees in module.WRONG_BY),
         (module.UNTRAINED, 0),
         (module.BOTH_SEEN, 0),
+        (module.UNSCALED, 0),
     ]
     assert all(r["queries"] == r["five"] == 2 * len(pair.matches) >= r["first"] for r in rows)
     assert all(r["first"] == r["queries"] and r["turned"] for r in rows if r["degrees"] == 0)
