@@ -157,7 +157,9 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("manifest", nargs="?", type=Path, default=HELDOUT)
     parser.add_argument("--descriptor", default="learned", help="as of topomerge match")
     parser.add_argument("--real", type=Path, metavar="CACHE", help="look for real maps, whose pairs are in this cache")
-    parser.add_argument("--write", type=Path, help="file whose section between the marks `retrieval` (`retrieval-real`) is replaced")
+    parser.add_argument(
+        "--write", type=Path, help="file whose section between the marks `retrieval` (`retrieval-real`) is replaced"
+    )
     args = parser.parse_args(words)
     pairs = load_set(args.manifest)
     describe = embedder(args.descriptor)

@@ -2,13 +2,13 @@
 
 ``python -m benchmarks.surroundings [MANIFEST] [--limit N] [--write docs/results/learning.md]``: of a cached set of evaluation
 pairs (by default ``cache/evaluation/heldout.jsonl``, as of `retrieval.py`) those with rooms in common and of known scale. Is a
-room's true partner the nearest? Beside it: for how many pairs the quarter turn between the maps is the true one. ``--real CACHE``:
-of real pairs (as of `retrieval.py`), by site.
+room's true partner the nearest? Beside it: for how many pairs the quarter turn between the maps is the true one.
+``--real CACHE``: of real pairs (as of `retrieval.py`), by site.
 
 Wrong axes: the embedder that ships; sheet and crops of the second map are drawn in a direction that is off from its walls.
 Untrained: rooms are compared by the correlation of their main crops, pixel by pixel, at the quarter turn of the second map at
-which crops are most alike. With them the network that sees both maps, at the turn of which it is surest; and as if the scale of the second
-map were not known.
+which crops are most alike. With them the network that sees both maps, at the turn of which it is surest; and the same as if the
+scale of the second map were not known.
 """
 
 from __future__ import annotations
@@ -75,7 +75,10 @@ def ranks(pair: EvaluationPair, describe: Learned) -> list[Row]:
     surest = max(room_odds(rows, describe.graph(other)[0]), key=lambda turned: turned.sureness)
     scale, odds = odds_at_best_scale(rows, describe.at_scales(b))
     unscaled = max(odds, key=lambda turned: turned.sureness)
-    ways = [(UNTRAINED, quarters, alike), *((way, of.quarters, of.certainty) for way, of in ((BOTH_SEEN, surest), (UNSCALED, unscaled)))]
+    ways = [
+        (UNTRAINED, quarters, alike),
+        *((way, of.quarters, of.certainty) for way, of in ((BOTH_SEEN, surest), (UNSCALED, unscaled))),
+    ]
     for way, turn, score in ways:
         right = turn == true_quarters(pair, read, other)
         out.append({**head, "way": way, "degrees": 0, "turned": right, "scale": scale, **rank_counts(pair, 1 - score)})
@@ -153,7 +156,9 @@ def sections(rows: Sequence[Row]) -> dict[str, str]:
     axes = table("second map's walls taken wrong by", [(f"{d}°", of) for d, of in learned.items()])
     twins = table("rooms compared by", [(UNTRAINED, plain), (LEARNED, learned[0]), (BOTH_SEEN, both), (UNSCALED, free)])
     near = sum(abs(np.log(row["scale"])) < np.log(NEAR_SCALE) for row in free)
-    twins += f"\n\nScale unknown: it is taken within {100 * (NEAR_SCALE - 1):.0f} % of the true one in {near} of {len(free)} pairs."
+    twins += (
+        f"\n\nScale unknown: it is taken within {100 * (NEAR_SCALE - 1):.0f} % of the true one in {near} of {len(free)} pairs."
+    )
     return {"axes": axes, "untrained": twins}
 
 

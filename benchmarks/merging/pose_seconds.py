@@ -60,7 +60,9 @@ def measure(rooms: int) -> list[dict[str, Any]]:
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """As Markdown; ratios are to the search of walls alone."""
-    lines = ["| rooms of both maps | scale | pose by | rows, s | match, s | search, s | to the pose, s | of walls alone | off, m |"]
+    lines = [
+        "| rooms of both maps | scale | pose by | rows, s | match, s | search, s | to the pose, s | of walls alone | off, m |"
+    ]
     lines.append("|" + "---|" * 9)
     for row in rows:
         total = sum(row[name] for name in ("rows", "match", *UNTIL_POSE))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
+
 from topomerge.training.loop import made_by_threads
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from topomerge.training.other_sensors import HIGH, LOW, OPAQUE, WALL, as_slice, bent, looked_at, rough_walls, with_gaps
 
 from topomerge.embedding.surroundings import SHEET_PLANES
 from topomerge.kernels.sight import lit
+from topomerge.training.other_sensors import HIGH, LOW, OPAQUE, WALL, as_slice, bent, looked_at, rough_walls, with_gaps
 
 SIDE = 60
 
@@ -74,7 +74,7 @@ def test_rough_walls_lose_pixels_or_are_thicker():
 @pytest.mark.parametrize(("tilt", "zoom"), [(0.0, 1.0), (0.2, 1.0), (0.0, 1.2), (-0.3, 0.9)])
 def test_places_go_where_their_pixels_go(tilt, zoom):
     """A mark of three by three pixels is about its place after all was turned, stretched and bent."""
-    planes, room, anchor, doors = two_rooms()
+    planes, room, _, doors = two_rooms()
     planes[44:47, 14:17, LOW] = 255
     there = np.array([[45.5, 15.5]])
     seen, rooms, (moved, nothing) = bent(planes, room, (there, doors), tilt, zoom, 1.0, np.random.default_rng(1))

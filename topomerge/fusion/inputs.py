@@ -89,8 +89,8 @@ def risk_threshold(risk: float) -> float:
 
 
 def check_poses(poses: str, count: int, scale: str) -> None:
-    """Raise InputError for another word than those of `POSE_SOURCES`; without the search, there are two maps, and those whose surfaces
-    are aligned are of one scale."""
+    """Raise InputError for another word than those of `POSE_SOURCES`; without the search, there are two maps, and those whose
+    surfaces are aligned are of one scale."""
     if poses not in POSE_SOURCES:
         raise InputError(f"poses must be {', '.join(POSE_SOURCES[:-1])} or {POSE_SOURCES[-1]}, not {poses!r}")
     if poses != "search" and count > 2:

@@ -126,7 +126,9 @@ def _door_pairs(a: Doors, b: Doors, pairs: Array, weight: Array, widths: float =
 
 def _two_doors(a: Doors, b: Doors, pairs: Array, weight: Array, scales: tuple[float, float]) -> tuple[Array, ...]:
     """Two doors of one room on two of another, at a scale between these: rows of the first doors, yaw, scale, weight."""
-    of_a, of_b = ({int(room): _spans(doors, int(room)) for room in np.unique(k)} for doors, k in ((a, pairs.T[0]), (b, pairs.T[1])))
+    of_a, of_b = (
+        {int(room): _spans(doors, int(room)) for room in np.unique(k)} for doors, k in ((a, pairs.T[0]), (b, pairs.T[1]))
+    )
     parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), *np.zeros((3, 0)))]
     for (i, j), w in zip(pairs.tolist(), weight.tolist(), strict=True):
         (p, p2, u), (q, q2, v) = of_a[i], of_b[j]
@@ -141,8 +143,8 @@ def _two_doors(a: Doors, b: Doors, pairs: Array, weight: Array, scales: tuple[fl
 
 
 def _spans(doors: Doors, room: int) -> tuple[Array, Array, Array]:
-    """Rows of each two doors of a room that are apart, in either order, and the way from the first to the second, x + i y; of very
-    many, some of each length."""
+    """Rows of each two doors of a room that are apart, in either order, and the way from the first to the second, x + i y; of
+    very many, some of each length."""
     own = np.flatnonzero(doors.room == room)
     first, second = (k.ravel() for k in np.meshgrid(own, own, indexing="ij"))
     way = (doors.centre[second, :2] - doors.centre[first, :2]) @ np.array([1, 1j])

@@ -1,4 +1,4 @@
-"""Rows of a map whose scale is not known: those at the scale at which the network that sees both maps is surest of its matches."""
+"""Rows of a map whose scale is not known: at the scale at which the network that sees both maps is surest of its matches."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def looked_at(planes: Array, room: Array, anchor: Array, doors: Array, rng: np.r
 
 
 def as_slice(planes: Array, rng: np.random.Generator) -> Array:
-    """Planes as a laser that turns in one plane sees them: what stands at its height looks like walls, and nothing else is there."""
+    """Planes as a laser that turns in one plane sees them: what stands at its height looks like walls, the rest is not seen."""
     out = planes.copy()
     things = np.maximum(planes[..., HIGH], planes[..., LOW]) if rng.random() < 0.5 else planes[..., HIGH]
     out[..., WALL] = np.maximum(planes[..., WALL], things)

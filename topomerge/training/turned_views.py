@@ -52,8 +52,8 @@ def ways_of(graph: Graph, names: Sequence[str]) -> Graph:
 
 
 def changed_sheet(graph: Graph, augment: Augment, generator: torch.Generator) -> Graph:
-    """A map whose storeys were seen by another sensor on another walk (`training.other_sensors`); middles of rooms, and doors, lie
-    elsewhere."""
+    """A map whose storeys were seen by another sensor on another walk (`training.other_sensors`); middles of rooms, and doors,
+    lie elsewhere."""
     rng = np.random.default_rng(int(torch.randint(1 << 40, (), generator=generator)))
     planes, room, anchor, doors = (graph[name].numpy() for name in ("sheet", "sheet_room", "anchor", "door_anchor"))
     if rng.random() < augment.walks:
@@ -66,7 +66,10 @@ def changed_sheet(graph: Graph, augment: Augment, generator: torch.Generator) ->
     out, tilt = dict(graph), 0.0
     if augment.tilt or augment.zoom or augment.bend:
         more = WILD if rng.random() < WILD_SHARE else 1.0
-        tilt, zoom = math.radians(more * augment.tilt) * rng.standard_normal(), math.exp(more * augment.zoom * rng.standard_normal())
+        tilt, zoom = (
+            math.radians(more * augment.tilt) * rng.standard_normal(),
+            math.exp(more * augment.zoom * rng.standard_normal()),
+        )
         planes, room, (anchor, doors) = bent(planes, room, (anchor, doors), tilt, zoom, augment.bend, rng)
     if "edge_way" in out:
         out["edge_way"] = _rotated_ways(out["edge_way"], tilt)
