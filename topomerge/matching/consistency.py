@@ -113,7 +113,7 @@ def candidate_poses(
     scale_free: bool,
     scale: float | None = None,
 ) -> PoseArrays:
-    """Poses of all doors of all pairs, and of middles of the rooms; of unknown scale only those about a scale, if there is one."""
+    """Poses of all doors of all pairs, and of middles of the rooms; of unknown scale those about a scale, if there is one."""
     if not scale_free:
         return joined_poses(door_poses(a, b, plans, pairs, weight), middle_poses(a, b, plans, pairs, 0.2 * weight))
     if scale is None:
