@@ -40,12 +40,13 @@ def timed(a: TopometricMap, b: TopometricMap, way: str, scale: str) -> dict[str,
         describe, began = load_embedder(), time.process_time()
         rows = {id(m): describe(m) for m in (a, b)}
         seconds["rows"], began = time.process_time() - began, time.process_time()
-        poses = [h.transform for h in match(a, b, lambda m: rows[id(m)], scale_free=scale == "free").alternatives]
+        descriptor = describe if scale == "free" else lambda m: rows[id(m)]  # of unknown scale there are others
+        poses = [h.transform for h in match(a, b, descriptor, scale_free=scale == "free").alternatives]
         seconds["match"] = time.process_time() - began
-    found = register(a, b, scale=scale, proposed=poses, searched=way != "rooms")
-    seconds |= {step: found.seconds.get(step, 0.0) for step in UNTIL_POSE}
+    registration = register(a, b, scale=scale, proposed=poses, searched=way != "rooms")
+    seconds |= {step: registration.seconds.get(step, 0.0) for step in UNTIL_POSE}
     middle = b.rooms["centroid"].mean(axis=0)[None]
-    pose = found.alternatives[0].transform if found.alternatives else None
+    pose = registration.alternatives[0].transform if registration.alternatives else None
     off = np.inf if pose is None else float(np.linalg.norm(pose.apply(middle) - TURNED_POSE.inverse().apply(middle)))
     return {"way": way, "scale": scale, "off": off, **seconds}
 
@@ -69,9 +70,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         alone = next(r for r in rows if (r["rooms"], r["scale"], r["way"]) == (row["rooms"], row["scale"], "walls"))
         ratio = total / sum(alone[name] for name in UNTIL_POSE)
         off = f"{row['off']:.2f}" if row["off"] < NEAR else f"**{row['off']:.1f}**"
-        known = {"fixed": "known", "free": "unknown"}[row["scale"]]
+        scale = {"fixed": "known", "free": "unknown"}[row["scale"]]
         parts = " | ".join(f"{row[name]:.1f}" for name in ("rows", "match", "search"))
-        lines.append(f"| {row['a']}, {row['b']} | {known} | {row['way']} | {parts} | {total:.1f} | {ratio:.1f} | {off} |")
+        lines.append(f"| {row['a']}, {row['b']} | {scale} | {row['way']} | {parts} | {total:.1f} | {ratio:.1f} | {off} |")
     return "\n".join(lines)
 
 

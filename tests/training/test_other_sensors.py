@@ -38,11 +38,11 @@ def test_a_walk_sees_the_rooms_it_enters_and_a_part_of_the_others(monkeypatch):
 
     planes, room, anchor, doors = two_rooms()
     monkeypatch.setattr(other_sensors, "ENTERED", (1.0, 1.0))
-    monkeypatch.setattr(other_sensors, "REACH", (56.0, 56.0))
+    monkeypatch.setattr(other_sensors, "SENSOR_REACH", (56.0, 56.0))
     all_planes, all_rooms = looked_at(planes, room, anchor, doors, np.random.default_rng(0))
     assert (all_rooms == room).mean() > 0.99 and ((all_planes == planes) | (all_planes == 0)).all()
     monkeypatch.setattr(other_sensors, "ENTERED", (0.0, 0.0))
-    monkeypatch.setattr(other_sensors, "REACH", (8.0, 8.0))
+    monkeypatch.setattr(other_sensors, "SENSOR_REACH", (8.0, 8.0))
     some_planes, some = looked_at(planes, room, anchor, doors, np.random.default_rng(0))
     for number in (0, 1):
         assert 0.05 < (some == number).sum() / (room == number).sum() < 0.3

@@ -48,7 +48,8 @@ def crops(map_sheet: Mapping[str, Array], part: str = CROP_PART, rooms: Array | 
         return _cut(map_sheet, anchor[number], number, CROP)
     if part == WIDE_PART:
         return _cut(map_sheet, anchor[number], number, WIDE_CROP, WIDE_STEP)
-    doors = np.asarray(map_sheet["door_anchor"])[number, :DOOR_CROPS]
+    doors = np.asarray(map_sheet["door_anchor"])[:, :DOOR_CROPS]
+    doors = doors if rooms is None else doors[number]
     there = np.isfinite(doors).all(axis=2)
     out = np.zeros((len(number), *CROP_SHAPES[DOOR_PART]), np.uint8)
     out[there] = _cut(map_sheet, doors[there], number[np.nonzero(there)[0]], DOOR_CROP)

@@ -90,10 +90,7 @@ def match(
         return Matching(pairs, similarity[tuple(pairs.T)], statistics=statistics)
     odds: tuple[RoomOdds, ...] = ()
     if method in ("attention", "consistent"):
-        if scale_free and hasattr(describe, "at_scales"):
-            statistics["scale"], odds = odds_at_best_scale(rows[0], describe.at_scales(b))
-        elif not scale_free:
-            odds = room_odds(*rows)
+        odds = _odds(describe, rows, b, scale_free, statistics)
     if method == "attention":
         return _by_attention(a, b, odds, statistics)
     if method == "consistent":
@@ -106,6 +103,18 @@ def match(
         ranked = _from_growing(a, b, cost, similarity, growing)
         rooms, probability = (ranked[0].rooms, ranked[0].fit) if ranked else (np.zeros((0, 2), np.int64), np.zeros(0))
     return Matching(rooms, probability, ranked[0].transform if ranked else None, ranked, statistics)
+
+
+def _odds(
+    describe: Descriptor, rows: tuple[Rows, Rows], b: TopometricMap, scale_free: bool, statistics: dict[str, float]
+) -> tuple[RoomOdds, ...]:
+    """Partners of rooms by `room_matcher`; of unknown scale at that at which they are surest, which goes into the statistics."""
+    if not scale_free:
+        return room_odds(*rows)
+    if not hasattr(describe, "at_scales"):
+        return ()
+    statistics["scale"], odds = odds_at_best_scale(rows[0], describe.at_scales(b))
+    return odds
 
 
 def _by_attention(a: TopometricMap, b: TopometricMap, odds: Sequence[RoomOdds], statistics: dict[str, float]) -> Matching:

@@ -21,7 +21,7 @@ SEEN_AS = (  # planes that a map lacks, and how often: drawings and slices have 
     (("ceiling", "low", "high"), 0.1),
 )
 PATCHES, PATCH = 3, (4, 24)  # patches that nothing was seen of, at most, and pixels of a side
-REACH = (16.0, 56.0)  # pixels, how far a sensor sees
+SENSOR_REACH = (16.0, 56.0)  # pixels, how far a sensor sees
 OPAQUE = 128  # from which share of a pixel on a wall stops a ray
 ENTERED = (0.3, 1.0)  # share of rooms that a walk enters; into the others it looks through a door
 BEND_STEP = 32  # pixels, between two places that drift apart from each other
@@ -39,7 +39,7 @@ def looked_at(planes: Array, room: Array, anchor: Array, doors: Array, rng: np.r
     through = doors[np.arange(len(anchor)), rng.integers(0, np.maximum(np.isfinite(doors[..., 0]).sum(axis=1), 1))]
     stand = np.where((entered | ~np.isfinite(through[:, 0]))[:, None], anchor, through)
     columns = np.clip(np.floor(stand).astype(np.int64), 0, np.array(room.shape) - 1)
-    seen = lit(planes[..., WALL] >= OPAQUE, columns, rng.uniform(*REACH))
+    seen = lit(planes[..., WALL] >= OPAQUE, columns, rng.uniform(*SENSOR_REACH))
     return np.where(seen[..., None], planes, 0).astype(np.uint8), np.where(seen, room, -1).astype(room.dtype)
 
 

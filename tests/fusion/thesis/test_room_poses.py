@@ -68,12 +68,12 @@ def test_merge_by_rooms_alone(flats, poses):
     assert np.allclose((result.registration.transform @ back.registration.transform).matrix, np.eye(4), atol=1e-6)
 
 
-def test_merge_by_rooms_is_for_two_maps_of_one_scale(flats):
+def test_merge_by_rooms_is_for_two_maps_and_by_surfaces_for_one_scale(flats):
     for poses in ("rooms", "surfaces"):
-        with pytest.raises(InputError, match="two maps of one scale"):
-            tm.merge(flats, poses=poses, scale="free")
-        with pytest.raises(InputError, match="two maps of one scale"):
+        with pytest.raises(InputError, match="poses of rooms alone are for two maps"):
             tm.merge([*flats, flats[0]], poses=poses)
+    with pytest.raises(InputError, match="poses of surfaces are for two maps of one scale"):
+        tm.merge(flats, poses="surfaces", scale="free")
     with pytest.raises(InputError, match="search, rooms or surfaces, not 'thesis'"):
         tm.merge(flats, poses="thesis")
 
