@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from topomerge import numpy_nn as nn
-from topomerge.embedding.turns import FACTS, QUARTERS, Rows, TurnedRows
+from topomerge.embedding.turns import FACTS, QUARTERS, Rows, TurnedRows, quarters_between
 from topomerge.errors import InputError
 from topomerge.io.weight_files import weights_file
 from topomerge.kernels.votes import summed_votes
@@ -85,9 +85,12 @@ class RoomOdds:
         return float((self.certainty**2).sum())
 
 
-def room_odds(a: Rows, b: Rows) -> tuple[RoomOdds, ...]:
+def room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOdds, ...]:
     """Partners of the rooms of two maps at each of four quarter turns of the second one; none where the rows are not those of the
     embedder that the network was trained with, or a map has no rooms.
+
+    Args:
+        likeliest: only at the turn that rows vote for (`turns.quarters_between`).
 
     Raises:
         InputError: the network is damaged.
@@ -97,6 +100,9 @@ def room_odds(a: Rows, b: Rows) -> tuple[RoomOdds, ...]:
         if not isinstance(rows, TurnedRows) or not len(rows) or rows.facts is None or rows.embedder != embedder_of(weights):
             return ()
     assert isinstance(a, TurnedRows) and isinstance(b, TurnedRows)
+    if likeliest:
+        k = quarters_between(a, b)
+        return (replace(odds_of(rooms_seen(a), rooms_seen(b, k), weights), quarters=k),)
     return every_turn(rooms_seen(a), [rooms_seen(b, k) for k in range(QUARTERS)], weights)
 
 

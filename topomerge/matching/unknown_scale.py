@@ -23,15 +23,15 @@ def odds_at_best_scale(of_a: Rows, rows_at: RowsAt) -> tuple[float, tuple[RoomOd
         of_a: rows of the first map, whose scale is known.
         rows_at: scale -> rows of the second one (`Learned.at_scales`).
     """
-    tried: dict[float, tuple[RoomOdds, ...]] = {}
+    rows: dict[float, Rows] = {}
 
     def sureness(scale: float) -> float:
-        if scale not in tried:
-            tried[scale] = room_odds(of_a, rows_at(scale))
-        return max(turned.sureness for turned in tried[scale])
+        """At the quarter turn that most rooms which look alike vote for: all four take four times as long."""
+        rows[scale] = rows[scale] if scale in rows else rows_at(scale)
+        return room_odds(of_a, rows[scale], likeliest=True)[0].sureness
 
-    if not room_odds(of_a, rows_at(1.0)):
+    if not room_odds(of_a, rows_at(1.0), likeliest=True):
         return 1.0, ()
     best = max(COARSE_SCALES, key=sureness)
     best = max([best, best / FINE_STEP**0.5, best * FINE_STEP**0.5], key=sureness)
-    return best, tried[best]
+    return best, room_odds(of_a, rows[best])
