@@ -8,6 +8,7 @@ import pytest
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
 from topomerge import load_embedder
+from topomerge.fusion.merge import merge
 from topomerge.matching.match import match
 from topomerge.matching.unknown_scale import COARSE_SCALES, odds_at_best_scale
 
@@ -38,3 +39,12 @@ def test_matching_at_unknown_scale_says_which_it_took() -> None:
 
 def test_an_embedder_without_a_matcher_has_no_say() -> None:
     assert odds_at_best_scale(np.eye(3), lambda scale: np.eye(3)) == (1.0, ())
+
+
+@pytest.mark.longer
+def test_poses_of_rooms_alone_have_their_scale() -> None:
+    a = building(3)
+    b, true = turned(a, (3.0, 1.0, 0.0), 1.25)
+    merged = merge([a, b], poses="rooms", scale="free")
+    assert merged.registration is not None and merged.registration.transform is not None
+    assert merged.registration.transform.scale == pytest.approx(true.scale, rel=0.02)
