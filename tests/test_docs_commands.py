@@ -51,7 +51,9 @@ def take(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         Exception: it does not take them.
     """
     if words[0] == "train.py":
-        importlib.import_module("topomerge.training.tasks").settings_of(words[1:])
+        importlib.import_module("topomerge.training.tasks").settings_of(
+            [w for w in words[1:] if w != "-m"]
+        )  # of a sweep, its start
         return
     if words[0] == "evaluate.py":
         from topomerge.config import compose
