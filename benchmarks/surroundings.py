@@ -72,8 +72,9 @@ def ranks(pair: EvaluationPair, describe: Learned) -> list[Row]:
         counts = rank_counts(pair, descriptor_costs(rows, turned))
         out.append({**head, "way": LEARNED, "degrees": degrees, "turned": right, **counts})
     quarters, alike = likenesses(crops(read), crops(other))
-    surest = max(room_odds(rows, describe.graph(other)[0]), key=lambda turned: turned.sureness)
-    scale, odds = odds_at_best_scale(rows, describe.at_scales(b))
+    plain = describe.graph(other)[0]
+    surest = max(room_odds(rows, plain), key=lambda turned: turned.sureness)
+    scale, odds = odds_at_best_scale(rows, plain, describe.at_scales(b))
     unscaled = max(odds, key=lambda turned: turned.sureness)
     ways = [
         (UNTRAINED, quarters, alike),

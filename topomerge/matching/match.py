@@ -113,7 +113,7 @@ def _odds(
         return room_odds(*rows)
     if not hasattr(describe, "at_scales"):
         return ()
-    statistics["scale"], odds = odds_at_best_scale(rows[0], describe.at_scales(b))
+    statistics["scale"], odds = odds_at_best_scale(*rows, describe.at_scales(b))
     return odds
 
 

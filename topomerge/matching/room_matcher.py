@@ -87,7 +87,7 @@ class RoomOdds:
 
 def room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOdds, ...]:
     """Partners of the rooms of two maps at each of four quarter turns of the second one; none where the rows are not those of the
-    embedder that the network was trained with, or a map has no rooms.
+    embedder that the network was trained with, or a map has no rooms. Which map is given first changes nothing.
 
     Args:
         likeliest: only at the turn that rows vote for (`turns.quarters_between`).
@@ -100,10 +100,19 @@ def room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOdds, ...]
         if not isinstance(rows, TurnedRows) or not len(rows) or rows.facts is None or rows.embedder != embedder_of(weights):
             return ()
     assert isinstance(a, TurnedRows) and isinstance(b, TurnedRows)
+    if _order(b) < _order(a):  # rows are read as they are turned: the second map as the first one stands
+        swapped = [RoomOdds(o.columns, o.rows, -o.quarters % QUARTERS) for o in room_odds(b, a, likeliest)]
+        return tuple(sorted(swapped, key=lambda turned: turned.quarters))
     if likeliest:
         k = quarters_between(a, b)
         return (replace(odds_of(rooms_seen(a), rooms_seen(b, k), weights), quarters=k),)
     return every_turn(rooms_seen(a), [rooms_seen(b, k) for k in range(QUARTERS)], weights)
+
+
+def _order(rows: TurnedRows) -> tuple[int, float]:
+    """That of two maps, whichever is given first."""
+    assert rows.facts is not None
+    return len(rows), float(rows.facts.sum())
 
 
 def certainty_of_turns(odds: Sequence[RoomOdds]) -> Array:

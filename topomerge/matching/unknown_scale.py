@@ -15,14 +15,17 @@ FINE_STEP = COARSE_SCALES[1] / COARSE_SCALES[0]
 RowsAt = Callable[[float], Rows]
 
 
-def odds_at_best_scale(of_a: Rows, rows_at: RowsAt) -> tuple[float, tuple[RoomOdds, ...]]:
+def odds_at_best_scale(of_a: Rows, of_b: Rows, rows_at: RowsAt) -> tuple[float, tuple[RoomOdds, ...]]:
     """m that the unit of the second map is taken for, and the partners of the rooms of both maps at each quarter turn then; 1 and
     none where the rows are of an embedder for which there is no such network.
 
     Args:
         of_a: rows of the first map, whose scale is known.
+        of_b: rows of the second one as it is.
         rows_at: scale -> rows of the second one (`Learned.at_scales`).
     """
+    if not room_odds(of_a, of_b, likeliest=True):
+        return 1.0, ()
     rows: dict[float, Rows] = {}
 
     def sureness(scale: float) -> float:
@@ -30,8 +33,6 @@ def odds_at_best_scale(of_a: Rows, rows_at: RowsAt) -> tuple[float, tuple[RoomOd
         rows[scale] = rows[scale] if scale in rows else rows_at(scale)
         return room_odds(of_a, rows[scale], likeliest=True)[0].sureness
 
-    if not room_odds(of_a, rows_at(1.0), likeliest=True):
-        return 1.0, ()
     best = max(COARSE_SCALES, key=sureness)
     best = max([best, best / FINE_STEP**0.5, best * FINE_STEP**0.5], key=sureness)
     return best, room_odds(of_a, rows[best])
