@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
-from topomerge.extraction.elevations.colour_network import INPUTS
-from topomerge.extraction.elevations.elevation import WALL_CLASSES
+from topomerge.extraction.elevations.colour_network import COLOUR_CLASSES, INPUTS
 from topomerge.extraction.elevations.wall_network import ALONG_LAYERS, DILATIONS, TAPS
 from topomerge.types import Array
 
@@ -28,7 +27,7 @@ class ColourNetwork(nn.Module):
         self.along = nn.ModuleList(
             nn.Conv1d(width, width, TAPS, padding=TAPS // 2 * dilation, dilation=dilation) for dilation in DILATIONS
         )
-        self.out = nn.Linear(width, len(WALL_CLASSES))
+        self.out = nn.Linear(width, len(COLOUR_CLASSES))
         self.dropout = nn.Dropout(dropout)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)

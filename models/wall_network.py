@@ -17,7 +17,7 @@ from topomerge.types import Array
 
 
 class WallNetwork(nn.Module):
-    """(n, 14, w, 32) strips along walls to (n, 4, w / 2) scores of `WALL_CLASSES`.
+    """(n, 17, w, 32) strips along walls to (n, 7, w / 2) scores of `WALL_CLASSES`.
 
     Args:
         widths: channels of the two convolutions, of the layer of all depths, and of those along the wall.

@@ -91,11 +91,11 @@ def _edges(rooms_a_storey: int, doors: Array, storeys: int, at: Array, rooms: Ar
             centre = at + (np.array([x, y + 0.5, s * HEIGHT + 1])) * EDGE
             kind = "opening" if a % 3 == 2 else "door"
             ends = (a + s * rooms_a_storey, b + s * rooms_a_storey)
-            edges[k] = (ends, centre, 1.0, 2.0, np.pi / 2, kind, True, 1.0, centre, centre)
+            edges[k] = (ends, centre, 1.0, 2.0, np.pi / 2, kind, True, False, 1.0, centre, centre)
             k += 1
         if s:
             hall = (s + 1) * rooms_a_storey - 1
-            edges[k] = ((hall - rooms_a_storey, hall), rooms["centroid"][hall], 1.2, 2.0, 0.0, "stairs", True, 1.0, 0, 0)
+            edges[k] = ((hall - rooms_a_storey, hall), rooms["centroid"][hall], 1.2, 2.0, 0.0, "stairs", True, False, 1.0, 0, 0)
             edges["centre"][k, 0] += 3
             k += 1
     return edges

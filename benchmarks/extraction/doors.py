@@ -34,11 +34,11 @@ from topomerge.types import Array, TopometricMap
 
 DOOR_SEEDS, PAINTED_SEEDS, TRAINING = 800_720, 800_760, 5_700  # first seeds
 FRAMES = 0.7  # share of the doors with frames and handles
-STATES = ("open", "half", "shut")
+STATES, SAID = ("open", "half", "shut"), ("right", "said", "said half")
 SHOWN_BY = PLAN, WALLS, COLOURS = "plan", "plan and walls", "plan, walls and colours"
 
 DOOR_COLUMNS = ("sensor", "doors by", "true doors", *STATES)
-DOOR_COLUMNS += ("precision", "called shut: right", "edges P", "edges R", "rooms IoU", "s")
+DOOR_COLUMNS += ("precision", "called shut: right", "called half open: right", "edges P", "edges R", "rooms IoU", "s")
 Row = dict[str, Any]
 
 
@@ -80,9 +80,11 @@ def judged(case: Case, scan: Scan, how: str) -> Row:
         row[name] = np.array([int((there & own).sum()), int(own.sum())])
     row["right"] = np.array([verdict.doors.right, verdict.doors.extracted])
     said_shut = ~edges["open"] & ~_looked_into(map, edges)
-    really = np.zeros(len(edges), bool)
-    really[pairs[:, 1]] = state[pairs[:, 0]] == "shut"
-    row["said"] = np.array([int((said_shut & really).sum()), int(said_shut.sum())])
+    said_half = edges["half"] & ~_looked_into(map, edges)
+    for name, said, true in (("said", said_shut, "shut"), ("said half", said_half, "half")):
+        really = np.zeros(len(edges), bool)
+        really[pairs[:, 1]] = state[pairs[:, 0]] == true
+        row[name] = np.array([int((said & really).sum()), int(said.sum())])
     return row
 
 
@@ -107,9 +109,9 @@ def table(rows: list[Row]) -> str:
             some = [r for r in rows if r["how"] == how and sensor in (r["sensor"], "all")]
             if not some:
                 continue
-            total = {name: sum(r[name] for r in some) for name in (*STATES, "right", "said")}
+            total = {name: sum(r[name] for r in some) for name in (*STATES, *SAID)}
             count = sum(int(total[name][1]) for name in STATES)
-            shares = [share(total[name]) for name in (*STATES, "right", "said")]
+            shares = [share(total[name]) for name in (*STATES, *SAID)]
             edges = np.nanmean([r["edges"] for r in some], axis=0)
             rest = [*edges, np.mean([r["iou"] for r in some]), np.mean([r["seconds"] for r in some])]
             lines.append(f"| {sensor} | {how} | {count} | {' | '.join(shares)} | {' | '.join(f'{v:.2f}' for v in rest)} |")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 from topomerge.datasets.buildings import fittings
+from topomerge.datasets.buildings.niches import wall_niches
 from topomerge.datasets.buildings.openings import Hole, storey_holes, true_doors
 from topomerge.datasets.buildings.spaces import Space, footprint, numbered, storey_spaces, true_room
 from topomerge.datasets.buildings.stairs import staircase
@@ -52,7 +53,8 @@ def erect(
     spaces = numbered(spaces)
     holes = [h for k, plan in enumerate(plans) for h in storey_holes(plan, k, spaces, difficulty, rng)]
     stairs, wells, soup = _stairs(plans, floors, spaces)
-    _shell(spaces, holes, wells, floors, soup)
+    hollows, niches = wall_niches(spaces, holes, difficulty.niches, rng)
+    _shell(spaces, holes, [*wells, *hollows], floors, soup)
     doors = true_doors(holes, spaces, difficulty, rng)
     things = fittings.fit(soup, plans, spaces, holes, doors, stairs, difficulty, rng)
     vertices, triangles, labels, thing_of = soup.arrays()
@@ -60,7 +62,9 @@ def erect(
     levels["floor"], levels["ceiling"] = floors[:-1], [z + p.ceiling for z, p in zip(floors, plans, strict=False)]
     recorded = {"difficulty": asdict(difficulty), **(parameters or {})}
     rooms = tuple(true_room(s) for s in spaces if s.room >= 0)
-    return Building(name, kind, vertices, triangles, labels, thing_of, rooms, doors, stairs, levels, things, seed, recorded)
+    return Building(
+        name, kind, vertices, triangles, labels, thing_of, rooms, doors, stairs, levels, things, seed, recorded, niches
+    )
 
 
 def _stairs(plans: Sequence[Plan], floors: Array, spaces: list[Space]) -> tuple[Array, list[Prism], Soup]:

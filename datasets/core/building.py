@@ -54,6 +54,16 @@ STAIR_DTYPE = np.dtype(
     ]
 )
 LEVEL_DTYPE = np.dtype([("floor", "f8"), ("ceiling", "f8")])  # m; the ceiling is that of most rooms
+NICHE_DTYPE = np.dtype(
+    [
+        ("centre", "f8", 3),  # of its footprint, on the room's floor
+        ("width", "f8"),  # m
+        ("depth", "f8"),
+        ("direction", "f8"),  # rad, into the wall, away from its room
+        ("bottom", "f8"),  # m above the floor
+        ("top", "f8"),
+    ]
+)
 THING_DTYPE = np.dtype(
     [
         ("kind", "U12"),  # desk, chair, leaf, column, lamp, ...
@@ -84,6 +94,7 @@ class Building:
         stairs: (S,) STAIR_DTYPE, one row a flight between two neighbouring storeys.
         storeys: (L,) LEVEL_DTYPE, lowest first.
         things: (M,) THING_DTYPE, furniture, door leaves, columns, lamps: everything that stands in the rooms.
+        niches: (N,) NICHE_DTYPE, recesses of walls; those that are made of a building (`bent`, `twin_wing`) have none.
         seed: what it was made from; -1 for a real plan whose furniture was not drawn.
         parameters: what it was made with.
     """
@@ -101,6 +112,7 @@ class Building:
     things: Array
     seed: int = -1
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    niches: Array = field(default_factory=lambda: np.zeros(0, NICHE_DTYPE))
 
     def __post_init__(self) -> None:
         count = len(self.triangles)

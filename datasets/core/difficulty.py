@@ -35,6 +35,7 @@ class Difficulty:
         spread: how much rooms of a kind differ in width: share that are half as wide again or more.
         frames: share of the doors with a frame around them and handles, whose leaves stand anywhere in the wall's thickness; the
             leaves of the others lie in the wall's face.
+        niches: share of the longer walls with a recess, as deep as what is behind allows.
     """
 
     lintels: float = 0.9
@@ -60,6 +61,7 @@ class Difficulty:
     closets: float = 0.12
     spread: float = 0.2
     frames: float = 0.0
+    niches: float = 0.0
 
     def __post_init__(self) -> None:
         limits = {"furniture": 3.0, "clutter": 5.0, "people": 5.0}

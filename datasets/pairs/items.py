@@ -25,6 +25,7 @@ from topomerge.io.listing import plain
 PAIR_FORMAT = 13
 EXTRACTION = "topomerge.extraction.extract"
 MAKER = "topomerge.datasets.pairs.example"  # what makes the files
+UNDRAWN = ("niches",)  # of the difficulty: younger than the names of cached pairs, which hold what is drawn
 CANDIDATES = 4  # buildings tried for an item: not every one has two parts with the overlap that is wanted
 TWINS = 6  # rooms over rooms of the same outline, from which on two real storeys are hard to tell apart
 
@@ -180,7 +181,8 @@ def _pick(weights: Mapping[str, float], rng: np.random.Generator) -> str:
 
 def _difficulty(spread: float, rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
     """Every number of the difficulty about its default."""
-    drawn = {f.name: round(float(f.default * rng.uniform(1 - spread, 1 + spread)), 3) for f in fields(Difficulty)}  # type: ignore[operator]
+    drawn_fields = [f for f in fields(Difficulty) if f.name not in UNDRAWN]
+    drawn = {f.name: round(float(f.default * rng.uniform(1 - spread, 1 + spread)), 3) for f in drawn_fields}  # type: ignore[operator]
     drawn = {name: value if name in ("furniture", "clutter", "people") else min(value, 1.0) for name, value in drawn.items()}
     drawn["half"] = min(drawn["half"], round(1 - drawn["open"], 3))
     return tuple(sorted(drawn.items()))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -47,7 +48,7 @@ class PlanRecipe:
         split: train, validation or test: of which real plans, and in which range the seeds lie.
         scans: how many; seed: of the first one, from the beginning of the split's range on.
         folder: of the real data; empty: procedural buildings only.
-        flat: slices and grid maps, where walls are learned from; sparse: share of scans that lose most of their points, there;
+        flat: slices, robots' grids and drawings alone; sparse: share of scans that lose most of their points, there;
             painted: share of scans with colours or intensities, there.
     """
 
@@ -100,7 +101,7 @@ def check_plans(recipe: PlanRecipe) -> None:
 
 def build_plans(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
     """The files of a set, made where they are missing, in the order of the seeds."""
-    return build_scans(recipe, "plans", draw_item, make_plan_file, sharing, say)
+    return build_scans(recipe, "plans", partial(draw_item, flat=recipe.flat), make_plan_file, sharing, say)
 
 
 def build_scans(

@@ -18,6 +18,7 @@ RASTER_CELL = 0.05  # m, of the rasters of what is true
 WALL_REACH = 0.4  # m: so far from a room it is wall, further outside
 LEVEL_TOLERANCE = 0.6  # m between a storey and the true floor
 DRAWN_HEIGHT = 1.0  # m: lower furniture is in a drawn grid
+RAISED_WALL = 2.4  # m: to this height its walls are raised
 HUNG_KINDS = ("leaf", "board", "lamp", "beam", "duct")  # in no drawn grid
 
 
@@ -77,7 +78,7 @@ def drawn_map(building: Building, visited: Array, rng: np.random.Generator) -> P
                 fill(solid, (box - low) / RASTER_CELL, 1)
     solid &= near_mask(np.isin(room, visited), 0.3)
     solid |= free & (rng.random(free.shape) < rng.choice([0.0, 0.002]))
-    levels = np.arange(0.0, 2.4 + 1e-6, 0.1)
+    levels = np.arange(0.0, RAISED_WALL + 1e-6, RASTER_CELL)  # as close as files are raised: no cell of a wall stays empty
     walls, floor = ((np.argwhere(m)[:, ::-1] + 0.5) * RASTER_CELL + low for m in (solid, free & ~solid))
     points = np.column_stack([np.repeat(walls, len(levels), axis=0), np.tile(levels, len(walls))])
     points = np.concatenate([points, np.column_stack([floor, np.zeros(len(floor))])])

@@ -21,6 +21,7 @@ from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.core.plan import Plan
 from topomerge.datasets.pairs.items import digest
 from topomerge.datasets.pairs.plan_truth import drawn_map
+from topomerge.datasets.pairs.robot_grid import robot_grid
 from topomerge.datasets.simulation.scanner import scan
 from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.spoils import drift_between, exact_sensor, spoilt, upper_half
@@ -29,9 +30,12 @@ from topomerge.datasets.simulation.walk import part
 from topomerge.io.listing import plain
 from topomerge.types import Array, PointCloud, Sim3
 
-PLAN_FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names
+PLAN_FORMAT = 3  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.55, "r2v": 0.3, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.16, "lidar": 0.16, "depth": 0.12, "tablet": 0.12, "mono": 0.08, "laser2d": 0.2, "drawn": 0.16}
+# Of what robots and draughtsmen leave: grids of 2D lasers, drawings, and slices.
+FLAT_SOURCE_SHARES = {"procedural": 0.35, "r2v": 0.5, "campus": 0.15}
+FLAT_SENSOR_SHARES = {"robot": 0.5, "drawn": 0.3, "laser2d": 0.2}
 SPOIL_SHARES = {"": 0.48, "sparse": 0.16, "noise": 0.1, "below2": 0.1, "drift": 0.06, "above": 0.1}  # above: no lower half
 ROOMS_VISITED = (4, 9)  # at least, less than
 Plans = Mapping[str, Sequence[tuple[str, Plan]]]
@@ -40,13 +44,14 @@ Plans = Mapping[str, Sequence[tuple[str, Plan]]]
 @dataclass(frozen=True)
 class PlanItem:
     """Everything that the bytes of one file depend on: the seed, where the building is from, of how many plans one was drawn,
-    which, and its digest."""
+    which, and its digest; and is it a slice, a grid or a drawing?"""
 
     seed: int
     source: str
     candidates: int
     plan: str
     digest: str
+    flat: bool = False
 
     @property
     def name(self) -> str:
@@ -86,37 +91,44 @@ def scan_of_item(item: PlanItem, plan: Plan | None) -> SimulatedScan:
     seed = item.seed
     rng = np.random.default_rng(seed)
     difficulty = draw_difficulty(rng)
-    source, sensor = _draw_source(rng)
+    source, sensor = _draw_source(rng, item.flat)
     if plan is not None:
         rng.integers(item.candidates)  # which plan: drawn already
         building = erect([plan], difficulty, rng, f"{source}-{seed}")
     else:
-        floors = 1 if sensor in ("laser2d", "drawn") else int(rng.choice([1, 1, 1, 2]))
+        floors = 1 if sensor in FLAT_SENSOR_SHARES else int(rng.choice([1, 1, 1, 2]))
         building = make_building(str(rng.choice(BUILDING_KINDS)), seed, floors, difficulty)
     visited = part(building, int(rng.integers(*ROOMS_VISITED)), rng)
     if sensor == "drawn":
         cloud, shift = drawn_map(building, visited, rng), None
+    elif sensor == "robot":
+        cloud, shift = replace(robot_grid(building, get_sensor("laser2d"), visited, rng, Sim3()), rooms=(), labels=None), None
     else:
         cloud, shift = scanned(building, sensor, visited, rng, seed)
     frame = Sim3(float(rng.uniform(-np.pi, np.pi)) if rng.random() < 0.75 else 0.0)
     return SimulatedScan(building, sensor, visited, cloud, shift, frame)
 
 
-def draw_item(seed: int, plans: Plans) -> PlanItem:
-    """The item of a seed; `make_examples` draws the same numbers again."""
+def draw_item(seed: int, plans: Plans, flat: bool = False) -> PlanItem:
+    """The item of a seed; `make_examples` draws the same numbers again.
+
+    Args:
+        flat: a slice, a robot's grid or a drawing.
+    """
     rng = np.random.default_rng(seed)
     draw_difficulty(rng)
-    source, _ = _draw_source(rng)
+    source, _ = _draw_source(rng, flat)
     entries = plans.get(source, ())
     if not entries:
-        return PlanItem(seed, "procedural", 0, "", "")
+        return PlanItem(seed, "procedural", 0, "", "", flat)
     name, plan = entries[int(rng.integers(len(entries)))]
-    return PlanItem(seed, source, len(entries), name, digest((plan,)))
+    return PlanItem(seed, source, len(entries), name, digest((plan,)), flat)
 
 
-def _draw_source(rng: np.random.Generator) -> tuple[str, str]:
-    source = str(rng.choice(list(SOURCE_SHARES), p=list(SOURCE_SHARES.values())))
-    return source, str(rng.choice(list(SENSOR_SHARES), p=list(SENSOR_SHARES.values())))
+def _draw_source(rng: np.random.Generator, flat: bool) -> tuple[str, str]:
+    sources, sensors = (FLAT_SOURCE_SHARES, FLAT_SENSOR_SHARES) if flat else (SOURCE_SHARES, SENSOR_SHARES)
+    source = str(rng.choice(list(sources), p=list(sources.values())))
+    return source, str(rng.choice(list(sensors), p=list(sensors.values())))
 
 
 def draw_difficulty(rng: np.random.Generator) -> Difficulty:

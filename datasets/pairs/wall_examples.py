@@ -55,7 +55,7 @@ from topomerge.io import archive
 from topomerge.io.listing import plain
 from topomerge.types import ROOM_DTYPE, Array, PointCloud, Sim3, TopometricMap, VoxelGrid
 
-WALL_FORMAT = 5  # raise it when the same item gives other bytes: it is part of the files' names
+WALL_FORMAT = 6  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.6, "r2v": 0.25, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.35, "depth": 0.25, "lidar": 0.2, "tablet": 0.12, "mono": 0.08}
 MAP_CELL = 0.1  # m
@@ -69,10 +69,15 @@ FRAMES, FRAMES_PAINTED = (0.3, 1.0), (0.0, 0.8)  # share of the doors with a fra
 SLICE_SHARE, POSED_SHARE = 0.6, 0.6  # of flat maps by a 2D laser, and of these with the sensor's places
 LOST_BY_CHANCE, SHARE_LEFT = 0.5, (0.03, 0.3)
 SPACING_LEFT = (0.05, 0.2)  # m
+NICHES = 0.25  # share of the longer walls with a recess, at most
+CUPBOARDS = ("shelf", "cabinet", "wardrobe", "kitchen", "locker")  # kinds of furniture that stand before walls
+LEAST_CUPBOARD = 0.75  # m, height
+IN_ROOM = 0.1  # m behind a face, at most, is the front of what stands in its room
 DEEP = 0.3  # m beside a wall's middle: a strip there is of that wall
 ASKEW = 0.26  # sine of the angle between a wall and a strip along it
 SAME_FLOOR = 0.6  # m between floors of one storey
 WALL_ARRAYS = ("first", "strips", "truth", "doors", "faces")
+DOOR_STATES = {"open": ("open", "none"), "half": ("half",), "shut": ("shut",)}  # of each class
 MAP_ARRAYS, ROOMS_HELD = ("edges", "storeys", "navigable_room"), ("storey", "completeness")
 NO_WALLS = Elevations(np.zeros(0, FACE_DTYPE), np.zeros(1, np.int64), np.zeros((0, DEPTHS, STRIP_CHANNELS), np.float32))
 
@@ -98,7 +103,7 @@ class WallExample:
 
     Args:
         first: (F + 1,) the first place of each wall.
-        strips: (n, 32, 14) uint8, of 255, as of `Elevations`.
+        strips: (n, 32, 17) uint8, of 255, as of `Elevations`.
         truth: (n,) uint8, index into `WALL_CLASSES`.
         doors: (D, 3) where the true doors are, m, in the map's frame.
         map: the map, without its cells; of the rooms storey and completeness alone, of the edges what the plans show.
@@ -194,6 +199,8 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     rng = np.random.default_rng([seed, 8])
     frames = FRAMES_PAINTED if item.shades else FRAMES
     difficulty = replace(draw_difficulty(rng), frames=float(rng.uniform(*frames)))
+    if not item.flat:  # what a slice shows of a recess is the same wall elsewhere
+        difficulty = replace(difficulty, niches=float(np.random.default_rng([seed, 13]).uniform(0, NICHES)))
     if plan is not None:
         building = erect([plan], difficulty, rng, f"{item.source}-{seed}")
     else:
@@ -204,7 +211,7 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     cloud = replace(moved(thinned(cloud, seed) if item.sparse else cloud, frame), rooms=())
     scan, _, floor, map = rooms_and_passages(cloud, MAP_CELL, PRESETS["default"], Stopwatch())
     cells = scan.grid if rng.random() < COARSE_SHARE else voxelise(cloud, FINE_CELL)
-    walls = NO_WALLS if item.flat else wall_elevations(map, cells, scan.shades)
+    walls = NO_WALLS if item.flat else wall_elevations(map, cells, scan.shades, scan.crossed)
     if not item.flat and not len(walls.faces):
         raise InputError(f"{seed}: no wall was seen")
     strips, truth = np.rint(255 * walls.strips).astype(np.uint8), true_classes(building, walls, frame, shift)
@@ -264,20 +271,46 @@ def true_classes(building: Building, walls: Elevations, frame: Sim3, shift: tupl
     place = np.arange(len(truth)) - np.repeat(walls.first[:-1], np.diff(walls.first))
     face = walls.faces[np.repeat(np.arange(len(walls.faces)), np.diff(walls.first))]
     at = face["start"] + (place + 0.5)[:, None] * ALONG * face["along"]
-    ends = [frame.inverse().apply(np.column_stack([p, face["floor"]])) for p in (at, at + 0.01 * face["along"])]
+    beside = (at, at + 0.01 * face["along"], at + 0.01 * face["out"])
+    ends = [frame.inverse().apply(np.column_stack([p, face["floor"]])) for p in beside]
     if shift is not None:
-        ends = [p + shift[1][cKDTree(shift[0]).query(ends[0])[1]] for p in ends]
-    at, along = ends[0], (ends[1] - ends[0])[:, :2] / 0.01
-    for name, holes in (("window", panes(building)), ("open", _doors(building, False)), ("shut", _doors(building, True))):
+        undone = shift[1][cKDTree(shift[0]).query(ends[0])[1]]
+        ends = [p + undone for p in ends]
+    at, along, out = ends[0], (ends[1] - ends[0])[:, :2] / 0.01, (ends[2] - ends[0])[:, :2] / 0.01
+    holes_of = {"cupboard": cupboards(building), "niche": niches_of(building), "window": panes(building)}
+    holes_of |= {name: _doors(building, states) for name, states in DOOR_STATES.items()}
+    for name, holes in holes_of.items():
         for x, y, z, direction, width, thickness in holes:
             normal = np.array([np.cos(direction), np.sin(direction)])
             off = at[:, :2] - (x, y)
-            across, beside = np.abs(off @ normal), np.abs(off @ (-normal[1], normal[0]))
-            within = (across < thickness / 2 + DEEP) & (beside < width / 2) & (np.abs(along @ normal) < ASKEW)
+            across, aside = np.abs(off @ normal), np.abs(off @ (-normal[1], normal[0]))
+            within = (across < thickness / 2 + DEEP) & (aside < width / 2) & (np.abs(along @ normal) < ASKEW)
+            if name == "niche":  # the wall's other face does not show it
+                within &= out @ normal > 0
+            elif name == "cupboard":  # nor what stands behind the wall
+                within &= -(off * out).sum(axis=1) < thickness / 2 + IN_ROOM
             truth[within & (np.abs(at[:, 2] - z) < SAME_FLOOR)] = WALL_CLASSES.index(name)
     return truth
 
 
-def _doors(building: Building, shut: bool) -> Sequence[tuple[float, ...]]:
-    doors = building.doors[(building.doors["state"] == "shut") == shut]
+def cupboards(building: Building) -> Sequence[tuple[float, ...]]:
+    """As `_doors`, the furniture that stands before walls and is as high as a table or higher."""
+    things = building.things
+    tall = np.isin(things["kind"], CUPBOARDS) & (things["size"][:, 2] >= LEAST_CUPBOARD)
+    rows = []
+    for thing in things[tall]:
+        x, y, z = thing["centre"].tolist()
+        wide, deep, high = thing["size"].tolist()
+        rows.append((x, y, z - high / 2, float(thing["yaw"]) + np.pi / 2, wide, deep))
+    return rows
+
+
+def niches_of(building: Building) -> Sequence[tuple[float, ...]]:
+    """As `_doors`, the recesses of walls."""
+    return [(*n["centre"].tolist(), float(n["direction"]), float(n["width"]), float(n["depth"])) for n in building.niches]
+
+
+def _doors(building: Building, states: Sequence[str]) -> Sequence[tuple[float, ...]]:
+    """Middle on the floor (m), direction of the normal (rad), width and thickness (m) of the doors that stand so."""
+    doors = building.doors[np.isin(building.doors["state"], states)]
     return [(*d["centre"].tolist(), *(float(d[k]) for k in ("direction", "width", "thickness"))) for d in doors]

@@ -84,6 +84,16 @@ def test_flying_points_do_not_shut_a_door():
     assert len(extract(points).edges) == 1
 
 
+def test_a_floor_between_solid_walls_is_no_noise():
+    """Draughtsmen fill walls, and robots' images may be black all around: most cells then have all 26 neighbours."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*(np.arange(0.025, 6, 0.05),) * 2))
+    free = (np.abs(x - 3) < 2) & (np.abs(y - 3) < 1.5)
+    heights = np.arange(0, 2.5, 0.05)
+    walls = np.column_stack([np.tile(x[~free], len(heights)), np.tile(y[~free], len(heights)), np.repeat(heights, (~free).sum())])
+    result = extract(np.concatenate([walls, np.column_stack([x[free], y[free], 0 * x[free]])]))
+    assert len(result.rooms) == 1 and 11 < result.rooms["area"][0] < 14
+
+
 @pytest.mark.longer
 def test_the_thesis_cuts_the_corridor():
     """Its known fault, kept: the range of 5 m cuts what is longer (findings.md)."""

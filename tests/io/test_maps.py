@@ -16,7 +16,7 @@ from tests.scenes_map import building, same
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.io.maps import OLDER_ROOMS, load_map, map_to_json, save_json, save_map, save_rooms_ply
-from topomerge.types import EDGE_DTYPE, ROOM_DTYPE, ROOM_ODDS, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
+from topomerge.types import EDGE_DTYPE, OLDER_EDGE_DTYPE, ROOM_DTYPE, ROOM_ODDS, STOREY_DTYPE, Array, TopometricMap, VoxelGrid
 
 
 @pytest.fixture(scope="module")
@@ -311,6 +311,16 @@ def test_maps_of_earlier_versions_open(saved: Path, scene: TopometricMap, tmp_pa
     assert (opened["entered"] == ~opened["glimpsed"]).all() and (opened["entered"] == opened["whole"]).all()
     assert (opened["confidence"] == 1).all() and (opened["outside"] == 0).all()
     assert opened["glimpsed"].any() and not opened["glimpsed"].all()
+
+
+def test_maps_that_tell_no_half_open_doors_open(saved: Path, scene: TopometricMap, tmp_path: Path) -> None:
+    edges = archive.read(saved)["edges"]
+    older = np.zeros(len(edges), OLDER_EDGE_DTYPE)
+    for name in OLDER_EDGE_DTYPE.names or ():
+        older[name] = edges[name]
+    opened = load_map(rewritten(saved, tmp_path / "old.tmap", edges=older)).edges
+    assert len(opened) == len(scene.edges) > 0 and not opened["half"].any()
+    assert all((opened[name] == scene.edges[name]).all() for name in OLDER_EDGE_DTYPE.names or ())
 
 
 @pytest.mark.parametrize("name", ROOM_ODDS)

@@ -145,7 +145,7 @@ def _edge(
     place = tuple(centre.tolist())
     standing = navigable.properties.get("standing")
     passable = standing is None or bool(standing[rows].any())
-    return (tuple(int(p) for p in pair), place, width, height, across, kind, passable, 1.0, place, place)
+    return (tuple(int(p) for p in pair), place, width, height, across, kind, passable, False, 1.0, place, place)
 
 
 def _under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:

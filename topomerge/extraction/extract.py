@@ -153,7 +153,9 @@ def _with_odds_and_openings(
     if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
         return replace(map, rooms=with_outline_odds(map.rooms)), [], _Reconsidered()
     map = with_room_odds(map, scan.rays)
-    walls = wall_elevations(map, scan.fine, scan.shades) if p.walls and scan.fine is not None and len(map.rooms) else None
+    walls = None
+    if p.walls and scan.fine is not None and len(map.rooms):
+        walls = wall_elevations(map, scan.fine, scan.shades, scan.crossed)
     classes = None if walls is None else place_classes(walls)
     again = _Reconsidered()
     if walls is not None and classes is not None:

@@ -22,7 +22,7 @@ from topomerge.types import EDGE_DTYPE, Array, TopometricMap
 DOOR_SIDE = 1.0  # m around a door in which floor says which rooms it joins
 LEAST_FLOOR = 5  # cells of it, from which a map saw that side of a door
 ONE_DOOR = 1.2  # m: doors of two maps that are this close are one
-SEEN_BY_A_PART = ("centre", "lower", "upper", "direction", "width", "height", "kind", "open")  # of a door
+SEEN_BY_A_PART = ("centre", "lower", "upper", "direction", "width", "height", "kind", "open", "half")  # of a door
 
 
 class LaidPart(NamedTuple):

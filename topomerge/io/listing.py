@@ -8,7 +8,7 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
                 "bounding_box": {"min": [x, y, z], "max": [x, y, z]}, "cells",
                 "completeness", "glimpsed", "confidence", "whole", "entered", "outside"}, …],
      "edges": [{"rooms": [id, id], "door": {"centre": [x, y, z], "width", "height", "direction"}, "kind",
-                "open", "confidence", "lower": [x, y, z], "upper": [x, y, z]}, …],
+                "open", "half", "confidence", "lower": [x, y, z], "upper": [x, y, z]}, …],
      "windows": [{"rooms": [id, id], "centre": [x, y, z], "width", "sill", "head", "direction", "confidence"}, …],
      "areas": [{"id", "room", "centroid": [x, y, z], "area"}, …], "narrows": [like edges, "areas" for "rooms"],
      "storeys": [{"id", "floor", "ceiling", "area"}, …],
@@ -16,8 +16,9 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
 
 `completeness` is the share of a floor's outline at which a wall was seen; `confidence` the probability that it is a room, `whole`
 that most of it was seen, `entered` that the sensor was in it, `outside` that it is out of doors; `glimpsed` rooms were probably
-only looked into. `kind` is door, opening or stairs; `direction` is that of the wall's normal seen from above, from x towards y.
-The second room of a window is null where it leads out of doors; `sill` and `head` are m above the floor.
+only looked into. `kind` is door, opening or stairs; `half`: its leaf stands half open; `direction` is that of the wall's normal
+seen from above, from x towards y. The second room of a window is null where it leads out of doors; `sill` and `head` are m above
+the floor.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from topomerge.io.atomic import replacing
 from topomerge.types import ROOM_ODDS, TopometricMap
 
 LISTING_FORMAT = 1
+EDGE_FACTS = ("kind", "open", "half", "confidence", "lower", "upper")
 DIGITS = 6  # micrometres: the digits behind are noise
 
 
@@ -100,7 +102,7 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
 
 def _edge(edge: Any, ends: str) -> dict[str, Any]:
     door = {name: edge[name] for name in ("centre", "width", "height", "direction")}
-    return {ends: edge["rooms"], "door": door, **{name: edge[name] for name in ("kind", "open", "confidence", "lower", "upper")}}
+    return {ends: edge["rooms"], "door": door, **{name: edge[name] for name in EDGE_FACTS}}
 
 
 def _window(window: Any) -> dict[str, Any]:

@@ -29,11 +29,13 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io import archive
 from topomerge.io.listing import map_to_json, plain, save_json
+from topomerge.io.map_limits import require_compact_rooms, require_sane_counts
 from topomerge.io.rooms_ply import save_rooms_ply
 from topomerge.kernels import morton
 from topomerge.types import (
     AREA_DTYPE,
     EDGE_DTYPE,
+    OLDER_EDGE_DTYPE,
     ROOM_DTYPE,
     ROOM_ODDS,
     STOREY_DTYPE,
@@ -48,11 +50,6 @@ __all__ = ["TMAP_FORMAT", "load_map", "map_to_json", "save_json", "save_map", "s
 
 TMAP_FORMAT = 2
 KIND = "map of topomerge (.tmap)"
-# What a file may declare. The largest buildings have about 1,000 rooms, the tallest 163 storeys.
-ROOM_LIMIT, STOREY_LIMIT = 5_000, 200
-ROOM_COLUMNS, TOTAL_COLUMNS = 50_000_000, 100_000_000  # of the grid, in the rectangle around a room's floor, and around each
-CONNECTION_LIMIT = 30_000  # of edges, areas, narrows and windows each, however many rooms there are
-EDGES_PER_ROOM, AREAS_PER_ROOM, WINDOWS_PER_ROOM = 20, 20, 100  # on average
 COORDINATE_LIMIT = 1e9  # m, either way: beyond, float64 is coarser than 0.1 micrometres
 AREA_LIMIT = 1e12  # m2, and m3 for volumes
 SHORTEST_CELL_EDGE, LONGEST_CELL_EDGE = 0.001, 10.0  # m
@@ -189,19 +186,29 @@ def _table(arrays: dict[str, Array], name: str, dtype: np.dtype[Any]) -> Array:
     return table.astype(dtype, copy=False)
 
 
+def _widened(table: Array, dtype: np.dtype[Any]) -> Array:
+    """A table with more columns, 0 in the new ones."""
+    out = np.zeros(len(table), dtype)
+    for name in table.dtype.names or ():
+        out[name] = table[name]
+    return out
+
+
 def _rooms(arrays: dict[str, Array]) -> Array:
     """The table of rooms. Files of earlier versions say no probabilities: there a glimpsed room was not entered."""
     if arrays["rooms"].dtype == OLDER_ROOMS:
-        older = _table(arrays, "rooms", OLDER_ROOMS)
-        rooms = np.zeros(len(older), ROOM_DTYPE)
-        for name in OLDER_ROOMS.names or ():
-            rooms[name] = older[name]
-        return with_outline_odds(rooms)
+        return with_outline_odds(_widened(_table(arrays, "rooms", OLDER_ROOMS), ROOM_DTYPE))
     rooms = _table(arrays, "rooms", ROOM_DTYPE)
     for name in ROOM_ODDS:
         if not ((rooms[name] >= 0) & (rooms[name] <= 1)).all():
             raise ValueError(f"rooms has a {name} that is not from 0 to 1")
     return rooms
+
+
+def _edges(arrays: dict[str, Array], name: str) -> Array:
+    """A table of edges. Files of earlier versions do not tell half-open doors from open ones."""
+    older = arrays[name].dtype == OLDER_EDGE_DTYPE
+    return _widened(_table(arrays, name, OLDER_EDGE_DTYPE if older else EDGE_DTYPE), EDGE_DTYPE)
 
 
 def _windows(arrays: dict[str, Array]) -> Array:
@@ -210,46 +217,6 @@ def _windows(arrays: dict[str, Array]) -> Array:
     if (windows["width"] <= 0).any() or (windows["head"] <= windows["sill"]).any():
         raise ValueError("windows has one that is not wide or not high")
     return windows
-
-
-def _require_sane_counts(arrays: dict[str, Array]) -> None:
-    """Refuses tables longer than the cells of the map can fill, before anything is done for each of their rows.
-
-    Raises:
-        ValueError: more rooms, edges, storeys, areas, narrows or windows than a building has.
-    """
-    rooms, areas = arrays["rooms"].size, arrays["areas"].size
-    cells = arrays["room"].size + arrays["navigable_room"].size
-    limits = {
-        "rooms": (ROOM_LIMIT, ""),
-        "storeys": (STOREY_LIMIT, ""),
-        "edges": (min(EDGES_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} a room)"),
-        "areas": (min(AREAS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({AREAS_PER_ROOM} a room)"),
-        "narrows": (min(EDGES_PER_ROOM * areas, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} an area)"),
-        "windows": (min(WINDOWS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({WINDOWS_PER_ROOM} a room)"),
-    }
-    for name, (limit, share) in limits.items():
-        words = share if limit < CONNECTION_LIMIT else ""
-        if name in arrays and arrays[name].size > limit:
-            raise ValueError(f"declares {arrays[name].size:,} {name}, more than {limit:,}{words}")
-    if rooms > cells:
-        raise ValueError(f"declares {rooms:,} rooms and has only {cells:,} cells")
-
-
-def _require_compact_rooms(navigable: VoxelGrid, room: Array, rooms: int) -> None:
-    """Refuses rooms whose floor is strewn over the map: what draws a room goes through the rectangle around it.
-
-    Raises:
-        ValueError: the rectangles have more columns than those of a building.
-    """
-    inside = (room >= 0) & (room < rooms)
-    low, high = np.full((rooms, 2), np.iinfo(np.int64).max), np.full((rooms, 2), -1)
-    columns = navigable.cells[inside, :2].astype(np.int64)
-    np.minimum.at(low, room[inside], columns)
-    np.maximum.at(high, room[inside], columns)
-    sizes = np.where(high[:, 0] >= 0, np.prod(np.where(high >= 0, high - low + 1, 0), axis=1, dtype=np.float64), 0.0)
-    if sizes.max(initial=0) > ROOM_COLUMNS or sizes.sum() > TOTAL_COLUMNS:
-        raise ValueError(f"has rooms that span {sizes.sum():.2g} columns of cells, the largest {sizes.max():.2g}")
 
 
 def _limited_warnings(messages: list[Any]) -> tuple[str, ...]:
@@ -270,14 +237,13 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
     if missing := set(about["arrays"]) - set(arrays):
         raise KeyError(min(missing))
     provenance = _typed(arrays, "provenance", "u", 1).astype(np.uint32) if "provenance" in arrays else None
-    _require_sane_counts(arrays)
-    edges = _table(arrays, "edges", EDGE_DTYPE)
-    narrows = _table(arrays, "narrows", EDGE_DTYPE)
+    require_sane_counts(arrays)
+    edges, narrows = _edges(arrays, "edges"), _edges(arrays, "narrows")
     for table in (edges, narrows):
         table["kind"].tolist()  # fails here, not later, where the text is none
     navigable, navigable_room = _unpack(arrays, "navigable"), _typed(arrays, "navigable_room", "i", 1).astype(np.int32)
     if len(navigable) == len(navigable_room):  # else the map itself refuses them
-        _require_compact_rooms(navigable, navigable_room, arrays["rooms"].size)
+        require_compact_rooms(navigable, navigable_room, arrays["rooms"].size)
     return TopometricMap(
         grid=_unpack(arrays, "grid"),
         room=_typed(arrays, "room", "i", 1).astype(np.int32),

@@ -1,11 +1,13 @@
 """Task `plan_segmentation`: the network that says what stands in each column of a plan (`extraction.plans.plan_network`).
 
-Crops of simulated scans' plans, turned and mirrored, with things taken away now and then. Every n-th scan is watched.
+Crops of simulated scans' plans, turned and mirrored, with things taken away now and then. Every n-th scan is watched. The network
+of grids (`grid_segmentation`) sees the same scans as grids show them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from torch.nn import functional
 
 from topomerge.datasets.pairs.plan_examples import PlanExample, PlanRecipe, build_plans, load_examples
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
+from topomerge.datasets.pairs.scan_items import FLAT_SENSOR_SHARES
 from topomerge.errors import InputError
 from topomerge.extraction.classified_storey import COLUMN_CLASSES
 from topomerge.extraction.plans.plan_network import column_probabilities, evidence, read_weights
@@ -23,10 +26,12 @@ from topomerge.io import archive
 from topomerge.models.plan_unet import PlanUNet, exported_weights
 from topomerge.training.loop import Say, State, made_beside, mixed
 from topomerge.training.networks import NetworkJob, run_network
-from topomerge.training.scan_settings import PlanAugment, PlanLoss, PlanSegmentation
+from topomerge.training.scan_settings import GridSegmentation, PlanAugment, PlanLoss, PlanSegmentation
 from topomerge.types import Array
 
 LEAST_COLUMNS = 100  # inside of a plan that trains
+BARE_EVERY = 4  # plans that are shown as grids: one without furniture
+LASER_HEIGHTS, RAISED_HEIGHTS, FLOOR_HEIGHTS = (0.2, 0.5), (0.0, 2.4), (-0.1, 0.1)  # m: robots look there; walls of grids; floors
 UPPER_CHANNELS, FLOOR_CHANNEL = (5, 7, 8, 9), (6,)  # of `evidence`
 FLOOR_LOST = 0.3  # share of the crops without an upper half that lose their floor instead
 PlanTensors = tuple[Array, Array, Array]  # evidence, truth and weight of each column
@@ -43,6 +48,8 @@ def fit(settings: PlanSegmentation, say: Say) -> dict[str, float]:
     watched = [e for scan in scans[:: settings.hold_out] for e in scan]
     learned = [e for k, scan in enumerate(scans) if k % settings.hold_out for e in scan]
     learned = [e for e in learned if e.plan.inside.sum() > LEAST_COLUMNS]
+    if isinstance(settings, GridSegmentation):
+        learned, watched = ([as_grid(e, k % BARE_EVERY > 0) for k, e in enumerate(some)] for some in (learned, watched))
     if not learned or not watched:
         raise InputError(f"data.scans={settings.data.scans}: too few scans to train on some and watch others")
     torch.manual_seed(mixed(settings.seed))
@@ -103,6 +110,23 @@ class PlanJob(NetworkJob):
     def write_weights(self, path: Path) -> None:
         """An archive of arrays."""
         archive.write(self.weights(), path)
+
+
+def as_grid(example: PlanExample, furnished: bool) -> PlanExample:
+    """The plan of a scan as a robot would leave it, or a draughtsman: walls alone, all raised alike. Grids stay as they are.
+
+    Args:
+        furnished: with what a laser meets near the floor as walls.
+    """
+    plan = example.plan
+    if example.source.split("/")[0] in FLAT_SENSOR_SHARES:
+        return example
+    standing = plan.occupied(*LASER_HEIGHTS) & plan.inside if furnished else np.zeros_like(plan.wall)
+    wall, inside = plan.wall | standing, plan.inside & ~standing
+    full, floor = (plan.profile.dtype.type(plan.bands.mask(*heights)) for heights in (RAISED_HEIGHTS, FLOOR_HEIGHTS))
+    profile = np.where(wall, full | floor, np.where(inside, floor, plan.profile.dtype.type(0)))
+    ceiling = np.full(wall.shape, np.nan)
+    return replace(example, plan=replace(plan, wall=wall, inside=inside, profile=profile, ceiling=ceiling))
 
 
 def plan_tensors(example: PlanExample, loss: PlanLoss) -> PlanTensors:

@@ -60,16 +60,14 @@ class PlanSegmentation(RasterTask):
 
 @dataclass
 class GridSegmentation(PlanSegmentation):
-    """The same for robots' grids and drawings, by a smaller network and fewer scans: a larger one learns how grids are simulated
-    (docs/adr/0005)."""
+    """The same for robots' grids and drawings; fewer steps, as longer training learns how scans are simulated (docs/adr/0005)."""
 
     task: str = "grid_segmentation"
     name: str = "grid_segmentation"
-    epochs: int = 27
-    batch: int = 8
-    steps: int = 500
-    warmup: int = 100
-    widths: list[int] = field(default_factory=lambda: [16, 32, 40, 40, 40, 32, 16, 12])
+    epochs: int = 6
+    warmup: int = 200
+    rate: float = 3e-3
+    augment: PlanAugment = field(default_factory=lambda: PlanAugment(upper=0.0, columns=0.0))
 
 
 @dataclass
@@ -80,7 +78,7 @@ class WallAugment:
         shift: elements by which a face is moved nearer or farther, at most.
         sparse: share of stretches that lose elements; lost: share of these, drawn between 0 and this.
         hidden: share of stretches of which some is not seen up to some height.
-        walk: share of stretches without the floor that one can walk on.
+        walk: share of stretches without the floor that one can walk on; rays: and without what is known of rays.
     """
 
     shift: int = 2
@@ -88,6 +86,7 @@ class WallAugment:
     lost: float = 0.7
     hidden: float = 0.3
     walk: float = 0.15
+    rays: float = 0.4
 
 
 @dataclass
@@ -97,7 +96,7 @@ class WallTask(RasterTask):
     Args:
         steps: of an epoch; warmup: steps in which the rate rises.
         length: places of a stretch, even; at_holes: share of the stretches about the side of a door or window.
-        classes: weights of the four classes in the cross-entropy.
+        classes: weights of the classes in the cross-entropy.
     """
 
     data: PlanRecipe = field(default_factory=PlanRecipe)
@@ -121,6 +120,7 @@ class WallSegmentation(WallTask):
     task: str = "wall_segmentation"
     name: str = "wall_segmentation"
     widths: list[int] = field(default_factory=lambda: [24, 32, 96, 64])
+    classes: list[float] = field(default_factory=lambda: [1.0, 1.5, 3.0, 1.5, 2.0, 2.5, 1.0])
     unseen: float = 0.05
     augment: WallAugment = field(default_factory=WallAugment)
     watch: str = "f1_doors"

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from topomerge.errors import InputError
+from topomerge.extraction.elevations.colour_network import COLOUR_CLASSES
+from topomerge.extraction.elevations.elevation import WALL_CLASSES
 from topomerge.training.scan_settings import PlanSegmentation, WallColours, WallSegmentation, WallTask
 from topomerge.training.shared_settings import TaskSettings
 from topomerge.training.task_settings import LOOKALIKES_TAKEN, MergeBelief
@@ -54,5 +56,6 @@ def check_task(settings: TaskSettings) -> None:
     if isinstance(settings, WallTask):
         if settings.length < 8 or settings.length % 2:
             raise InputError(f"length must be an even number of places, 8 or more, not {settings.length}")
-        if len(settings.classes) != 4 or min(settings.classes) <= 0:
-            raise InputError(f"classes must be 4 weights above 0, not {settings.classes}")
+        count = len(WALL_CLASSES if isinstance(settings, WallSegmentation) else COLOUR_CLASSES)
+        if len(settings.classes) != count or min(settings.classes) <= 0:
+            raise InputError(f"classes must be {count} weights above 0, not {settings.classes}")

@@ -17,16 +17,22 @@ from torch.nn import functional
 
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import WallExample, build_walls, load_walls
-from topomerge.extraction.elevations.colour_network import LEAST_CHANCE, colour_inputs, read_network, with_colours
+from topomerge.extraction.elevations.colour_network import (
+    COLOUR_CLASSES,
+    LEAST_CHANCE,
+    coarse_classes,
+    colour_inputs,
+    read_network,
+    with_colours,
+)
 from topomerge.extraction.elevations.doorways import read_both_ways
-from topomerge.extraction.elevations.elevation import WALL_CLASSES
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.io import archive
 from topomerge.models.colour_network import ColourNetwork, exported_colours
 from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import NetworkJob, run_network
 from topomerge.training.scan_settings import ColourAugment, WallColours
-from topomerge.training.wall_segmentation import class_scores, learned_and_watched
+from topomerge.training.wall_segmentation import COARSE_CLASS, class_scores, learned_and_watched
 from topomerge.types import Array
 
 Weights = dict[str, Array]
@@ -40,7 +46,7 @@ class ColouredWalls:
         first: (F + 1,) the first place of each wall.
         colours: (n, 13, 4) float16.
         classes: (n / 2, 4) what their shape says.
-        truth: (n / 2,) index into `WALL_CLASSES`.
+        truth: (n / 2,) index into `COLOUR_CLASSES`.
     """
 
     first: Array
@@ -70,14 +76,15 @@ def coloured_walls(recipe: PlanRecipe, settings: WallColours, say: Say) -> list[
     for path in paths:
         example = load_walls(path)
         if example.colours is not None and len(example.truth):
-            scans.append(ColouredWalls(example.first, example.colours, shape_classes(example), example.truth[::PLACES]))
+            truth = COARSE_CLASS[example.truth[::PLACES]]
+            scans.append(ColouredWalls(example.first, example.colours, shape_classes(example), truth))
     return scans
 
 
 def shape_classes(example: WallExample) -> Array:
     """(n / 2, 4) float32 what the network of elevations says."""
     ends = zip(example.first[:-1].tolist(), example.first[1:].tolist(), strict=True)
-    return np.concatenate([read_both_ways(example.strips[low:high] / np.float32(255)) for low, high in ends])
+    return np.concatenate([coarse_classes(read_both_ways(example.strips[low:high] / np.float32(255))) for low, high in ends])
 
 
 class ColourJob(NetworkJob):
@@ -167,7 +174,7 @@ def _spoilt(colours: Array, augment: ColourAugment, rng: np.random.Generator) ->
 def colour_scores(scans: Sequence[ColouredWalls], weights: Weights, classes: Sequence[float]) -> dict[str, float]:
     """Over the places where a colour was seen, by shape and colours, and by shape alone (``shape_``): F1 of each class, and the
     mean logarithm of the probability of what is true, weighted by classes."""
-    table = np.zeros((2, len(WALL_CLASSES), len(WALL_CLASSES)), np.int64)
+    table = np.zeros((2, len(COLOUR_CLASSES), len(COLOUR_CLASSES)), np.int64)
     sums, total = np.zeros(2), 0.0
     for scan in scans:
         for low, high in zip(scan.first[:-1].tolist(), scan.first[1:].tolist(), strict=True):

@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from topomerge.datasets.pairs.wall_examples import WallExample, build_walls, load_walls
 from topomerge.errors import InputError
+from topomerge.extraction.elevations.colour_network import COLOUR_CLASSES, coarse_classes
 from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, STRIP_CHANNELS, WALL_CLASSES
 from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities, read_network
 from topomerge.io import archive
@@ -25,6 +26,8 @@ from topomerge.training.networks import NetworkJob, run_network
 from topomerge.training.scan_settings import WallAugment, WallSegmentation, WallTask
 from topomerge.types import Array
 
+# Index of each of `WALL_CLASSES` among those that colours tell apart: half-open doors are open, niches and cupboards are wall.
+COARSE_CLASS = coarse_classes(np.eye(len(WALL_CLASSES))).argmax(axis=1)
 ScanT = TypeVar("ScanT")
 Stretch = tuple[Array, Array, Array]  # strip, truth and weight of each place
 
@@ -143,32 +146,44 @@ def _spoilt(x: Array, augment: WallAugment, rng: np.random.Generator) -> Array:
         start, length = int(rng.integers(len(x))), int(rng.integers(4, len(x) // 2))
         x = x.copy()
         x[start : start + length, :, : int(rng.integers(1, BANDS))] = 0
-    if rng.random() < augment.walk:
-        x = x.copy()
-        x[..., BANDS:] = 0
+    for share, channels in ((augment.walk, slice(BANDS, BANDS + 1)), (augment.rays, slice(BANDS + 1, None))):
+        if rng.random() < share:
+            x = x.copy()
+            x[..., channels] = 0
     return np.ascontiguousarray(x)
 
 
 def wall_scores(examples: Sequence[WallExample], weights: dict[str, Array]) -> dict[str, float]:
-    """F1 of each class over the places where anything was seen, and the mean of those of doors."""
+    """F1 of each class over the places where anything was seen, and the mean of those of doors, open or half open, and shut."""
     table = np.zeros((len(WALL_CLASSES), len(WALL_CLASSES)), np.int64)
     for scan in examples:
         for low, high in zip(scan.first[:-1], scan.first[1:], strict=True):
             strip = scan.strips[low:high] / np.float32(255)
             right, there = answers(scan.truth[low:high], strip)
             np.add.at(table, (right[there], place_probabilities(strip, weights).argmax(axis=1)[there]), 1)
-    return class_scores(table)
+    coarse = np.zeros((len(COLOUR_CLASSES), len(COLOUR_CLASSES)), np.int64)
+    np.add.at(coarse, np.ix_(COARSE_CLASS, COARSE_CLASS), table)
+    return {**f1_scores(table, WALL_CLASSES), **class_scores(coarse)}
 
 
 def class_scores(table: Array) -> dict[str, float]:
-    """F1 of each of `WALL_CLASSES`, and the mean of those of doors.
+    """F1 of each of `COLOUR_CLASSES`, and the mean of those of doors.
 
     Args:
         table: (4, 4) how often each was taken for each.
     """
-    f1 = 2 * np.diag(table) / np.maximum(table.sum(axis=0) + table.sum(axis=1), 1)
-    scores = {f"f1_{name}": float(v) for name, v in zip(WALL_CLASSES, f1, strict=True)}
+    scores = f1_scores(table, COLOUR_CLASSES)
     return {**scores, "f1_doors": float((scores["f1_open"] + scores["f1_shut"]) / 2)}
+
+
+def f1_scores(table: Array, names: Sequence[str]) -> dict[str, float]:
+    """F1 of each class.
+
+    Args:
+        table: (k, k) how often each was taken for each.
+    """
+    f1 = 2 * np.diag(table) / np.maximum(table.sum(axis=0) + table.sum(axis=1), 1)
+    return {f"f1_{name}": float(v) for name, v in zip(names, f1, strict=True)}
 
 
 def judge(settings: WallSegmentation, file: Path, say: Say) -> dict[str, Any]:

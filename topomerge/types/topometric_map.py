@@ -42,11 +42,13 @@ EDGE_DTYPE = np.dtype(
         ("direction", "f8"),  # rad, of the wall's normal in the horizontal plane, in [0, pi)
         ("kind", "U8"),  # door | opening | stairs | ramp
         ("open", "?"),  # one could walk through; a shut door joins two rooms, too
+        ("half", "?"),  # its leaf stands half open
         ("confidence", "f8"),  # that it is one: 0..1
         ("lower", "f8", 3),  # of stairs and ramps: where they begin and end, in the input's frame; of doors both the centre
         ("upper", "f8", 3),
     ]
 )
+OLDER_EDGE_DTYPE = np.dtype([(n, EDGE_DTYPE[n]) for n in EDGE_DTYPE.names or () if n != "half"])  # of files until 26 November
 AREA_DTYPE = np.dtype(
     [
         ("room", "i4"),
@@ -66,6 +68,11 @@ WINDOW_DTYPE = np.dtype(
     ]
 )
 STOREY_DTYPE = np.dtype([("floor", "f8"), ("ceiling", "f8"), ("area", "f8")])  # m, m (nan: not seen), m2
+
+
+def door_state(edge: Array) -> str:
+    """How a door stands, a row of EDGE_DTYPE: open, half open or shut."""
+    return "shut" if not edge["open"] else "half open" if edge["half"] else "open"
 
 
 def mostly_unseen(rooms: Array) -> Array:

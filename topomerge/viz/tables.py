@@ -10,7 +10,7 @@ import numpy as np
 
 from topomerge.io.listing import plain, room_words
 from topomerge.io.palette import room_colours
-from topomerge.types import TopometricMap
+from topomerge.types import TopometricMap, door_state
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.scene import hex_colour
 from topomerge.viz.sureness import edge_sureness, room_sureness
@@ -109,7 +109,7 @@ def doors_table(map: TopometricMap, key: str = "") -> Markup:
             cell(str(edge["kind"]), kind="text"),
             cell(join([room_link(key, a), room_link(key, b)], " – "), a, kind="text"),
             cell(" – ".join(texts(storeys)), storeys[0], kind="text"),
-            cell(("open" if edge["open"] else "shut") if way else "", kind="text"),
+            cell(door_state(edge) if way else "", kind="text"),
             measure(edge["width"], 2),
             measure(edge["height"], 2, edge["height"] > 0),
             cell(f"{100 * edge['confidence']:.0f} %", float(edge["confidence"])),

@@ -9,7 +9,7 @@ from tests.scenes import DOOR, HEIGHT, THICK, Scene, rectangle, two_rooms
 from topomerge.extraction.extract import extract
 from topomerge.types import Sim3, TopometricMap
 
-SHUT_DOOR = 1.9  # m along the wall between the rooms
+SHUT_DOOR, AJAR_DOOR = 1.9, 4.5  # m along the wall between the rooms
 
 
 def leaf(scene: Scene, x: float, y: float, back: float) -> Scene:
@@ -23,6 +23,19 @@ def three_doors(back: float = 0.05) -> Scene:
     """4 x 5 m and 3 x 5 m side by side along x, a shut door between them at y = 1.9 and an open one at y = 4."""
     scene = Scene().shell(0, 0, 7, 5).wall((4, 0), (4, 5), doors=(SHUT_DOOR, 4.0))
     return leaf(scene, 4.0, SHUT_DOOR, back)
+
+
+def ajar_door(angle: float) -> Scene:
+    """4 x 8 m and 3 x 8 m side by side: a shut door, one whose leaf is opened by `angle` (rad) into the right room, and an open
+    one at y = 7."""
+    scene = Scene().shell(0, 0, 7, 8).wall((4, 0), (4, 8), doors=(SHUT_DOOR, AJAR_DOOR, 7.0))
+    hinge, reach = np.array([4.055, AJAR_DOOR - DOOR[0] / 2 + 0.01]), DOOR[0] - 0.02
+    along, across = (reach * np.sin(angle), reach * np.cos(angle), 0), (0.04 * np.cos(angle), -0.04 * np.sin(angle), 0)
+    for shift in (np.zeros(2), np.array(across[:2])):
+        scene.parts.append(rectangle((*(hinge + shift), 0.01), along, (0, 0, DOOR[1] - 0.02)))
+    for shift in (np.zeros(2), np.array(along[:2])):
+        scene.parts.append(rectangle((*(hinge + shift), 0.01), across, (0, 0, DOOR[1] - 0.02)))
+    return leaf(scene, 4.0, SHUT_DOOR, 0.05)
 
 
 def flush_door(doors: tuple[float, ...] = (SHUT_DOOR, 4.0)) -> np.ndarray:

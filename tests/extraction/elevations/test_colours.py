@@ -12,13 +12,21 @@ from topomerge.models.colour_network import ColourNetwork, exported_colours
 from tests.extraction.elevations.doors import SHUT_DOOR, flush_door
 from tests.scenes import DOOR
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.colour_network import INPUTS, colour_inputs, read_network, with_colours
+from topomerge.extraction.elevations.colour_network import (
+    COLOUR_CLASSES,
+    INPUTS,
+    coarse_classes,
+    colour_inputs,
+    read_network,
+    with_colours,
+)
 from topomerge.extraction.elevations.doorways import SHUT, coloured_both_ways, coloured_classes, place_classes
 from topomerge.extraction.elevations.elevation import (
     BANDS,
     DEPTHS,
     FACE_DTYPE,
     STRIP_CHANNELS,
+    WALL_CLASSES,
     Elevations,
     strip_colours,
     wall_elevations,
@@ -109,8 +117,18 @@ def test_a_network_that_learned_nothing_changes_nothing():
     assert with_colours(np.zeros_like(colours), classes) is classes
 
 
+def test_half_open_doors_are_open_and_niches_and_cupboards_wall_to_colours():
+    classes = np.random.default_rng(3).dirichlet(np.ones(len(WALL_CLASSES)), 5)
+    coarse, at = coarse_classes(classes), {name: classes[:, k] for k, name in enumerate(WALL_CLASSES)}
+    assert coarse.sum(axis=1) == pytest.approx(np.ones(5))
+    assert coarse[:, COLOUR_CLASSES.index("open")] == pytest.approx(at["open"] + at["half"])
+    assert coarse[:, COLOUR_CLASSES.index("wall")] == pytest.approx(at["wall"] + at["niche"] + at["cupboard"])
+    assert coarse[:, [SHUT, 3]] == pytest.approx(classes[:, [SHUT, 3]]) and WALL_CLASSES[:4] == COLOUR_CLASSES
+
+
 def test_a_mirrored_wall_is_the_mirrored_answer():
-    colours, classes = example(np.random.default_rng(2))
+    colours, _ = example(np.random.default_rng(2))
+    classes = np.random.default_rng(2).dirichlet(np.ones(len(WALL_CLASSES)), SIZE // 2).astype(np.float32)
     there, back = coloured_both_ways(colours, classes), coloured_both_ways(colours[::-1], classes[::-1])
     assert back[::-1] == pytest.approx(there, abs=1e-5)
 
@@ -150,7 +168,8 @@ def test_intensities_speak_for_a_flush_door_whatever_they_are_counted_in():
         walls = wall_elevations(map, scan.fine, scan.shades)
         shape = place_classes(walls)
         chances.append([classes[:, SHUT].max() for classes in (shape, coloured_classes(walls, shape))])
-    assert chances[0][1] > 4 * chances[0][0] and chances[0][1] > 0.3
+    odds = [chance / (1 - chance) for chance in chances[0]]
+    assert odds[1] > 4 * odds[0] and chances[0][1] > 0.3
     assert chances[1] == pytest.approx(chances[0], abs=0.02)
 
 

@@ -9,11 +9,11 @@ from tests.extraction.elevations.doors import SHUT_DOOR, cupboard_and_board, ext
 from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE, OPEN, SHUT, doorways, joined_openings, read_both_ways
-from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, WALL_CLASSES, Elevations
+from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE, HALF, OPEN, SHUT, doorways, joined_openings, read_both_ways
+from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
 from topomerge.extraction.elevations.wall_network import read_network
-from topomerge.types import Sim3
+from topomerge.types import Sim3, door_state
 
 STEP = 2 * ALONG
 
@@ -24,15 +24,15 @@ def face(room=0, start=(0.0, 0.0), along=(1.0, 0.0), out=(0.0, 1.0), length=6.0,
 
 def walls(*faces):
     sizes = [2 * round(f["length"][0] / STEP) for f in faces]
-    strips = np.full((sum(sizes), 32, 14), 0.5, np.float32)
+    strips = np.full((sum(sizes), 32, STRIP_CHANNELS), 0.5, np.float32)
     return Elevations(np.concatenate(faces), np.concatenate([[0], np.cumsum(sizes)]), strips)
 
 
 def chances(length, *doors):
-    """(n, 2) where doors (start, stop, open, shut) stand in probabilities along `length` m."""
-    out = np.zeros((round(length / STEP), 2))
-    for start, stop, is_open, is_shut in doors:
-        out[round(start / STEP) : round(stop / STEP)] = is_open, is_shut
+    """(n, 3) where doors (start, stop, open, shut, half open) stand in probabilities along `length` m."""
+    out = np.zeros((round(length / STEP), 3))
+    for start, stop, *states in doors:
+        out[round(start / STEP) : round(stop / STEP), : len(states)] = states
     return out
 
 
@@ -43,8 +43,20 @@ def test_a_stretch_is_a_doorway_in_its_middle_and_as_wide():
     assert door["rooms"].tolist() == [0, -1] and door["faces"] == 1 and door["probability"] == pytest.approx(0.95)
 
 
+@pytest.mark.parametrize(("half", "state"), [(0.7, "half open"), (0.3, "open")])
+def test_most_of_what_speaks_for_a_door_says_how_its_leaf_stands(half, state):
+    states = (2.0, 2.9, 0.9 - half, 0.05, half)
+    (door,) = doorways(walls(face()), chances(6, states))
+    assert door["open"] == pytest.approx(0.9 / 0.95) and door["half"] == pytest.approx(half / 0.95)
+    (edge,) = seen(chances(8, states)).edges  # beside one of the plan
+    assert door_state(edge) == state
+    map = two_doors(0)[0]
+    map.edges["centre"][0, 0] = 7.2
+    assert door_state(seen(chances(8, states), map).edges[1]) == state  # of the wall alone
+
+
 def way(rooms=(0, 1), at=0.0, width=1.1, out=(0.0, 1.0), probability=0.9, level=0.0, off=0.0):
-    return (rooms, (at * out[1] - off * out[0], -at * out[0] + off * out[1], level), out, width, probability, 0.8, 0.9, 1)
+    return (rooms, (at * out[1] - off * out[0], -at * out[0] + off * out[1], level), out, width, probability, 0.8, 0.9, 0.0, 1)
 
 
 @pytest.mark.parametrize("out", [(0.0, 1.0), (0.6, 0.8)])
@@ -110,7 +122,7 @@ def seen(doors, map=None):
     example = two_doors(0)
     elevations = Elevations(example[1], np.array([0, 160]), example[2] / np.float32(255))
     classes = np.zeros((len(doors), len(WALL_CLASSES)))
-    classes[:, [OPEN, SHUT]] = doors
+    classes[:, [OPEN, SHUT, HALF]] = doors
     return door_candidates(example[0] if map is None else map, (), elevations, classes)
 
 

@@ -8,6 +8,7 @@ import pytest
 from tests.extraction.elevations.doors import SHUT_DOOR, extracted, three_doors
 from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, BEFORE, PAST_ENDS, wall_elevations, wall_faces
 from topomerge.extraction.voxels import voxelise
+from topomerge.types import VoxelGrid
 
 CLOUD = three_doors().points()
 
@@ -49,7 +50,29 @@ def test_a_leaf_that_lies_back_shows_and_an_open_door_is_empty(map):
     assert strip[open_door][..., BANDS].mean() > 0.15  # where one can walk
 
 
+def test_rays_went_through_the_open_door_and_not_through_the_shut_one(map):
+    """Cells that are free on both sides of the wall, in the open doorway, and before the leaf."""
+    cell = 0.2
+    nx, ny, nz = 36, 26, 14
+    grid = VoxelGrid.from_cells(np.array([(0, 0, 0)]), np.zeros(3), cell, (nx, ny, nz))
+    x, y, z = (grid.centroids(np.argwhere(np.ones((nx, ny, nz), bool))))[:, :3].T
+    free = (np.abs(x - 4) > 0.2) | ((np.abs(y - 4.0) < 0.4) & (z < 2.2))
+    crossed = grid.with_cells(np.argwhere(np.ones((nx, ny, nz), bool))[free])
+    walls, unknown = wall_elevations(map, voxelise(CLOUD, 0.05), crossed=crossed), wall_elevations(map, voxelise(CLOUD, 0.05))
+    face = max(between(walls.faces, 3.925 + 0.013), key=lambda f: walls.faces["length"][f])
+    strip = walls.strips[walls.first[face] : walls.first[face + 1], :, BANDS + 1 :]
+    y = walls.faces["start"][face][1] + walls.faces["along"][face][1] * (np.arange(len(strip)) + 0.5) * ALONG
+    depth = (np.arange(strip.shape[1]) + 0.5) * ACROSS - BEFORE
+    shut, opened = np.abs(y - SHUT_DOOR) < 0.3, np.abs(y - 4.0) < 0.3
+    inside, before = np.abs(depth - 0.075) < 0.05, depth < -0.15
+    assert (strip[opened][:, inside] > 0.9).all() and (strip[shut][:, inside] == 0).all()
+    assert (strip[shut][:, before] == 1).all() and (strip[opened][:, before] == 1).all()
+    assert (
+        not unknown.strips[..., BANDS + 1 :].any() and (unknown.strips[..., : BANDS + 1] == walls.strips[..., : BANDS + 1]).all()
+    )
+
+
 def test_strips_hold_shares_and_cover_all_faces(map):
     walls = wall_elevations(map, voxelise(CLOUD, 0.05))
-    assert walls.strips.shape == (walls.first[-1], 32, BANDS + 1) and len(walls.first) == len(walls.faces) + 1
+    assert walls.strips.shape == (walls.first[-1], 32, BANDS + 4) and len(walls.first) == len(walls.faces) + 1
     assert walls.strips.min() >= 0 and walls.strips.max() <= 1 and not (np.diff(walls.first) % 2).any()

@@ -5,13 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.extraction.elevations.doors import SHUT_DOOR, double_door, extracted, niche, sliding_door, three_doors
+from tests.extraction.elevations.doors import (
+    AJAR_DOOR,
+    SHUT_DOOR,
+    ajar_door,
+    double_door,
+    extracted,
+    niche,
+    sliding_door,
+    three_doors,
+)
 from tests.scenes import Scene
 from topomerge.extraction.elevations.doorways import door_places, doorways, place_classes
 from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, Elevations, wall_elevations
 from topomerge.extraction.extract import extract, rooms_and_passages
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.stopwatch import Stopwatch
+from topomerge.types import door_state
 
 
 @pytest.mark.parametrize(
@@ -53,6 +63,13 @@ def test_a_sliding_door_that_stands_half_open_is_one_open_door(cover: float):
     (door,) = extracted(sliding_door(cover).points(0.003)).edges
     assert door["open"] and door["kind"] == "door"
     assert door["centre"][:2] == pytest.approx([4, 2], abs=0.15) and door["width"] == pytest.approx(0.9, abs=0.15)
+
+
+@pytest.mark.parametrize("angle", [0.5, 0.8, 1.1])
+def test_a_leaf_that_stands_half_open_is_told_from_one_that_is_shut_or_wide_open(angle: float):
+    map = extracted(ajar_door(angle).points(0.003))
+    shut, ajar, wide = (map.edges[int(np.abs(map.edges["centre"][:, 1] - y).argmin())] for y in (SHUT_DOOR, AJAR_DOOR, 7.0))
+    assert len(map.edges) == 3 and [door_state(door) for door in (shut, ajar, wide)] == ["shut", "half open", "open"]
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -98,4 +115,4 @@ def test_a_wall_as_short_as_one_place_shows_no_doorway():
     strips[0, DEPTHS // 2, BANDS // 2] = 1
     walls = Elevations(face, np.array([0, 2]), strips)
     classes = place_classes(walls)
-    assert classes.shape == (1, 4) and not len(doorways(walls, door_places(walls, classes)))
+    assert classes.shape == (1, 7) and not len(doorways(walls, door_places(walls, classes)))

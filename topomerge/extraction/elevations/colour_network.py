@@ -22,7 +22,20 @@ from topomerge.types import Array
 COLOUR_NETWORK_FILE = "colour_network.npz"
 COLOUR_CHANNELS = 4  # of `Elevations.colours`
 LEAST_CHANCE = 1e-4  # probability: what shape says is not taken for surer
-INPUTS = PLACES * BANDS * COLOUR_CHANNELS + len(WALL_CLASSES)
+COLOUR_CLASSES = ("wall", "open", "shut", "window")  # that colours tell apart: the first ones of `WALL_CLASSES`
+INPUTS = PLACES * BANDS * COLOUR_CHANNELS + len(COLOUR_CLASSES)
+
+
+def coarse_classes(classes: Array) -> Array:
+    """(n / 2, 4) float32 probability of each of `COLOUR_CLASSES`: half-open doors are open, niches and cupboards are wall.
+
+    Args:
+        classes: (n / 2, 7) of `WALL_CLASSES`.
+    """
+    out = np.array(classes[:, : len(COLOUR_CLASSES)], np.float32)
+    out[:, WALL_CLASSES.index("open")] += classes[:, WALL_CLASSES.index("half")]
+    out[:, WALL_CLASSES.index("wall")] += classes[:, WALL_CLASSES.index("niche")] + classes[:, WALL_CLASSES.index("cupboard")]
+    return out
 
 
 def colour_inputs(colours: Array, classes: Array) -> tuple[Array, Array]:
@@ -30,14 +43,14 @@ def colour_inputs(colours: Array, classes: Array) -> tuple[Array, Array]:
 
     Args:
         colours: (n, 13, 4) of a strip, n even.
-        classes: (n / 2, 4) probability of each of `WALL_CLASSES` by its shape.
+        classes: (n / 2, 4) probability of each of `COLOUR_CLASSES` by its shape.
     """
     scores = np.log(np.maximum(classes, LEAST_CHANCE)).astype(np.float32)
     return np.hstack([colours.reshape(len(scores), -1).astype(np.float32), scores]), scores
 
 
 def with_colours(colours: Array, classes: Array, network: dict[str, Array] | None = None) -> Array:
-    """(n / 2, 4) float32 probability of each of `WALL_CLASSES` by shape and colours; where no colour was seen, as it was.
+    """(n / 2, 4) float32 probability of each of `COLOUR_CLASSES` by shape and colours; where no colour was seen, as it was.
 
     Args:
         colours, classes: as of `colour_inputs`.
@@ -67,6 +80,6 @@ def read_network(path: Path) -> dict[str, Array]:
         InputError: not the network that this version knows, or damaged.
     """
     layers = read_layers(path, "colours of walls", {"in": INPUTS, "out": 1} | dict.fromkeys(ALONG_LAYERS, TAPS))
-    if layers["in.w"].shape[0] != INPUTS or layers["out.w"].shape[1] != len(WALL_CLASSES):
+    if layers["in.w"].shape[0] != INPUTS or layers["out.w"].shape[1] != len(COLOUR_CLASSES):
         raise InputError(f"{path}: was trained with other inputs or outputs; install topomerge again")
     return layers

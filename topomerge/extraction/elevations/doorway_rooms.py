@@ -34,7 +34,7 @@ def doorways_of(map: TopometricMap, walls: Elevations, doors: Array) -> Array:
     """(D,) DOORWAY_DTYPE of a map's walls with the rooms on both sides.
 
     Args:
-        doors: (n / 2, 2) of `door_places`.
+        doors: (n / 2, 3) of `door_places`.
     """
     return with_other_room(map, doorways(walls, doors, rooms_before(map, walls)))
 
@@ -102,7 +102,7 @@ def colour_doorways(map: TopometricMap, walls: Elevations, classes: Array, other
     """
     if walls.colours is None:
         return np.zeros(0, DOORWAY_DTYPE)
-    ways = doorways(walls, door_places(walls, coloured_classes(walls, classes)), rooms_before(map, walls))
+    ways = doorways(walls, door_places(walls, coloured_classes(walls, classes)), rooms_before(map, walls), by_shape=False)
     apart = ways["centre"][:, None] - others
     far = (np.linalg.norm(apart[..., :2], axis=2) > reach) | (np.abs(apart[..., 2]) > reach)
     ways = with_other_room(map, ways[far.all(axis=1)])

@@ -11,19 +11,22 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse.csgraph import connected_components
 
-from topomerge.extraction.elevations.colour_network import with_colours
-from topomerge.extraction.elevations.elevation import ALONG, WALL_CLASSES, Elevations
+from topomerge.extraction.elevations.colour_network import coarse_classes, with_colours
+from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities
 from topomerge.types import Array
 
 DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of a doorway, and of one of them
 LEAST_WIDTH = 0.45  # m
+SEEN_AROUND, LEAST_ELEMENTS = 10, 12  # places to both sides of a doorway, and elements with points that its wall has there
+LEAF_BANDS = slice(2, 10)  # 0.3 to 1.9 m
+SURFACE_FILL, EMPTY_FILL, THICKEST_LEAF = 0.3, 0.1, 0.08  # of the elements of a surface, and between two; m between them
 HALF_WALL = 0.06  # m from the face of a wall to its middle, where one face was seen only
 SAME_DOORWAY = 0.45  # m between what two faces show of one doorway
 STOOD = 0.12  # m from the middle of a cell of a floor: a place this near is on it
 DOORWAY_LEVEL = 0.5  # m between their floors
 STRAIGHT = 0.95  # cosine between two parts of one opening
-OPEN, SHUT = WALL_CLASSES.index("open"), WALL_CLASSES.index("shut")
+OPEN, SHUT, HALF = (WALL_CLASSES.index(name) for name in ("open", "shut", "half"))
 DOORWAY_DTYPE = np.dtype(
     [
         ("rooms", "i4", 2),  # that see it, the second -1 where one does
@@ -32,23 +35,24 @@ DOORWAY_DTYPE = np.dtype(
         ("width", "f8"),  # m
         ("probability", "f8"),  # of a door, the highest along it
         ("mean", "f8"),  # and on average
-        ("open", "f8"),  # share of that which speaks for an open one
+        ("open", "f8"),  # share of that which speaks for one that is open or half open
+        ("half", "f8"),  # and for one whose leaf stands half open
         ("faces", "i4"),  # on which it was seen
     ]
 )
 
 
 def place_classes(walls: Elevations) -> Array:
-    """(n / 2, 4) float32 probability of each of `WALL_CLASSES` in each place along all strips, each read from both its ends."""
+    """(n / 2, 7) float32 probability of each of `WALL_CLASSES` in each place along all strips, each read from both its ends."""
     parts = [read_both_ways(walls.strips[low:high]) for low, high in strip_bounds(walls)]
     return np.concatenate([np.zeros((0, len(WALL_CLASSES)), np.float32), *parts])
 
 
 def read_both_ways(strip: Array) -> Array:
-    """(n / 2, 4) float32 probability of each of `WALL_CLASSES`: a mirrored wall has the same doors, so two readings are averaged.
+    """(n / 2, 7) float32 probability of each of `WALL_CLASSES`: a mirrored wall has the same doors, so two readings are averaged.
 
     Args:
-        strip: (n, 32, 14), n even.
+        strip: (n, 32, 17), n even.
     """
     one, mirrored = place_probabilities(np.stack([strip, strip[::-1]]))
     mean: Array = (one + mirrored[::-1]) / np.float32(2)
@@ -56,10 +60,10 @@ def read_both_ways(strip: Array) -> Array:
 
 
 def coloured_classes(walls: Elevations, classes: Array) -> Array:
-    """(n / 2, 4) float32 likewise, by shape and colours; walls without colours as they are.
+    """(n / 2, 7) float32 likewise, by shape and colours; walls without colours as they are.
 
     Args:
-        classes: (n / 2, 4) of `place_classes`.
+        classes: (n / 2, 7) of `place_classes`.
     """
     if walls.colours is None:
         return classes
@@ -68,21 +72,22 @@ def coloured_classes(walls: Elevations, classes: Array) -> Array:
 
 
 def coloured_both_ways(colours: Array, classes: Array) -> Array:
-    """(n / 2, 4) float32 likewise, by shape and colours.
+    """(n / 2, 7) float32 likewise, by shape and colours, which tell `colour_network.COLOUR_CLASSES` apart: the others are 0.
 
     Args:
         colours: (n, 13, 4), n even.
-        classes: (n / 2, 4) by shape.
+        classes: (n / 2, 7) by shape.
     """
-    one, mirrored = with_colours(colours, classes), with_colours(colours[::-1], classes[::-1])
+    shape = coarse_classes(classes)
+    one, mirrored = with_colours(colours, shape), with_colours(colours[::-1], shape[::-1])
     mean: Array = (one + mirrored[::-1]) / np.float32(2)
-    return mean
+    return np.pad(mean, [(0, 0), (0, len(WALL_CLASSES) - mean.shape[1])])
 
 
 def door_places(walls: Elevations, classes: Array) -> Array:
-    """(n / 2, 2) float32 probability of an open and of a shut door in each place, of those of all classes."""
-    parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT]] for low, high in strip_bounds(walls)]
-    return np.concatenate([np.zeros((0, 2), np.float32), *parts])
+    """(n / 2, 3) float32 probability of an open, a shut and a half-open door in each place, of those of all classes."""
+    parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT, HALF]] for low, high in strip_bounds(walls)]
+    return np.concatenate([np.zeros((0, 3), np.float32), *parts])
 
 
 def strip_bounds(walls: Elevations) -> Iterator[tuple[int, int]]:
@@ -90,18 +95,22 @@ def strip_bounds(walls: Elevations) -> Iterator[tuple[int, int]]:
     return zip(walls.first[:-1].tolist(), walls.first[1:].tolist(), strict=True)
 
 
-def doorways(walls: Elevations, doors: Array, before: Array | None = None) -> Array:
+def doorways(walls: Elevations, doors: Array, before: Array | None = None, by_shape: bool = True) -> Array:
     """(D,) DOORWAY_DTYPE, each once however many faces show it.
 
     Args:
-        doors: (n / 2, 2) of `door_places`.
+        doors: (n / 2, 3) of `door_places`.
         before: (n / 2, k) room on whose floor each of k spots before a place lies, -1 none: a strip goes on past its face, where
             the next room may lie before it. None: the room of the face everywhere.
+        by_shape: what is thicker than a leaf is no shut door; colours show those that are as thick as their wall.
     """
     rows = []
     for face, (low, high) in zip(walls.faces, strip_bounds(walls), strict=True):
         each = doors[low // PLACES : high // PLACES]
         for start, stop in _runs(each.sum(axis=1)):
+            shut = by_shape and 2 * each[start:stop, 1].sum() > each[start:stop].sum()
+            if not _is_seen(walls.strips[low:high], start, stop) or (shut and _is_thick(walls.strips[low:high], start, stop)):
+                continue
             room = int(face["room"])
             if before is not None:
                 room = _most_common(before[low // PLACES + start : low // PLACES + stop], room)
@@ -154,6 +163,22 @@ def _runs(chance: Array) -> Iterator[tuple[int, int]]:
             yield start, stop
 
 
+def _is_seen(strip: Array, start: int, stop: int) -> bool:
+    """Does the wall show around a stretch? Where there are hardly any points, floor that goes on is no doorway."""
+    around = strip[max(start - SEEN_AROUND, 0) * PLACES : (stop + SEEN_AROUND) * PLACES, :, :BANDS]
+    return int(np.count_nonzero(around)) >= LEAST_ELEMENTS
+
+
+def _is_thick(strip: Array, start: int, stop: int) -> bool:
+    """Do two surfaces show in a stretch, farther apart than those of a leaf, and nothing between them? Then a wall is there: a
+    niche of a door's size looks like a set-back leaf."""
+    inner = (stop - start) // 4
+    across = strip[(start + inner) * PLACES : (stop - inner) * PLACES, :, LEAF_BANDS].mean(axis=(0, 2))
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], across > SURFACE_FILL, [0]])))
+    gaps = ends[1:-1].reshape(-1, 2).tolist()
+    return any((b - a) * ACROSS >= THICKEST_LEAF and across[a:b].max() < EMPTY_FILL for a, b in gaps)
+
+
 def _doorway(face: Array, room: int, doors: Array, start: int, stop: int) -> tuple[object, ...]:
     """Row of DOORWAY_DTYPE of one stretch of a face, with the room before it."""
     step = PLACES * ALONG
@@ -161,9 +186,9 @@ def _doorway(face: Array, room: int, doors: Array, start: int, stop: int) -> tup
     at = (np.average(np.arange(start, stop), weights=chance) + 0.5) * step
     middle = face["start"] + at * face["along"] + HALF_WALL * face["out"]
     width = float(chance.sum()) * step
-    share = float(doors[start:stop, 0].sum() / chance.sum())
+    wide, _, half = (doors[start:stop].sum(axis=0) / chance.sum()).tolist()
     place = (*middle.tolist(), float(face["floor"]))
-    return (room, -1), place, face["out"], width, float(chance.max()), float(chance.mean()), share, 1
+    return (room, -1), place, face["out"], width, float(chance.max()), float(chance.mean()), wide + half, half, 1
 
 
 def _joined(rows: Array) -> Array:
@@ -186,6 +211,7 @@ def _one(rows: Array) -> Array:
         out["rooms"][1] = sides[1]["rooms"][0]
     out["centre"] = np.mean([side["centre"] for side in sides], axis=0)
     out["width"] = float(np.mean([side["width"] for side in sides]))
-    out["open"], out["mean"] = np.average(rows["open"], weights=weight), rows["mean"].max()
+    out["open"], out["half"] = (np.average(rows[name], weights=weight) for name in ("open", "half"))
+    out["mean"] = rows["mean"].max()
     out["faces"] = len(rows)
     return out

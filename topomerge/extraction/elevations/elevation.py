@@ -24,13 +24,17 @@ BEFORE, BEHIND = 0.3, 0.5  # m on both sides of a face
 LOWEST, HIGHEST = -0.1, 2.5  # m above the floor
 PAST_ENDS = 1.2  # m by which a strip goes on past both ends of its face
 DEPTHS, BANDS = round((BEFORE + BEHIND) / ACROSS), round((HIGHEST - LOWEST) / UPWARDS)
-STRIP_CHANNELS = BANDS + 1  # and where one can walk
+FREE_HEIGHTS = ((0.3, 0.6), (1.0, 1.3), (1.7, 2.0))  # m above the floor, at which rays are looked for
+FREE_ALONG, FREE_ACROSS = 2, 4  # elements that share an answer: cells that rays crossed are longer
+STRIP_CHANNELS = BANDS + 1 + len(FREE_HEIGHTS)  # and where one can walk, and where rays went
 FULL = 0.75  # of the cells of a flat surface that make an element full
 SIDE_REACH = (0.15, 0.6)  # m from a face: where its room's floor lies
 SURFACE = (-0.1, 0.3)  # m from a face: what has a colour there is of the wall, or of a leaf in it
 LEAST_SHADE = 0.25  # points
 DARKEST, HUE_STEP, MOST_CONTRAST = 15.0, 64.0, 2.0  # of 255; of a difference of 1
-WALL_CLASSES = ("wall", "open", "shut", "window")  # of a place along a wall; where there is no wall, too
+# Of a place along a wall: a door that stands open, is shut, a window, a door that stands half open, a recess, and what stands
+# before the wall; "wall" where there is none, too.
+WALL_CLASSES = ("wall", "open", "shut", "window", "half", "niche", "cupboard")
 TILE = 1.0  # m: squares in which faces are looked up
 FACE_DTYPE = np.dtype(
     [
@@ -51,8 +55,9 @@ class Elevations:
     Args:
         faces: (F,) FACE_DTYPE.
         first: (F + 1,) the first element of each strip in `strips`.
-        strips: (n, 32, 14) float32 0..1 of each place along all strips: how full its elements are across the wall, from before it
-            to behind it, in each band of heights; the last channel is where one can walk.
+        strips: (n, 32, 17) float32 0..1 of each place along all strips: how full its elements are across the wall, from before it
+            to behind it, in each band of heights; then where one can walk, and where rays went at three heights (0 everywhere
+            where the sensor's places are unknown).
         colours: (n, 13, 4) float32 in each band of heights: was its colour seen (0 or 1), and by how much it is lighter, redder
             and yellower than most of its wall; None of a scan without colours.
     """
@@ -63,12 +68,15 @@ class Elevations:
     colours: Array | None = None
 
 
-def wall_elevations(map: TopometricMap, cells: VoxelGrid, shades: tuple[Array, Array] | None = None) -> Elevations:
+def wall_elevations(
+    map: TopometricMap, cells: VoxelGrid, shades: tuple[Array, Array] | None = None, crossed: VoxelGrid | None = None
+) -> Elevations:
     """The faces of all rooms, unrolled.
 
     Args:
         cells: with the means of their points (`cell_means`), in the map's frame; 5 cm or as fine as there are.
         shades: (k, 3) points and their colours (k, 3) uint8, as of `Scan`.
+        crossed: cells that rays crossed and in which nothing stands; None: unknown.
     """
     faces = wall_faces(map)
     sizes = 2 * np.ceil(faces["length"] / ALONG / 2).astype(np.int64)
@@ -82,9 +90,34 @@ def wall_elevations(map: TopometricMap, cells: VoxelGrid, shades: tuple[Array, A
     walk = fill_strips(floor, frames, sizes, (DEPTHS, 1), np.array([ALONG, ACROSS, BANDS * UPWARDS]), TILE)
     flat = ALONG * UPWARDS / cells.edge**2  # cells of a wall that an element holds
     edge = map.navigable.edge
-    strips = np.concatenate([solid / (FULL * flat), walk / (FULL * ALONG * ACROSS / edge**2)], axis=2)
+    rays = crossed_places(crossed, faces, sizes)
+    strips = np.concatenate([solid / (FULL * flat), walk / (FULL * ALONG * ACROSS / edge**2), rays], axis=2)
     walls = Elevations(faces, np.concatenate([[0], np.cumsum(sizes)]), np.minimum(strips, 1.0))
     return walls if shades is None else replace(walls, colours=strip_colours(walls, *shades))
+
+
+def crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array) -> Array:
+    """(n, 32, 3) float32 share of the heights of each of `FREE_HEIGHTS` at which rays went through an element.
+
+    Args:
+        crossed: as of `wall_elevations`.
+        faces: (F,) FACE_DTYPE; sizes: (F,) places of their strips, even.
+    """
+    out = np.zeros((int(sizes.sum()), DEPTHS, len(FREE_HEIGHTS)), np.float32)
+    if crossed is None or not len(crossed) or not len(out):
+        return out
+    pairs = sizes // FREE_ALONG
+    face = faces[np.repeat(np.arange(len(faces)), pairs)]
+    place = (np.arange(len(face)) - np.repeat(np.cumsum(pairs) - pairs, pairs) + 0.5) * (FREE_ALONG * ALONG)
+    depth = (np.arange(DEPTHS // FREE_ACROSS) + 0.5) * (FREE_ACROSS * ACROSS) - BEFORE
+    level = (face["start"] + place[:, None] * face["along"])[:, None] + depth[:, None] * face["out"][:, None]
+    for k, heights in enumerate(FREE_HEIGHTS):
+        went = np.zeros(level.shape[:2], np.float32)
+        for z in heights:
+            at = np.concatenate([level, np.broadcast_to((face["floor"] + z)[:, None, None], (*level.shape[:2], 1))], axis=2)
+            went += crossed.contains(crossed.locate(at.reshape(-1, 3))).reshape(went.shape) / np.float32(len(heights))
+        out[..., k] = went.repeat(FREE_ALONG, axis=0).repeat(FREE_ACROSS, axis=1)
+    return out
 
 
 def strip_colours(walls: Elevations, points: Array, colours: Array) -> Array:

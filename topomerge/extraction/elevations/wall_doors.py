@@ -48,6 +48,7 @@ SOURCES = ("both", "plan", "wall", "flat", "colour")
 WALL_DOOR_REACH = 1.0  # m between a door of the plan and the same one on the wall
 NEAR = 0.3  # m around a door of the plan
 PART_OFF = 0.5  # m between the middle of an opening of the plan and the wall that shows a part of it
+HALF_SHARE = 0.5  # of what speaks for a doorway, that speaks for a leaf that stands half open
 SUREST = 0.0005  # probability: what walls show is not taken for surer
 LEAST_FILL = 0.01  # share of the elements
 
@@ -76,7 +77,7 @@ def with_wall_doors(
     Args:
         storeys: what probably stands in the columns of its plans.
         walls: None of a map that shows none at heights.
-        classes: (n / 2, 4) of `place_classes`, of its walls.
+        classes: (n / 2, 7) of `place_classes`, of its walls.
     """
     candidates = door_candidates(map, storeys, walls, classes)
     chance = door_chance(candidates)
@@ -246,17 +247,22 @@ def _moved(edge: Array, way: Array) -> Array:
     """A door of the plan where the wall shows it."""
     out = edge.copy()
     out["centre"] = (*way["centre"][:2], edge["centre"][2])
-    out["width"], out["direction"] = way["width"], _normal(way)
+    out["width"], out["direction"], out["half"] = way["width"], _normal(way), _is_half_open(way) and edge["open"]
     out["kind"] = "door" if way["width"] <= DOOR_MOST_WIDTH else "opening"
     out["lower"] = out["upper"] = out["centre"]
     return out
+
+
+def _is_half_open(way: Array) -> bool:
+    """Does most of what speaks for a doorway speak for a leaf that stands half open?"""
+    return bool(way["half"] >= HALF_SHARE)
 
 
 def _edge(way: Array) -> Array:
     """A door that the plan does not show."""
     out = np.zeros((), EDGE_DTYPE)
     out["rooms"], out["centre"], out["width"] = np.sort(way["rooms"]), way["centre"], way["width"]
-    out["direction"], out["open"] = _normal(way), way["open"] >= 0.5
+    out["direction"], out["open"], out["half"] = _normal(way), way["open"] >= 0.5, _is_half_open(way)
     out["kind"] = "door" if way["width"] <= DOOR_MOST_WIDTH else "opening"
     out["lower"] = out["upper"] = out["centre"]
     return out

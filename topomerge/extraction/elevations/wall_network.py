@@ -25,8 +25,8 @@ ALONG_LAYERS = ("along1", "along2", "along3")
 
 
 def place_probabilities(strip: Array, network: dict[str, Array] | None = None) -> Array:
-    """(n / 2, 4) float32 probability of each of `WALL_CLASSES` along a strip (n, 32, 14), or of several of one length at once
-    (k, n, 32, 14); by the weights that ship or others."""
+    """(n / 2, 7) float32 probability of each of `WALL_CLASSES` along a strip (n, 32, 17), or of several of one length at once
+    (k, n, 32, 17); by the weights that ship or others."""
     w = weights() if network is None else network
     x = convolution(np.moveaxis(strip, -1, -3).astype(np.float32), w["a.w"], w["a.b"], PLACES)
     x = np.moveaxis(convolution(x, w["b.w"], w["b.b"]), -3, -1)

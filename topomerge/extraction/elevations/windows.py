@@ -33,7 +33,7 @@ def with_windows(map: TopometricMap, walls: Elevations, classes: Array) -> Topom
     """The map with the windows that its walls show.
 
     Args:
-        classes: (n / 2, 4) of `place_classes`.
+        classes: (n / 2, 7) of `place_classes`.
     """
     rows = windows_on_walls(walls, classes[:, WINDOW])
     return replace(map, windows=in_map(map, rows))

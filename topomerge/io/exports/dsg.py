@@ -142,7 +142,7 @@ def _places(map: TopometricMap) -> Iterator[tuple[Json, list[Json]]]:
         yield place, [_edge(symbol("R", r), symbol("p", i)), *narrows.get(i, [])]
     for number, way in enumerate(map.edges, start=len(owner)):
         ends, kind = way["rooms"].tolist(), str(way["kind"])
-        metadata = {"kind": kind, "open": bool(way["open"]), "confidence": float(way["confidence"])}
+        metadata = {"kind": kind, "open": bool(way["open"]), "half": bool(way["half"]), "confidence": float(way["confidence"])}
         place = _place(number, kind, way["centre"], way["width"] / 2, GREY, {**metadata, "rooms": ends})
         edges = [_edge(symbol("R", ends[0]), symbol("p", number))]  # a node has one parent
         for r in dict.fromkeys(ends):

@@ -120,7 +120,7 @@ def _doors(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dic
         line = np.stack([edge["lower"], edge["upper"]]) if is_flight(edge) else jambs(edge)
         properties = {"kind": str(edge["kind"]), "rooms": ends, "storey": storeys[0], "storeys": storeys}
         properties |= {name: round(float(edge[name]), 3) for name in ("width", "confidence")}
-        properties |= {"height": round(float(edge["height"]), 3) or None, "open": bool(edge["open"])}
+        properties |= {"height": round(float(edge["height"]), 3) or None, "open": bool(edge["open"]), "half": bool(edge["half"])}
         yield _feature(f"edge {i}", {"type": "LineString", "coordinates": place(line)}, properties)
 
 

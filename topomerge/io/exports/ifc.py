@@ -188,7 +188,7 @@ class _Building(Model):
     def say_of_edge(self, i: int, edge: Any, element: Any) -> None:
         """How likely a door, an opening or a flight is one, and whether one could walk through."""
         facts = [self._fact("Confidence", "IfcReal", float(edge["confidence"]))]
-        facts.append(self._fact("Open", "IfcBoolean", bool(edge["open"])))
+        facts += [self._fact(name, "IfcBoolean", bool(edge[name.lower()])) for name in ("Open", "Half")]
         self._define(element, self._set("IfcPropertySet", f"Topomerge_{str(edge['kind']).title()}", i, HasProperties=facts))
 
     def _box(self, width: float, height: float) -> Any:

@@ -181,7 +181,7 @@ def _polygon(parent: Any, id: str, rings: list[Array]) -> None:
 def _boundary(member: Any, i: int, edge: Any) -> None:
     boundary = _new(member, "CellSpaceBoundary", f"B{i}")
     kind = str(edge["kind"])
-    facts = {"kind": kind, "width": f"{edge['width']:.2f}", "open": str(bool(edge["open"])).lower()}
+    facts = {"kind": kind, "width": f"{edge['width']:.2f}", **{k: str(bool(edge[k])).lower() for k in ("open", "half")}}
     _head(boundary, f"{kind} {i}", **facts, confidence=f"{edge['confidence']:.2f}")
     _link(boundary, "duality", f"T{i}")
     a, b = jambs(edge)
