@@ -19,7 +19,7 @@ LONG_WALL = 1.4  # m, from which on a wall may have a niche
 NICHE_WIDTHS, NICHE_DEPTHS = (0.35, 1.3), (0.04, 0.4)  # m, at least, at most
 NICHE_BOTTOMS, NICHE_HEIGHTS = (0.3, 1.1), (0.4, 1.2)  # m
 BEHIND_NICHE = 0.05  # m of wall that stay behind it
-INTO_ROOM = 0.02  # m by which its free space begins before the face, so that it is one with the room's
+NICHE_MOUTH = 0.02  # m by which its free space begins before the face, so that it is one with the room's
 CORNER = 0.1  # m between a niche and the end of its wall
 
 
@@ -71,7 +71,7 @@ def _niche(
         corners = [first, first + along * width, first + along * width + out * depth, first + out * depth]
         behind = shapely.Polygon([*corners[:2], *(c + out * BEHIND_NICHE for c in corners[2:])])
         if depth >= NICHE_DEPTHS[0] and solid.buffer(1e-6).contains(behind):
-            shape = shapely.Polygon([c - out * INTO_ROOM for c in corners[:2]] + corners[2:])
+            shape = shapely.Polygon([c - out * NICHE_MOUTH for c in corners[:2]] + corners[2:])
             centre = (*(np.mean(corners, axis=0)).tolist(), space.floor)
             direction = float(np.arctan2(out[1], out[0]))
             return Prism(shape, space.floor + bottom, space.floor + top), (centre, width, float(depth), direction, bottom, top)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 from topomerge.datasets.buildings.erect import erect
-from topomerge.datasets.buildings.panes import panes
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.buildings.profiles import BUILDING_KINDS
 from topomerge.datasets.core.builder import Report, Row, Say, Sharing, make_item
@@ -30,6 +28,7 @@ from topomerge.datasets.pairs.items import digest
 from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, PlanRecipe, build_scans
 from topomerge.datasets.pairs.plan_truth import drawn_map
 from topomerge.datasets.pairs.scan_items import PlanItem, Plans, draw_difficulty, scanned
+from topomerge.datasets.pairs.wall_truth import true_classes
 from topomerge.datasets.simulation.scanner import moved, scan
 from topomerge.datasets.simulation.sensors import get_sensor
 from topomerge.datasets.simulation.spoils import drift_between, exact_sensor
@@ -38,11 +37,9 @@ from topomerge.datasets.simulation.walk import part
 from topomerge.errors import InputError
 from topomerge.extraction.classified_storey import ClassifiedStorey
 from topomerge.extraction.elevations.elevation import (
-    ALONG,
     DEPTHS,
     FACE_DTYPE,
     STRIP_CHANNELS,
-    WALL_CLASSES,
     Elevations,
     wall_elevations,
 )
@@ -70,14 +67,7 @@ SLICE_SHARE, POSED_SHARE = 0.6, 0.6  # of flat maps by a 2D laser, and of these 
 LOST_BY_CHANCE, SHARE_LEFT = 0.5, (0.03, 0.3)
 SPACING_LEFT = (0.05, 0.2)  # m
 NICHES = 0.25  # share of the longer walls with a recess, at most
-CUPBOARDS = ("shelf", "cabinet", "wardrobe", "kitchen", "locker")  # kinds of furniture that stand before walls
-LEAST_CUPBOARD = 0.75  # m, height
-IN_ROOM = 0.1  # m behind a face, at most, is the front of what stands in its room
-DEEP = 0.3  # m beside a wall's middle: a strip there is of that wall
-ASKEW = 0.26  # sine of the angle between a wall and a strip along it
-SAME_FLOOR = 0.6  # m between floors of one storey
 WALL_ARRAYS = ("first", "strips", "truth", "doors", "faces")
-DOOR_STATES = {"open": ("open", "none"), "half": ("half",), "shut": ("shut",)}  # of each class
 MAP_ARRAYS, ROOMS_HELD = ("edges", "storeys", "navigable_room"), ("storey", "completeness")
 NO_WALLS = Elevations(np.zeros(0, FACE_DTYPE), np.zeros(1, np.int64), np.zeros((0, DEPTHS, STRIP_CHANNELS), np.float32))
 
@@ -256,61 +246,3 @@ def thinned(cloud: PointCloud, seed: int) -> PointCloud:
         return taken(cloud, rng.random(len(cloud)) < np.exp(rng.uniform(*np.log(SHARE_LEFT))))
     cells = keys(squares(cloud.points, float(rng.uniform(*SPACING_LEFT))))[0]
     return taken(cloud, np.sort(np.unique(cells, return_index=True)[1]))
-
-
-def true_classes(building: Building, walls: Elevations, frame: Sim3, shift: tuple[Array, Array] | None) -> Array:
-    """(n,) uint8 index into `WALL_CLASSES` of each place along the walls.
-
-    Args:
-        frame: of the map in which the walls are.
-        shift: places of the building that drift bent, and what undoes it there (None: none did).
-    """
-    truth = np.zeros(int(walls.first[-1]), np.uint8)
-    if not len(truth):
-        return truth
-    place = np.arange(len(truth)) - np.repeat(walls.first[:-1], np.diff(walls.first))
-    face = walls.faces[np.repeat(np.arange(len(walls.faces)), np.diff(walls.first))]
-    at = face["start"] + (place + 0.5)[:, None] * ALONG * face["along"]
-    beside = (at, at + 0.01 * face["along"], at + 0.01 * face["out"])
-    ends = [frame.inverse().apply(np.column_stack([p, face["floor"]])) for p in beside]
-    if shift is not None:
-        undone = shift[1][cKDTree(shift[0]).query(ends[0])[1]]
-        ends = [p + undone for p in ends]
-    at, along, out = ends[0], (ends[1] - ends[0])[:, :2] / 0.01, (ends[2] - ends[0])[:, :2] / 0.01
-    holes_of = {"cupboard": cupboards(building), "niche": niches_of(building), "window": panes(building)}
-    holes_of |= {name: _doors(building, states) for name, states in DOOR_STATES.items()}
-    for name, holes in holes_of.items():
-        for x, y, z, direction, width, thickness in holes:
-            normal = np.array([np.cos(direction), np.sin(direction)])
-            off = at[:, :2] - (x, y)
-            across, aside = np.abs(off @ normal), np.abs(off @ (-normal[1], normal[0]))
-            within = (across < thickness / 2 + DEEP) & (aside < width / 2) & (np.abs(along @ normal) < ASKEW)
-            if name == "niche":  # the wall's other face does not show it
-                within &= out @ normal > 0
-            elif name == "cupboard":  # nor what stands behind the wall
-                within &= -(off * out).sum(axis=1) < thickness / 2 + IN_ROOM
-            truth[within & (np.abs(at[:, 2] - z) < SAME_FLOOR)] = WALL_CLASSES.index(name)
-    return truth
-
-
-def cupboards(building: Building) -> Sequence[tuple[float, ...]]:
-    """As `_doors`, the furniture that stands before walls and is as high as a table or higher."""
-    things = building.things
-    tall = np.isin(things["kind"], CUPBOARDS) & (things["size"][:, 2] >= LEAST_CUPBOARD)
-    rows = []
-    for thing in things[tall]:
-        x, y, z = thing["centre"].tolist()
-        wide, deep, high = thing["size"].tolist()
-        rows.append((x, y, z - high / 2, float(thing["yaw"]) + np.pi / 2, wide, deep))
-    return rows
-
-
-def niches_of(building: Building) -> Sequence[tuple[float, ...]]:
-    """As `_doors`, the recesses of walls."""
-    return [(*n["centre"].tolist(), float(n["direction"]), float(n["width"]), float(n["depth"])) for n in building.niches]
-
-
-def _doors(building: Building, states: Sequence[str]) -> Sequence[tuple[float, ...]]:
-    """Middle on the floor (m), direction of the normal (rad), width and thickness (m) of the doors that stand so."""
-    doors = building.doors[np.isin(building.doors["state"], states)]
-    return [(*d["centre"].tolist(), *(float(d[k]) for k in ("direction", "width", "thickness"))) for d in doors]

@@ -40,7 +40,7 @@ from topomerge.training.scan_settings import DoorClassification
 from topomerge.types import Array
 
 PURE = 0.7  # share of a region in its true room; regions between rooms are no example
-LEAST_SPREAD = 1e-3  # of a feature: weights are written with four digits
+LEAST_FEATURE_SPREAD = 1e-3  # of a feature: weights are written with four digits
 RANGE = (0.005, 0.995)  # quantiles that features are clipped to
 Doors = tuple[Array, Array, Array]  # (n, 17) features, (n,) is it a door, (n,) number of the scan
 
@@ -163,7 +163,7 @@ class DoorJob(NetworkJob):
         low, high = np.quantile(x, RANGE, axis=0)
         clipped = np.clip(x, low, high)
         spread = clipped.std(axis=0)  # grids have no lintels: what is the same everywhere says nothing
-        scale = np.where(spread > LEAST_SPREAD, spread, 1.0)
+        scale = np.where(spread > LEAST_FEATURE_SPREAD, spread, 1.0)
         self.scaling = {"low": low, "high": high, "mean": clipped.mean(axis=0), "scale": scale}
         weight = 1 / np.sqrt(np.unique(scan, return_counts=True)[1][np.unique(scan, return_inverse=True)[1]])
         inputs = (clipped - self.scaling["mean"]) / self.scaling["scale"]

@@ -10,7 +10,7 @@ import shapely
 from topomerge.datasets.buildings.erect import erect
 from topomerge.datasets.buildings.niches import BEHIND_NICHE, CORNER, NICHE_DEPTHS
 from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.pairs.wall_examples import true_classes
+from topomerge.datasets.pairs.wall_truth import true_classes
 
 from tests.datasets.boxes import BARE, two_rooms
 from topomerge.extraction.elevations.elevation import ALONG, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations

@@ -9,7 +9,15 @@ from tests.extraction.elevations.doors import SHUT_DOOR, cupboard_and_board, ext
 from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE, HALF, OPEN, SHUT, doorways, joined_openings, read_both_ways
+from topomerge.extraction.elevations.doorways import (
+    DOORWAY_DTYPE,
+    HALF_OPEN,
+    OPEN,
+    SHUT,
+    doorways,
+    joined_openings,
+    read_both_ways,
+)
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_candidates, door_chance
 from topomerge.extraction.elevations.wall_network import read_network
@@ -122,7 +130,7 @@ def seen(doors, map=None):
     example = two_doors(0)
     elevations = Elevations(example[1], np.array([0, 160]), example[2] / np.float32(255))
     classes = np.zeros((len(doors), len(WALL_CLASSES)))
-    classes[:, [OPEN, SHUT, HALF]] = doors
+    classes[:, [OPEN, SHUT, HALF_OPEN]] = doors
     return door_candidates(example[0] if map is None else map, (), elevations, classes)
 
 

@@ -26,7 +26,7 @@ SAME_DOORWAY = 0.45  # m between what two faces show of one doorway
 STOOD = 0.12  # m from the middle of a cell of a floor: a place this near is on it
 DOORWAY_LEVEL = 0.5  # m between their floors
 STRAIGHT = 0.95  # cosine between two parts of one opening
-OPEN, SHUT, HALF = (WALL_CLASSES.index(name) for name in ("open", "shut", "half"))
+OPEN, SHUT, HALF_OPEN = (WALL_CLASSES.index(name) for name in ("open", "shut", "half"))
 DOORWAY_DTYPE = np.dtype(
     [
         ("rooms", "i4", 2),  # that see it, the second -1 where one does
@@ -86,7 +86,7 @@ def coloured_both_ways(colours: Array, classes: Array) -> Array:
 
 def door_places(walls: Elevations, classes: Array) -> Array:
     """(n / 2, 3) float32 probability of an open, a shut and a half-open door in each place, of those of all classes."""
-    parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT, HALF]] for low, high in strip_bounds(walls)]
+    parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT, HALF_OPEN]] for low, high in strip_bounds(walls)]
     return np.concatenate([np.zeros((0, 3), np.float32), *parts])
 
 
