@@ -300,12 +300,17 @@ def test_json_fields_and_strictness(scene: TopometricMap, tmp_path: Path) -> Non
     assert list(listing["seconds"]) == ["read and voxelise", "rooms"]
 
 
+def with_columns(table: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """A table with fewer columns."""
+    older = np.zeros(len(table), dtype)
+    for name in dtype.names or ():
+        older[name] = table[name]
+    return older
+
+
 def test_maps_of_earlier_versions_open(saved: Path, scene: TopometricMap, tmp_path: Path) -> None:
     """Their tables of rooms say nothing of probabilities: what was mostly unseen was only looked into."""
-    rooms = archive.read(saved)["rooms"]
-    older = np.zeros(len(rooms), OLDER_ROOMS)
-    for name in OLDER_ROOMS.names or ():
-        older[name] = rooms[name]
+    older = with_columns(archive.read(saved)["rooms"], OLDER_ROOMS)
     opened = load_map(rewritten(saved, tmp_path / "old.tmap", rooms=older)).rooms
     assert all((opened[name] == scene.rooms[name]).all() for name in OLDER_ROOMS.names or ())
     assert (opened["entered"] == ~opened["glimpsed"]).all() and (opened["entered"] == opened["whole"]).all()
@@ -314,10 +319,7 @@ def test_maps_of_earlier_versions_open(saved: Path, scene: TopometricMap, tmp_pa
 
 
 def test_maps_that_tell_no_half_open_doors_open(saved: Path, scene: TopometricMap, tmp_path: Path) -> None:
-    edges = archive.read(saved)["edges"]
-    older = np.zeros(len(edges), OLDER_EDGE_DTYPE)
-    for name in OLDER_EDGE_DTYPE.names or ():
-        older[name] = edges[name]
+    older = with_columns(archive.read(saved)["edges"], OLDER_EDGE_DTYPE)
     opened = load_map(rewritten(saved, tmp_path / "old.tmap", edges=older)).edges
     assert len(opened) == len(scene.edges) > 0 and not opened["half"].any()
     assert all((opened[name] == scene.edges[name]).all() for name in OLDER_EDGE_DTYPE.names or ())
