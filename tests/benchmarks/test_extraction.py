@@ -46,19 +46,14 @@ def test_sets_keep_to_their_buildings(benchmark) -> None:
 
 @pytest.mark.longer
 @pytest.mark.data
-def test_rooms_of_robots_grids_are_those_of_their_segmentation(benchmark, data_dir, tmp_path) -> None:
-    """Of IPA's own lab at most one of the ten rooms that a person drew is missing, whatever corners are rooms beside them; over
-    all eight grids the mean IoU is .9 (one map went from .81 to .80 when the mean rose from .89 to .90)."""
+def test_rooms_of_a_robot_grid_are_those_of_its_segmentation(benchmark, data_dir, tmp_path) -> None:
+    """IPA's own lab: at most one of the ten rooms that a person drew is missing, whatever corners are rooms beside them."""
     from topomerge.datasets.simulation.floor_truth import judge
 
     from topomerge.extraction.extract import extract
 
-    scans, cases = (importlib.import_module(f"benchmarks.extraction.{name}") for name in ("scans", "cases"))
-    rooms = {}
-    for name in cases.IPA:
-        case = scans.Case("grids", "ipa", name, "")
-        scan = scans.load(case, tmp_path, data_dir)
-        rooms[name] = judge(extract(scan.cloud, voxel_size=case.voxel), scan.truth).rooms
-    lab = rooms["lab_ipa"]
-    assert len(lab.each) == 10 and lab.recall >= 0.9 and lab.precision >= 0.75
-    assert sum(r.iou for r in rooms.values()) / len(rooms) >= 0.9 and min(r.iou for r in rooms.values()) > 0.6
+    scans = importlib.import_module("benchmarks.extraction.scans")
+    case = scans.Case("grids", "ipa", "lab_ipa", "")
+    scan = scans.load(case, tmp_path, data_dir)
+    rooms = judge(extract(scan.cloud, voxel_size=case.voxel), scan.truth).rooms
+    assert len(rooms.each) == 10 and rooms.recall >= 0.9 and rooms.iou >= 0.8 and rooms.precision >= 0.75

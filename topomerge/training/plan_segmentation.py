@@ -24,6 +24,7 @@ from topomerge.extraction.classified_storey import COLUMN_CLASSES
 from topomerge.extraction.plans.plan_network import column_probabilities, evidence, read_weights
 from topomerge.io import archive
 from topomerge.models.plan_unet import PlanUNet, exported_weights
+from topomerge.training.grid_noise import with_grid_noise
 from topomerge.training.loop import Say, State, made_beside, mixed
 from topomerge.training.networks import NetworkJob, run_network
 from topomerge.training.scan_settings import GridSegmentation, PlanAugment, PlanLoss, PlanSegmentation
@@ -151,6 +152,8 @@ def crop(plan: PlanTensors, side: int, augment: PlanAugment, rng: np.random.Gene
     x = np.array(x, np.float32)
     if rng.random() < augment.upper:
         x[..., list(FLOOR_CHANNEL if rng.random() < FLOOR_LOST else UPPER_CHANNELS)] = 0
+    if augment.grid_noise and rng.random() < augment.grid_noise:
+        x = with_grid_noise(x, truth == TRUE_CLASSES.index("inside"), rng)
     if rng.random() < augment.columns:
         x[..., 1:10] *= rng.random((side, side, 1)) > rng.uniform(0, augment.lost)
     return x, truth, weight

@@ -28,8 +28,10 @@ class PlanAugment:
     Args:
         upper: share of crops without ceiling or without floor.
         columns: share of crops that lose single columns; lost: share of these, drawn between 0 and this.
+        grid_noise: share of crops with the noise of robots' grids (`training.grid_noise`).
     """
 
+    grid_noise: float = 0.0
     upper: float = 0.2
     columns: float = 0.3
     lost: float = 0.3
@@ -67,7 +69,7 @@ class GridSegmentation(PlanSegmentation):
     epochs: int = 6
     warmup: int = 200
     rate: float = 3e-3
-    augment: PlanAugment = field(default_factory=lambda: PlanAugment(upper=0.0, columns=0.0))
+    augment: PlanAugment = field(default_factory=lambda: PlanAugment(upper=0.0, columns=0.0, grid_noise=0.15))
 
 
 @dataclass
