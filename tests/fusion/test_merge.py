@@ -85,8 +85,17 @@ def test_two_halves_are_merged(merged, halves):
     middle = tuple(MOVE.apply(np.array([[10.0, 7.0, 1.0]]))[0])
     metres, degrees = off(merged.transforms[1], MOVE.inverse(), middle)
     assert metres < 0.06 and degrees < 0.2
-    assert set(merged.seconds) == set(MERGE_STEPS) and merged.seconds["fuse"] > 0 and merged.seconds["embed"] > 0
+    assert set(merged.seconds) == set(MERGE_STEPS) and merged.seconds["fuse"] > 0
     assert merged.maps == halves
+
+
+def test_rooms_are_matched_only_where_walls_are_not_believed(merged, refused, halves):
+    assert merged.seconds["embed"] == merged.seconds["match"] == 0
+    assert refused.seconds["embed"] > 0 and refused.seconds["match"] > 0
+    by_rooms = tm.merge(halves, poses="rooms")
+    assert by_rooms.merged and by_rooms.seconds["embed"] > 0
+    with pytest.raises(InputError, match="nobody"):  # before anything is done
+        tm.merge(halves, embedder="nobody")
 
 
 def walled(map: TopometricMap) -> np.ndarray:

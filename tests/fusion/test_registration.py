@@ -10,6 +10,7 @@ from tests.scenes import HEIGHT, Scene
 from topomerge.errors import InputError
 from topomerge.fusion.posterior import FEW, WRONG
 from topomerge.fusion.registration import register
+from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, VoxelGrid
 
 
@@ -80,6 +81,27 @@ def test_a_hypothesis_is_tried_and_refined(halves):
     near = Sim3(-MOVE.yaw + 0.03, MOVE.inverse().translation)
     found = register(*halves, proposed=[near])
     assert off(found.transform, MOVE.inverse(), middle_in_b())[0] < 0.03
+
+
+def test_poses_are_asked_for_only_where_those_of_walls_are_not_believed(halves, joined):
+    def never():
+        raise AssertionError("asked though walls are believed")
+
+    assert register(*halves, proposed=never).transform == joined.transform
+
+
+def test_poses_of_rooms_decide_where_the_search_of_walls_fails(halves, joined, monkeypatch):
+    """In either order, and by the same hypotheses as if they had been there from the start."""
+    astray = PoseHypothesis(Sim3(1.0, (40.0, 0.0, 0.0)))
+    monkeypatch.setattr("topomerge.fusion.registration.search", lambda *_: [astray])
+    pose = joined.transform
+    assert not register(*halves).accepted
+    late = register(*halves, proposed=lambda: [pose])
+    assert late.accepted and off(late.transform, pose, middle_in_b())[0] < 0.03
+    back = register(*reversed(halves), proposed=lambda: [pose.inverse()])
+    assert back.accepted and off(back.transform.inverse(), pose, middle_in_b())[0] < 0.03
+    assert len(late.alternatives) == 2 and late.alternatives[0].from_rooms and not late.alternatives[1].from_rooms
+    assert not register(*halves, proposed=list).accepted  # no matched rooms: as it was
 
 
 @pytest.mark.longer

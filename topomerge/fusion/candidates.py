@@ -73,9 +73,18 @@ def rivals(ranked: Sequence[PoseHypothesis]) -> list[int]:
     return near + sorted(rest, key=lambda k: lag[k])[:1]
 
 
-def candidates(a: Prepared, b: Prepared, ranked: Sequence[PoseHypothesis], scaled: bool) -> list[Candidate]:
-    """The hypotheses worth it, each with the maps bent, best first; those that end in one pose once."""
-    looked = sorted((candidate(a, b, ranked[k], scaled) for k in rivals(ranked)), key=lambda c: -c.score)
+def candidates(
+    a: Prepared, b: Prepared, ranked: Sequence[PoseHypothesis], scaled: bool, bent: dict[int, Candidate] | None = None
+) -> list[Candidate]:
+    """The hypotheses worth it, each with the maps bent, best first; those that end in one pose once.
+
+    Args:
+        bent: id of a hypothesis -> what was made of it before; new ones are added.
+    """
+    bent = {} if bent is None else bent
+    near = [ranked[k] for k in rivals(ranked)]
+    bent |= {id(h): candidate(a, b, h, scaled) for h in near if id(h) not in bent}
+    looked = sorted((bent[id(h)] for h in near), key=lambda c: -c.score)
     looked[0].features["repeats"] = float(repeats(ranked))  # asked of the best one only
     moved = [replace(c.hypothesis, transform=c.bend.transform) for c in looked]
     single = {id(h) for h in distinct_hypotheses(moved, np.append(b.storeys[0].middle, 0.0), BASIN)}

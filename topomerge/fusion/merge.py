@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def merge(
             gives that of a stated risk.
         embedder: "learned" (default), "engineered", "shapedna", "feather", the folder of a trained one, or a callable
             map -> (R, D), for the matching of rooms.
-        poses: "search": of walls and of matched rooms (default); "rooms": of matched rooms alone; "surfaces": of each matched
+        poses: "search": of walls and, where the best one is not believed, of matched rooms (default); "rooms": of matched rooms alone; "surfaces": of each matched
             pair of rooms by its surfaces, as the thesis does (with `embedder="shapedna"` its whole way). The last two are for two
             maps, the last one for maps of one scale.
         rigid: do not bend the maps.
@@ -97,7 +98,8 @@ def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> Merge
     check_pair(a, b, settings.scale)
     threshold = checked_threshold(settings.threshold)
     clock = _Clock()
-    hypotheses = _room_hypotheses(a, b, settings, clock)
+    describe = _Timed(settings.embedder, clock, settings.poses == "rooms")
+    hypotheses = partial(_room_hypotheses, a, b, settings, describe)
     searched = settings.poses == "search"
     choices: dict[str, Any] = {"rigid": settings.rigid, "same": settings.same}
     registration = register(a, b, scale=settings.scale, proposed=hypotheses, searched=searched, **choices)
@@ -199,14 +201,13 @@ class _Clock:
         return s
 
 
-def _room_hypotheses(a: TopometricMap, b: TopometricMap, settings: _Settings, clock: _Clock) -> list[Sim3]:
+def _room_hypotheses(a: TopometricMap, b: TopometricMap, settings: _Settings, describe: _Timed) -> list[Sim3]:
     """Poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "surfaces") of each by itself."""
     if not len(a.rooms) or not len(b.rooms):
         return []
     if registration_order(b) < registration_order(a):  # as registration: nothing may depend on which comes first
-        return [h.inverse() for h in _room_hypotheses(b, a, settings, clock)]
-    describe = _Timed(settings.embedder, clock, settings.poses == "rooms")
-    with clock("match"):
+        return [h.inverse() for h in _room_hypotheses(b, a, settings, describe)]
+    with describe.clock("match"):
         if settings.poses == "surfaces":
             return _surface_hypotheses(a, b, match(a, b, describe, "growing"))
         return [h.transform for h in match(a, b, describe, scale_free=settings.scale == "free").alternatives]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from topomerge.types import Sim3, VoxelGrid
 
 log = logging.getLogger(__name__)
 ALTERNATIVES = 10
+Proposed = Sequence[Sim3] | Callable[[], Sequence[Sim3]]  # poses T_ab, or what makes them
 DRIFTED = (0.5, np.radians(3.0))  # m, rad: a refinement that moves the middle by more has lost its way
 
 
@@ -66,7 +68,7 @@ def register(
     b: Map | Prepared,
     *,
     scale: str = "fixed",
-    proposed: Sequence[Sim3] = (),
+    proposed: Proposed = (),
     free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
     searched: bool = True,
     rigid: bool = False,
@@ -77,7 +79,8 @@ def register(
     Args:
         a, b: topometric maps or occupied cells, or what `prepare` made of them.
         scale: "fixed", or "free" where b's unit may differ (looked for between 0.5 and 2).
-        proposed: poses T_ab of matched rooms, tried beside those of the correlation.
+        proposed: poses T_ab of matched rooms, tried beside those of the correlation; or what makes them, which is asked only
+            where the best pose of the correlation is not believed.
         free: cells of a and of b known to be empty; topometric maps bring their own.
         searched: look for poses by correlation? Else the proposed ones are all there is.
         rigid: give the best rigid pose? Else both maps are bent, too. They are judged as bent all the same: drift is no
@@ -94,27 +97,69 @@ def register(
     a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
-        poses = [pose.inverse() for pose in proposed]
+        poses = partial(_inverses, proposed) if callable(proposed) else _inverses(proposed)
         swapped = register(b, a, scale=scale, proposed=poses, searched=searched, rigid=rigid, same=same)
         return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
-    first, second = a.storeys, b.storeys
-    if searched:
-        hypotheses = (search_scaled if scale == "free" else search)(first, second, proposed)
+    pair = _Pair(a, b, scale == "free", clock)
+    if searched and callable(proposed):
+        pair.search(())
+        registration = pair.registered(rigid, same)
+        if not registration.accepted:
+            pair.add(_made(proposed))
+            registration = pair.registered(rigid, same)
     else:
-        hypotheses = refine(first, second, [PoseHypothesis(pose, from_rooms=True) for pose in proposed])
-    clock("search")
-    if not hypotheses:
+        (pair.search if searched else pair.add)(_made(proposed))
+        registration = pair.registered(rigid, same)
+    if registration.transform is None:
         reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
-        return Registration(None, 0.0, False, reason=reason, seconds=clock.seconds)
-    ranked = rank(hypotheses, Judge(first, second))
-    clock("verify")
-    looked = candidates(a, b, ranked, scale == "free")
-    clock("bend")
-    bent, rmse = _refined(a, b, looked[0], scale == "free", rigid)
-    clock("refine")
-    believed = _verdict(ranked, looked, verdict([c.features for c in looked], looked[0].closely(), same))
-    features = {**believed.features, "rmse": rmse}
-    return replace(believed, transform=bent.transform, features=features, seconds=clock.seconds, bend=None if rigid else bent)
+        registration = replace(registration, reason=reason)
+    return replace(registration, seconds=clock.seconds)
+
+
+class _Pair:
+    """Two maps while they are registered: their hypotheses, ranked, and those that were looked at closely."""
+
+    def __init__(self, a: Prepared, b: Prepared, scaled: bool, clock: _Clock) -> None:
+        self.a, self.b, self.scaled, self.clock = a, b, scaled, clock
+        self.judge = Judge(a.storeys, b.storeys)
+        self.ranked: list[PoseHypothesis] = []
+        self.bent: dict[int, Candidate] = {}
+
+    def search(self, poses: Sequence[Sim3]) -> None:
+        """Add hypotheses of the correlation, and of given poses T_ab."""
+        self._rank((search_scaled if self.scaled else search)(self.a.storeys, self.b.storeys, poses))
+
+    def add(self, poses: Sequence[Sim3]) -> None:
+        """Add given poses T_ab, moved to where the walls meet."""
+        self.clock("match")
+        proposals = [PoseHypothesis(pose, from_rooms=True) for pose in poses]
+        self._rank(refine(self.a.storeys, self.b.storeys, proposals, self.scaled))
+
+    def _rank(self, hypotheses: Sequence[PoseHypothesis]) -> None:
+        self.clock("search")
+        self.ranked = rank(hypotheses, self.judge, self.ranked)
+        self.clock("verify")
+
+    def registered(self, rigid: bool, same: str) -> Registration:
+        """The registration by the hypotheses there are."""
+        if not self.ranked:
+            return Registration(None, 0.0, False)
+        looked = candidates(self.a, self.b, self.ranked, self.scaled, self.bent)
+        self.clock("bend")
+        bent, rmse = _refined(self.a, self.b, looked[0], self.scaled, rigid)
+        self.clock("refine")
+        said = verdict([c.features for c in looked], looked[0].closely(), same)
+        believed = _verdict(self.ranked, looked, said)
+        features = {**believed.features, "rmse": rmse}
+        return replace(believed, transform=bent.transform, features=features, bend=None if rigid else bent)
+
+
+def _made(poses: Proposed) -> Sequence[Sim3]:
+    return poses() if callable(poses) else poses
+
+
+def _inverses(poses: Proposed) -> list[Sim3]:
+    return [pose.inverse() for pose in _made(poses)]
 
 
 def _refined(a: Prepared, b: Prepared, best: Candidate, scaled: bool, rigid: bool) -> tuple[Bend, float]:
@@ -140,7 +185,8 @@ class _Clock:
 
     def __call__(self, step: str) -> None:
         now = time.perf_counter()
-        self.seconds[step], self.before = now - self.before, now
+        self.seconds[step] = self.seconds.get(step, 0.0) + now - self.before
+        self.before = now
 
 
 def _verdict(ranked: Sequence[PoseHypothesis], looked: Sequence[Candidate], said: Verdict) -> Registration:

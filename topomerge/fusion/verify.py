@@ -204,8 +204,11 @@ def winner_vector(f: Features) -> Array:
     )
 
 
-def rank(hypotheses: Sequence[PoseHypothesis], judge: Judge) -> list[PoseHypothesis]:
-    """The hypotheses with their features and, as scores, the log odds that each is right, seen by itself; best first.
+def rank(
+    hypotheses: Sequence[PoseHypothesis], judge: Judge, ranked: Sequence[PoseHypothesis] = ()
+) -> list[PoseHypothesis]:
+    """The hypotheses with their features and, as scores, the log odds that each is right, seen by itself; best first, and among
+    them those that were ranked before.
 
     The findings' two-stage rule (shortlist what reaches 0.6 of the best agreement, then least conflict) put the right pose
     first in 76 of 82 training pairs, the logistic model in 80: a flipped plan can agree in more walls than a true overlap.
@@ -213,7 +216,7 @@ def rank(hypotheses: Sequence[PoseHypothesis], judge: Judge) -> list[PoseHypothe
     lifted = [replace(h, transform=judge.lifted(h.transform)) for h in hypotheses]
     if len(lifted) > JUDGED_FULLY:
         lifted.sort(key=lambda h: -plausibility(judge(h.transform, GLANCE_STEP)))
-    judged = []
+    judged = list(ranked)
     for hypothesis in lifted[:JUDGED_FULLY]:
         features = judge(hypothesis.transform)
         judged.append(replace(hypothesis, features=features, score=plausibility(features)))
