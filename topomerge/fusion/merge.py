@@ -59,9 +59,9 @@ def merge(
             gives that of a stated risk.
         embedder: "learned" (default), "engineered", "shapedna", "feather", the folder of a trained one, or a callable
             map -> (R, D), for the matching of rooms.
-        poses: "search": of walls and, where the best one is not believed, of matched rooms (default); "rooms": of matched rooms alone; "surfaces": of each matched
-            pair of rooms by its surfaces, as the thesis does (with `embedder="shapedna"` its whole way). The last two are for two
-            maps, the last one for maps of one scale.
+        poses: "search": of walls and, where the best one is not believed, of matched rooms (default); "rooms": of matched rooms
+            alone; "surfaces": of each matched pair of rooms by its surfaces, as the thesis does (with `embedder="shapedna"` its
+            whole way). The last two are for two maps, the last one for maps of one scale.
         rigid: do not bend the maps.
         same: "nothing", "building" or "storey": all maps are known to be of one, so that nothing else has to be ruled out.
 

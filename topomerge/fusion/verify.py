@@ -204,9 +204,7 @@ def winner_vector(f: Features) -> Array:
     )
 
 
-def rank(
-    hypotheses: Sequence[PoseHypothesis], judge: Judge, ranked: Sequence[PoseHypothesis] = ()
-) -> list[PoseHypothesis]:
+def rank(hypotheses: Sequence[PoseHypothesis], judge: Judge, ranked: Sequence[PoseHypothesis] = ()) -> list[PoseHypothesis]:
     """The hypotheses with their features and, as scores, the log odds that each is right, seen by itself; best first, and among
     them those that were ranked before.
 
