@@ -30,8 +30,9 @@ from benchmarks.extraction.cases import BUILDING_KINDS
 from benchmarks.extraction.scans import Case, Scan, load
 from benchmarks.extraction.tables import replace_section
 from topomerge.extraction.elevations.doorways import place_classes
+from topomerge.extraction.elevations.stretches import STRETCH_CHANCE
 from topomerge.extraction.elevations.wall_network import PLACES
-from topomerge.extraction.elevations.windows import WINDOW, WINDOW_CHANCE
+from topomerge.extraction.elevations.windows import WINDOW
 from topomerge.extraction.extract import extract
 from topomerge.types import Array, TopometricMap
 
@@ -67,10 +68,10 @@ def judged(case: Case, scan: Scan, map: TopometricMap) -> Row:
     building = make_building(case.building, case.seed, case.storeys, Difficulty(**dict(case.difficulty)))
     true = np.array(glazed(building), float).reshape(-1, 7)
     own = map.windows[~map.rooms["glimpsed"][map.windows["rooms"][:, 0]]]
-    turned = scan.truth.place(own["centre"] + np.column_stack([_normal(own["direction"]), np.zeros(len(own))]))
+    turned = scan.truth.place(own["centre"] + np.column_stack([normals(own["direction"]), np.zeros(len(own))]))
     at = scan.truth.place(own["centre"])
     direction = np.arctan2(*(turned - at)[:, 1::-1].T)
-    pairs = _pairs(true, at, direction, own["width"])
+    pairs = paired(true, at, direction, own["width"])
     wanted = _of_visited(scan, true)
     there = np.isin(np.arange(len(true)), pairs[:, 0])
     t, m = true[pairs[:, 0]], own[pairs[:, 1]]
@@ -80,14 +81,21 @@ def judged(case: Case, scan: Scan, map: TopometricMap) -> Row:
     return {"sensor": case.sensor, **counts, **errors}
 
 
-def _normal(direction: Array) -> Array:
+def normals(direction: Array) -> Array:
+    """(n, 2) unit."""
     return np.stack([np.cos(direction), np.sin(direction)], axis=-1)
 
 
-def _pairs(true: Array, at: Array, direction: Array, width: Array) -> Array:
-    """(k, 2) true windows and those of the map that are one, each once, the best first."""
+def paired(true: Array, at: Array, direction: Array, width: Array, allowed: Array | None = None) -> Array:
+    """(k, 2) true windows, or fixtures, and those of the map that are one, each once, the best first.
+
+    Args:
+        true: (T, 5+) centre (m), direction (rad) and width (m) of each.
+        at: (n, 3) m, direction (n,) rad and width (n,) m of those of the map.
+        allowed: (T, n) bool, which may be one at all; None: all.
+    """
     apart = at[None] - true[:, None, :3]
-    normal = _normal(true[:, 3])[:, None]
+    normal = normals(true[:, 3])[:, None]
     across = np.abs((apart[..., :2] * normal).sum(axis=-1))
     place = np.abs(apart[..., 0] * normal[..., 1] - apart[..., 1] * normal[..., 0])
     wide = true[:, 4, None]
@@ -95,6 +103,7 @@ def _pairs(true: Array, at: Array, direction: Array, width: Array) -> Array:
     iou = shared / (wide + width - shared)
     fits = (across < ACROSS_WALL) & (np.abs(apart[..., 2]) < ONE_LEVEL) & (iou >= LEAST_IOU)
     fits &= np.abs(np.cos(direction[None] - true[:, 3, None])) > np.cos(np.radians(15))
+    fits &= True if allowed is None else allowed
     pairs: list[tuple[int, int]] = []
     for i, j in np.column_stack(np.unravel_index(np.argsort(-iou, axis=None, kind="stable"), iou.shape)).tolist():
         if fits[i, j] and all(i != a and j != b for a, b in pairs):
@@ -129,7 +138,7 @@ def places(listing: Path, folder: Path) -> str:
         example = load_walls(folder / json.loads(line)["file"])
         walls = example.elevations
         seen = walls.strips.reshape(len(walls.strips) // PLACES, -1).any(axis=1)
-        said, true = place_classes(walls)[seen, WINDOW] > WINDOW_CHANCE, example.truth[::PLACES][seen] == WINDOW
+        said, true = place_classes(walls)[seen, WINDOW] > STRETCH_CHANCE, example.truth[::PLACES][seen] == WINDOW
         row = np.array([(said & true).sum(), said.sum(), true.sum(), len(true), 1])
         for sensor in (example.source.partition("/")[0], "all"):
             counts.setdefault(sensor, []).append(row)

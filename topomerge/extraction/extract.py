@@ -13,6 +13,7 @@ from topomerge.extraction.distinct_doors import distinct_doors
 from topomerge.extraction.elevations.doorway_rooms import doors_inside_rooms
 from topomerge.extraction.elevations.doorways import place_classes
 from topomerge.extraction.elevations.elevation import wall_elevations
+from topomerge.extraction.elevations.fixtures import with_fixtures
 from topomerge.extraction.elevations.wall_doors import with_wall_doors
 from topomerge.extraction.elevations.windows import with_windows
 from topomerge.extraction.floor import Floor
@@ -148,8 +149,8 @@ class _Reconsidered(NamedTuple):
 def _with_odds_and_openings(
     map: TopometricMap, scan: Scan, floor: Floor, p: Parameters
 ) -> tuple[TopometricMap, list[str], _Reconsidered]:
-    """The map with how likely each room is one, with the doors and windows that its walls show, and with the doors that the
-    sensor was carried through; what is odd about its way; and what these say of its rooms."""
+    """The map with how likely each room is one, with the doors, windows and fixtures that its walls show, and with the doors that
+    the sensor was carried through; what is odd about its way; and what these say of its rooms."""
     if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
         return replace(map, rooms=with_outline_odds(map.rooms)), [], _Reconsidered()
     map = with_room_odds(map, scan.rays)
@@ -167,7 +168,8 @@ def _with_odds_and_openings(
     if walls is not None:
         again = again._replace(one=walked_rooms(map, floor, likeliest))
     if walls is not None and classes is not None:
-        map = without_patches(with_windows(map, walls, classes), scan.places)
+        map = with_fixtures(with_windows(map, walls, classes), walls, classes)
+        map = without_patches(map, scan.places)
     return map, [doubt] if doubt else [], again
 
 

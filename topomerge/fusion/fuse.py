@@ -27,7 +27,7 @@ from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.joined_doors import laid_floor, laid_part, with_doors
 from topomerge.fusion.joined_odds import with_part_odds
-from topomerge.fusion.joined_windows import laid_windows, with_joined_windows
+from topomerge.fusion.joined_windows import laid_fixtures, laid_windows, with_joined_fixtures, with_joined_windows
 from topomerge.fusion.resampling import Laying, decoded, encoded, laid_means, resampled
 from topomerge.fusion.single_walls import copies
 from topomerge.fusion.storey_levels import extruded
@@ -71,16 +71,18 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     cells = _JoinedCells(maps[poses[0][0]].grid.origin, _edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     layings = [Laying.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
-    windows, laid = [], []
+    windows, fixtures, laid = [], [], []
     for n in order:
         map = maps[poses[n][0]]
         cells.add_map(map, layings[n], int(first_bits[n]), parts[n].assumed and n != order[0])
         windows.append(laid_windows(map, layings[n]))
+        fixtures.append(laid_fixtures(map, layings[n]))
         laid.append(laid_part(map, layings[n]))
     name = JOINED.join(maps[k].source or "map" for k, _ in poses)
     rooms = [part.rooms for part in laid]
     joined = _extracted(cells, min(part.neighbours for part in parts), name, rooms)
-    return with_joined_windows(with_doors(with_part_odds(joined, rooms), laid), windows)
+    joined = with_joined_windows(with_doors(with_part_odds(joined, rooms), laid), windows)
+    return with_joined_fixtures(joined, fixtures)
 
 
 @dataclass(frozen=True)

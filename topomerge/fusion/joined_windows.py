@@ -1,7 +1,7 @@
-"""Windows of the maps that were joined -> windows of the joined map (method 4).
+"""Windows, niches and cupboards of the maps that were joined -> those of the joined map (method 4).
 
 Those that the joined cells show are not taken: walls that two maps show a little apart look like reveals, and the cells are
-coarser than those in which windows are seen.
+coarser than those in which they are seen.
 """
 
 from __future__ import annotations
@@ -11,21 +11,35 @@ from dataclasses import replace
 
 import numpy as np
 
+from topomerge.extraction.elevations.fixtures import fixtures_in_map
 from topomerge.extraction.elevations.windows import in_map, same_windows
 from topomerge.fusion.resampling import Laying
-from topomerge.types import WINDOW_DTYPE, Array, TopometricMap
+from topomerge.types import FIXTURE_DTYPE, WINDOW_DTYPE, Array, TopometricMap
 
 
 def laid_windows(part: TopometricMap, laying: Laying) -> Array:
     """(W,) WINDOW_DTYPE of a part in the joined map, without rooms."""
-    windows = part.windows.copy()
+    windows = _laid(part.windows, laying, ("width", "sill", "head"), np.pi)
     windows["rooms"] = -1
-    if len(windows):
-        windows["centre"] = laying.apply(windows["centre"])
-        windows["direction"] = (windows["direction"] + laying.pose.yaw) % np.pi
-        for name in ("width", "sill", "head"):
-            windows[name] *= laying.pose.scale
     return windows
+
+
+def laid_fixtures(part: TopometricMap, laying: Laying) -> Array:
+    """(F,) FIXTURE_DTYPE of a part in the joined map, without a room."""
+    fixtures = _laid(part.fixtures, laying, ("width", "depth", "bottom", "top"), 2 * np.pi)
+    fixtures["room"] = -1
+    return fixtures
+
+
+def _laid(rows: Array, laying: Laying, lengths: Sequence[str], full_turn: float) -> Array:
+    """Rows with `centre` and `direction` in the joined map, the columns of lengths at its scale."""
+    rows = rows.copy()
+    if len(rows):
+        rows["centre"] = laying.apply(rows["centre"])
+        rows["direction"] = (rows["direction"] + laying.pose.yaw) % full_turn
+        for name in lengths:
+            rows[name] *= laying.pose.scale
+    return rows
 
 
 def with_joined_windows(joined: TopometricMap, parts: Sequence[Array]) -> TopometricMap:
@@ -37,3 +51,13 @@ def with_joined_windows(joined: TopometricMap, parts: Sequence[Array]) -> Topome
     windows = np.concatenate([np.zeros(0, WINDOW_DTYPE), *parts])
     first = [int(group[0]) for group in same_windows(windows)]
     return replace(joined, windows=in_map(joined, windows[first]))
+
+
+def with_joined_fixtures(joined: TopometricMap, parts: Sequence[Array]) -> TopometricMap:
+    """The joined map, which has its windows, with the niches and cupboards of its parts, each once.
+
+    Args:
+        parts: FIXTURE_DTYPE of `laid_fixtures`.
+    """
+    rows = np.concatenate([np.zeros(0, FIXTURE_DTYPE), *parts])
+    return replace(joined, fixtures=fixtures_in_map(joined, rows))

@@ -9,15 +9,15 @@ from topomerge.types import Array, VoxelGrid
 # The largest buildings have about 1,000 rooms, the tallest 163 storeys.
 ROOM_LIMIT, STOREY_LIMIT = 5_000, 200
 ROOM_COLUMNS, TOTAL_COLUMNS = 50_000_000, 100_000_000  # of the grid, in the rectangle around a room's floor, and around each
-CONNECTION_LIMIT = 30_000  # of edges, areas, narrows and windows each, however many rooms there are
-EDGES_PER_ROOM, AREAS_PER_ROOM, WINDOWS_PER_ROOM = 20, 20, 100  # on average
+CONNECTION_LIMIT = 30_000  # of edges, areas, narrows, windows and fixtures each, however many rooms there are
+EDGES_PER_ROOM, AREAS_PER_ROOM, WINDOWS_PER_ROOM, FIXTURES_PER_ROOM = 20, 20, 100, 100  # on average
 
 
 def require_sane_counts(arrays: dict[str, Array]) -> None:
     """Refuses tables longer than the cells of the map can fill, before anything is done for each of their rows.
 
     Raises:
-        ValueError: more rooms, edges, storeys, areas, narrows or windows than a building has.
+        ValueError: more rooms, edges, storeys, areas, narrows, windows or fixtures than a building has.
     """
     rooms, areas = arrays["rooms"].size, arrays["areas"].size
     cells = arrays["room"].size + arrays["navigable_room"].size
@@ -28,6 +28,7 @@ def require_sane_counts(arrays: dict[str, Array]) -> None:
         "areas": (min(AREAS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({AREAS_PER_ROOM} a room)"),
         "narrows": (min(EDGES_PER_ROOM * areas, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} an area)"),
         "windows": (min(WINDOWS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({WINDOWS_PER_ROOM} a room)"),
+        "fixtures": (min(FIXTURES_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({FIXTURES_PER_ROOM} a room)"),
     }
     for name, (limit, share) in limits.items():
         words = share if limit < CONNECTION_LIMIT else ""

@@ -1,4 +1,4 @@
-"""Doors, openings and windows of a map, set into the walls that carry them."""
+"""Doors, openings, windows and fixtures of a map, set into the walls that carry them."""
 
 from __future__ import annotations
 
@@ -31,6 +31,16 @@ SET_WINDOW_DTYPE = np.dtype(
         ("direction", "f8"),  # rad, of the wall's normal, in [0, pi)
     ]
 )
+SET_FIXTURE_DTYPE = np.dtype(
+    [
+        ("fixture", "i4"),  # row of the map's fixtures
+        ("wall", "i4"),  # row of the walls; -1: none was seen around it
+        ("depth", "f8"),  # m; a usual one where it was not seen, as those that follow
+        ("bottom", "f8"),  # m above the floor
+        ("top", "f8"),
+    ]
+)
+USUAL_DEPTH = {"niche": 0.1, "cupboard": 0.45}  # m
 USUAL_SILL, USUAL_HEAD, LEAST_PANE = 0.9, 2.1, 0.3  # m above the floor, where they were not seen, and between them at least
 CARRIER_REACH = 0.8  # m between the middle of a door and the middle line of its wall
 STRANGE = 0.4  # m: a wall of other rooms has to be so much nearer
@@ -51,7 +61,7 @@ def openings_in_walls(map: TopometricMap, walls: Array) -> Array:
         edge = map.edges[i]
         for name in ("centre", "width", "height", "direction", "kind"):
             opening[name] = edge[name]
-        opening["edge"], opening["wall"] = i, _carrier(edge, walls, map.rooms["storey"][edge["rooms"]])
+        opening["edge"], opening["wall"] = i, _carrier(edge, edge["rooms"], walls, map.rooms)
         if opening["wall"] >= 0:
             _set_into(opening, walls[opening["wall"]])
     return out
@@ -67,11 +77,26 @@ def windows_in_walls(map: TopometricMap, walls: Array) -> Array:
     for k, (pane, window) in enumerate(zip(out, map.windows, strict=True)):
         for name in ("centre", "width", "direction"):
             pane[name] = window[name]
-        rooms = window["rooms"][window["rooms"] >= 0]
-        pane["window"], pane["wall"] = k, _carrier(window, walls, map.rooms["storey"][rooms])
+        pane["window"], pane["wall"] = k, _carrier(window, window["rooms"], walls, map.rooms)
         if pane["wall"] >= 0:
             _set_into(pane, walls[pane["wall"]])
         pane["sill"], pane["head"] = _pane(float(window["sill"]), float(window["head"]))
+    return out
+
+
+def fixtures_in_walls(map: TopometricMap, walls: Array) -> Array:
+    """(F,) SET_FIXTURE_DTYPE, in the order of the map's fixtures; they stay where they are, in the face of their wall.
+
+    Args:
+        walls: WALL_DTYPE of the whole map.
+    """
+    out = np.zeros(len(map.fixtures), SET_FIXTURE_DTYPE)
+    for k, (placed, fixture) in enumerate(zip(out, map.fixtures, strict=True)):
+        kind, bottom = str(fixture["kind"]), float(fixture["bottom"])
+        placed["fixture"], placed["wall"] = k, _carrier(fixture, fixture["room"][None], walls, map.rooms)
+        placed["depth"] = fixture["depth"] if np.isfinite(fixture["depth"]) else USUAL_DEPTH[kind]
+        stands = kind == "cupboard" and not np.isfinite(bottom)
+        placed["bottom"], placed["top"] = _pane(0.0 if stands else bottom, float(fixture["top"]))
     return out
 
 
@@ -84,8 +109,14 @@ def _pane(sill: float, head: float) -> tuple[float, float]:
     return low, head if head > low else low + LEAST_PANE
 
 
-def _carrier(edge: Array, walls: Array, storeys: Array) -> int:
-    """Row of the wall nearest to a door or a window among those that part its rooms, -1 none."""
+def _carrier(edge: Array, rooms: Array, walls: Array, table: Array) -> int:
+    """Row of the wall nearest to a door, a window or a fixture among those that part its rooms, -1 none.
+
+    Args:
+        rooms: (2,) on its two sides, -1 none; or (1,) that sees it, whatever lies behind.
+        table: ROOM_DTYPE of the whole map.
+    """
+    inner = rooms[rooms >= 0]
     line = walls["end"] - walls["start"]
     length = np.maximum(np.hypot(*line.T), 1e-9)
     along = line / length[:, None]
@@ -93,10 +124,10 @@ def _carrier(edge: Array, walls: Array, storeys: Array) -> int:
     place = (apart * along).sum(axis=1)
     off = np.abs(apart[:, 0] * along[:, 1] - apart[:, 1] * along[:, 0])
     past = np.maximum(np.maximum(-place, place - length), 0.0)
-    beside = np.isin(walls["rooms"], edge["rooms"][edge["rooms"] >= 0]).sum(axis=1)
-    two = (np.sort(walls["rooms"], axis=1) == np.sort(edge["rooms"])).all(axis=1)
+    beside = np.isin(walls["rooms"], inner).sum(axis=1)
+    two = (np.sort(walls["rooms"], axis=1) == np.sort(rooms)).all(axis=1) if len(rooms) == 2 else beside > 0
     cost = np.hypot(off, past) + np.where(two, 0.0, STRANGE)
-    fits = np.isin(walls["storey"], storeys) & (beside > 0) & (off <= CARRIER_REACH)
+    fits = np.isin(walls["storey"], table["storey"][inner]) & (beside > 0) & (off <= CARRIER_REACH)
     fits &= past <= (0.5 - LEAST_SHARE) * edge["width"] + 0.1
     return int(np.flatnonzero(fits)[cost[fits].argmin()]) if fits.any() else -1
 

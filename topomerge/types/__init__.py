@@ -12,6 +12,8 @@ from topomerge.types.some_rooms import confident, of_rooms
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
     EDGE_DTYPE,
+    FIXTURE_DTYPE,
+    FIXTURE_KINDS,
     JOINED,
     OLDER_EDGE_DTYPE,
     ROOM_DTYPE,
@@ -27,6 +29,8 @@ from topomerge.types.topometric_map import (
 __all__ = [
     "AREA_DTYPE",
     "EDGE_DTYPE",
+    "FIXTURE_DTYPE",
+    "FIXTURE_KINDS",
     "JOINED",
     "OLDER_EDGE_DTYPE",
     "ROOM_DTYPE",

@@ -10,23 +10,28 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from topomerge.extraction.elevations.doorways import HALF_WALL, STOOD, strip_bounds
-from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, BEFORE, LOWEST, UPWARDS, WALL_CLASSES, Elevations
+from topomerge.extraction.elevations.doorways import HALF_WALL, strip_bounds
+from topomerge.extraction.elevations.elevation import ACROSS, BEFORE, WALL_CLASSES, Elevations
+from topomerge.extraction.elevations.stretches import (
+    PLACE,
+    at_any,
+    doors_of,
+    ends_upwards,
+    face_cover,
+    in_place,
+    likely_stretches,
+    one_each,
+    rooms_beside,
+    wall_depth,
+)
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.types import WINDOW_DTYPE, Array, TopometricMap
 
-WINDOW_CHANCE, LIKELY_WINDOW = 0.5, 0.85  # probability of a window of every place of it, and on average
+LIKELY_WINDOW = 0.85  # probability of a window, on average of its places
 LEAST_WINDOW = 0.4  # m, width
 WINDOW = WALL_CLASSES.index("window")
-SAME_WINDOW = 0.5  # share of the narrower of two that lies in the other one, from which they are one
-SAME_WALL, WINDOW_LEVEL = 0.6, 0.75  # m across and in height, to be in one wall
 TURNED_AWAY = 0.26  # sine of the angle between two walls that are not one
-SIDES = (0.3, 1.0)  # m from a window: where its rooms have their floors, which reach a little into walls
-BESIDE_WINDOWS, ABOVE_WINDOWS = slice(5, 12), slice(11, 13)  # bands in which walls show beside windows, and above most
-BESIDE = 5  # places beside a window that show how full its wall is
-LEAST_FILL = 0.15  # of the elements of a wall: in emptier ones no sill shows
 
 
 def with_windows(map: TopometricMap, walls: Elevations, classes: Array) -> TopometricMap:
@@ -48,7 +53,7 @@ def windows_on_walls(walls: Elevations, chance: Array) -> Array:
     rows, outs = [], []
     for face, (low, high) in zip(walls.faces, strip_bounds(walls), strict=True):
         each, strip = chance[low // PLACES : high // PLACES], walls.strips[low:high]
-        for start, stop in _runs(each):
+        for start, stop in likely_stretches(each, LIKELY_WINDOW, LEAST_WINDOW):
             rows.append(_window(face, each, strip, start, stop))
             outs.append(face["out"])
     table, out = np.array(rows, WINDOW_DTYPE), np.array(outs, float).reshape(-1, 2)
@@ -66,76 +71,37 @@ def in_map(map: TopometricMap, rows: Array) -> Array:
     if not len(rows) or not len(map.rooms):
         return np.zeros(0, WINDOW_DTYPE)
     rows = rows.copy()
-    sides = _rooms_beside(map, rows)
+    sides = rooms_beside(map, rows)
     unseen = (sides < 0).all(axis=1)
     sides[unseen] = rows["rooms"][unseen]
     sides[sides[:, 0] == sides[:, 1], 1] = -1
     both = np.asarray((sides >= 0).all(axis=1))
     rows["rooms"] = np.where(both[:, None], np.sort(sides, axis=1), -np.sort(-sides, axis=1))
-    rows = rows[(rows["rooms"][:, 0] >= 0) & ~_at_doors(map, rows)]
+    rows = rows[(rows["rooms"][:, 0] >= 0) & ~at_any(rows, doors_of(map))]
     return rows[np.lexsort((*rows["centre"].T[::-1], *rows["rooms"].T[::-1]))]
 
 
 def same_windows(rows: Array) -> Iterator[Array]:
     """Rows of WINDOW_DTYPE that are one window, as indices, the likeliest first; the likeliest windows first."""
-    open_rows = np.ones(len(rows), bool)
-    for i in np.argsort(-rows["confidence"], kind="stable").tolist():
-        if open_rows[i]:
-            near = np.flatnonzero(open_rows & _overlapping(rows[i], rows))
-            open_rows[near] = False
-            yield near[np.argsort(-rows["confidence"][near], kind="stable")]
-
-
-def _runs(chance: Array) -> Iterator[tuple[int, int]]:
-    """First place and that after the last one of every stretch that is probably a window."""
-    likely = np.flatnonzero(np.diff(np.concatenate([[0], chance > WINDOW_CHANCE, [0]]).astype(np.int8)))
-    for start, stop in likely.reshape(-1, 2).tolist():
-        if (stop - start) * PLACES * ALONG >= LEAST_WINDOW - 1e-9 and chance[start:stop].mean() >= LIKELY_WINDOW:
-            yield start, stop
+    return one_each(rows, _overlapping)
 
 
 def _window(face: Array, chance: Array, strip: Array, start: int, stop: int) -> tuple[object, ...]:
     """Row of WINDOW_DTYPE of one stretch of a face."""
-    step = PLACES * ALONG
-    depth = _wall_depth(strip, start, stop)
+    depth = wall_depth(strip, start, stop)
     off = (depth + 0.5) * ACROSS - BEFORE + HALF_WALL
-    middle = face["start"] + (start + stop) / 2 * step * face["along"] + off * face["out"]
+    middle = face["start"] + (start + stop) / 2 * PLACE * face["along"] + off * face["out"]
     direction = float(np.arctan2(face["out"][1], face["out"][0]) % np.pi)
     centre = (*middle.tolist(), float(face["floor"]))
     likely = float(chance[start:stop].mean())
-    return (int(face["room"]), -1), centre, (stop - start) * step, *_heights(strip, start, stop, depth), direction, likely
-
-
-def _wall_depth(strip: Array, start: int, stop: int) -> int:
-    """Element across the strip in which the wall of a window lies, by what is beside and above it: a cupboard before a window has
-    a face, too, and its strip shows the window behind it."""
-    left, right = (strip[slice(*ends)] for ends in _beside(start, stop))
-    beside = np.concatenate([left, right])[:, :, BESIDE_WINDOWS].sum(axis=(0, 2))
-    return int((beside + strip[start * PLACES : stop * PLACES, :, ABOVE_WINDOWS].sum(axis=(0, 2))).argmax())
-
-
-def _beside(start: int, stop: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """First element and that after the last one of both sides of a stretch."""
-    return (max(start - BESIDE, 0) * PLACES, start * PLACES), (stop * PLACES, (stop + BESIDE) * PLACES)
+    return (int(face["room"]), -1), centre, (stop - start) * PLACE, *_heights(strip, start, stop, depth), direction, likely
 
 
 def _heights(strip: Array, start: int, stop: int, depth: int) -> tuple[float, float]:
     """m above the floor of sill and head of a stretch, nan where they do not show: the bands of the face that are mostly empty,
     and as much of those below and above them as is."""
-    inner = slice((start + 1) * PLACES, (stop - 1) * PLACES)
-    reach = slice(max(start - BESIDE, 0) * PLACES, (stop + BESIDE) * PLACES)
-    face = strip[:, max(depth - 1, 0) : depth + 1, :BANDS].max(axis=1)
-    full = float(np.quantile(face[reach].mean(axis=0), 0.75))
-    if full < LEAST_FILL:
-        return np.nan, np.nan
-    empty = 1 - np.minimum(face[inner].mean(axis=0) / full, 1.0)
-    runs = np.flatnonzero(np.diff(np.concatenate([[0], empty > 0.5, [0]]))).reshape(-1, 2)
-    if not len(runs):
-        return np.nan, np.nan
-    low, high = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist()
-    sill = low + (1 - empty[low]) - empty[low - 1] if low > 0 else np.nan
-    head = high - (1 - empty[high - 1]) + empty[high] if high < BANDS else np.nan
-    return float(LOWEST + UPWARDS * sill), float(LOWEST + UPWARDS * head)
+    cover = face_cover(strip, start, stop, depth)
+    return (np.nan, np.nan) if cover is None else ends_upwards(1 - cover)
 
 
 def _one(rows: Array, out: Array) -> Array:
@@ -156,47 +122,7 @@ def _one(rows: Array, out: Array) -> Array:
     return window
 
 
-def _along(rows: Array) -> Array:
-    """(W, 2) unit, the ways along the walls that windows are in."""
-    return np.stack([-np.sin(rows["direction"]), np.cos(rows["direction"])], axis=-1)
-
-
 def _overlapping(window: Array, rows: Array) -> Array:
     """(W,) bool: in one wall with a window, and sharing most of the narrower of the two."""
     parallel = np.abs(np.sin(rows["direction"] - window["direction"])) < TURNED_AWAY
-    return parallel & _in_place(window, rows["centre"], rows["width"])
-
-
-def _in_place(window: Array, centres: Array, widths: Array) -> Array:
-    """(n,) bool: does something so wide share most of its width, or of the window's, with a window?"""
-    apart, along = centres - window["centre"], _along(window)
-    place, across = apart[:, :2] @ along, np.abs(apart[:, 0] * along[1] - apart[:, 1] * along[0])
-    shared = (widths + window["width"]) / 2 - np.abs(place)
-    level = np.abs(apart[:, 2]) < WINDOW_LEVEL
-    fits: Array = level & (across < SAME_WALL) & (shared > SAME_WINDOW * np.minimum(widths, window["width"]))
-    return fits
-
-
-def _at_doors(map: TopometricMap, rows: Array) -> Array:
-    """(W,) bool: is a door or an opening there?"""
-    doors = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
-    return np.array([bool(_in_place(row, doors["centre"], doors["width"]).any()) for row in rows], bool)
-
-
-def _rooms_beside(map: TopometricMap, rows: Array) -> Array:
-    """(W, 2) the rooms whose floors are the nearest on either side, -1 none."""
-    inside = map.navigable_room >= 0
-    flat = np.array([1, 1, STOOD / WINDOW_LEVEL])
-    floor, room = map.navigable.centroids(map.navigable.cells[inside]) * flat, map.navigable_room[inside]
-    steps = np.arange(SIDES[0], SIDES[1] + 0.05, 0.1)[:, None] * np.array([-1.0, 1.0])
-    shift = rows["width"][:, None] / 4 * np.array([0.0, -1.0, 1.0])
-    out = np.stack([np.cos(rows["direction"]), np.sin(rows["direction"])], axis=-1)
-    places = np.zeros((len(rows), len(steps), 3, 2, 3))
-    places[..., :2] = shift[:, None, :, None, None] * _along(rows)[:, None, None, None]
-    places[..., :2] += steps[None, :, None, :, None] * out[:, None, None, None]
-    places += rows["centre"][:, None, None, None]
-    far, row = cKDTree(floor).query(places * flat, distance_upper_bound=STOOD)
-    label = np.where(np.isfinite(far), np.append(room, -1)[row], -1).reshape(len(rows), -1, 2)
-    first = (label >= 0).argmax(axis=1)
-    sides: Array = np.take_along_axis(label, first[:, None], axis=1)[:, 0].astype(np.int64)
-    return sides
+    return parallel & in_place(window, rows["centre"], rows["width"])
