@@ -29,9 +29,9 @@ class SearchSettings:
     conflict_weight: float = 0.75
     least_walls: int = 20
     height_gap: float = 0.4
-    per_yaw: int = 12
+    per_yaw: int = 24
     peak_distance: float = 0.6
-    hypotheses: int = 100
+    hypotheses: int = 200
 
 
 SEARCH = SearchSettings()
