@@ -1,9 +1,10 @@
 """Seconds until there is a pose, with and without rooms: 20, 200 and 1,000 rooms.
 
 ``python -m benchmarks.merging.pose_seconds [ROOMS ...] [--write docs/results/learning.md]``: the two maps of a floor of
-`benchmarks.speed.merge_growth`, extracted. The pose is looked for by walls alone, by matched rooms alone, and by both, as
-`merge` does; of up to 200 rooms also as if the scale were not known. Seconds are of the processor, until the hypotheses are
-ranked: what comes after (bending, the verdict) is the same. Each size runs in a process of its own.
+`benchmarks.speed.merge_growth`, extracted. The pose is looked for by walls alone, which is what `merge` does where they are
+believed, by matched rooms alone, and by both; of up to 200 rooms also as if the scale were not known. Seconds are of the
+processor, until the hypotheses are ranked: what comes after (bending, the verdict) is the same. Each size runs in a process of
+its own.
 """
 
 from __future__ import annotations

@@ -223,6 +223,16 @@ def test_a_school_with_a_lecture_hall_keeps_its_other_rooms_in_a_slice() -> None
     assert sorted(map.rooms["area"]) == pytest.approx([27, 27, 27, 27.5, 48, 238], rel=0.04)
 
 
+@pytest.mark.parametrize("doors", [(4.2, 15.8), (3.0, 17.0), (4.0, 10.0, 16.0)])
+def test_a_wall_with_doors_close_behind_the_last_row_parts_the_hall_from_the_corridor(doors) -> None:
+    scene = Scene().shell(0, 0, 20, 20).wall((0, 11), (20, 11), doors=doors)
+    scene.wall((0, 14.5), (20, 14.5), doors=(2.0, 7.0, 12.0, 17.0))
+    for x in (5, 10, 15):
+        scene.wall((x, 14.5), (x, 20))
+    map = extract(slice_of(seats(scene, ((4.0, 16.0),)), 0.3))
+    assert sorted(map.rooms["area"]) == pytest.approx([27, 27, 27, 27.5, 68, 218], rel=0.04)
+
+
 def test_a_store_with_shelves_is_one_room_in_a_slice() -> None:
     scene = Scene().shell(0, 0, 14, 10)
     for k in range(6):

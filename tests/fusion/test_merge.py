@@ -92,6 +92,8 @@ def test_two_halves_are_merged(merged, halves):
 def test_rooms_are_matched_only_where_walls_are_not_believed(merged, refused, halves):
     assert merged.seconds["embed"] == merged.seconds["match"] == 0
     assert refused.seconds["embed"] > 0 and refused.seconds["match"] > 0
+    stricter = tm.merge(halves, threshold=1.0)
+    assert not stricter.merged and stricter.seconds["embed"] > 0
     by_rooms = tm.merge(halves, poses="rooms")
     assert by_rooms.merged and by_rooms.seconds["embed"] > 0
     with pytest.raises(InputError, match="nobody"):  # before anything is done

@@ -33,8 +33,8 @@ def test_a_stated_storey_never_lowers_a_right_pose_of_real_maps(data_dir: Path, 
 def test_a_drawing_whose_scale_is_not_that_of_the_map_is_not_believed(data_dir: Path) -> None:
     """It is larger by a fifth. Walls of two captures met it well in a wrong place, and the next best place was not looked at: the
     hundred best of the correlation did not hold it."""
-    for name, make in office_floor.pairs(data_dir / "halmstad_office_f5"):
-        if name in ("F5_01-F5_layout", "F5_04-F5_layout"):
-            pair = make()
-            registration = register(*(extract(cloud) for cloud in (pair.a, pair.b)))
-            assert not registration.accepted and len(registration.alternatives) > 1
+    pairs = dict(office_floor.pairs(data_dir / "halmstad_office_f5"))
+    for name in ("F5_01-F5_layout", "F5_04-F5_layout"):
+        pair = pairs[name]()
+        registration = register(*(extract(cloud) for cloud in (pair.a, pair.b)))
+        assert not registration.accepted and len(registration.alternatives) > 1

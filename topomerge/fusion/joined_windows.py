@@ -15,6 +15,7 @@ from topomerge.extraction.elevations.fixtures import fixtures_in_map
 from topomerge.extraction.elevations.windows import in_map, same_windows
 from topomerge.fusion.resampling import Laying
 from topomerge.types import FIXTURE_DTYPE, WINDOW_DTYPE, Array, TopometricMap
+from topomerge.types.arrays import within_turn
 
 
 def laid_windows(part: TopometricMap, laying: Laying) -> Array:
@@ -36,7 +37,7 @@ def _laid(rows: Array, laying: Laying, lengths: Sequence[str], full_turn: float)
     rows = rows.copy()
     if len(rows):
         rows["centre"] = laying.apply(rows["centre"])
-        rows["direction"] = (rows["direction"] + laying.pose.yaw) % full_turn
+        rows["direction"] = within_turn(rows["direction"] + laying.pose.yaw, full_turn)
         for name in lengths:
             rows[name] *= laying.pose.scale
     return rows

@@ -1,4 +1,5 @@
-"""Maps -> one map, or an honest refusal: rooms matched, poses judged on the whole maps, cells fused (seeds 3.3; method 4)."""
+"""Maps -> one map, or an honest refusal: poses of walls and of matched rooms judged on the whole maps, cells fused (seeds 3.3;
+method 4)."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ from topomerge.fusion.fuse import fuse, rooms_in_common
 from topomerge.fusion.inputs import check_list, check_pair, check_poses, check_scale, checked_threshold, loaded, pair_warnings
 from topomerge.fusion.posterior import check_same
 from topomerge.fusion.prepared import registration_order
-from topomerge.fusion.registration import Registration, register
+from topomerge.fusion.registration import Registration, Resort, register
 from topomerge.fusion.result import MERGE_STEPS, MergeResult, RoomMatch
 from topomerge.fusion.thesis.fpfh import check_open3d
 from topomerge.fusion.thesis.room_poses import room_poses
@@ -99,7 +100,7 @@ def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> Merge
     threshold = checked_threshold(settings.threshold)
     clock = _Clock()
     describe = _Timed(settings.embedder, clock, settings.poses == "rooms")
-    hypotheses = partial(_room_hypotheses, a, b, settings, describe)
+    hypotheses = Resort(partial(_room_hypotheses, a, b, settings, describe), threshold)
     searched = settings.poses == "search"
     choices: dict[str, Any] = {"rigid": settings.rigid, "same": settings.same}
     registration = register(a, b, scale=settings.scale, proposed=hypotheses, searched=searched, **choices)

@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -28,8 +27,15 @@ from topomerge.types import Sim3, VoxelGrid
 
 log = logging.getLogger(__name__)
 ALTERNATIVES = 10
-Proposed = Sequence[Sim3] | Callable[[], Sequence[Sim3]]  # poses T_ab, or what makes them
 DRIFTED = (0.5, np.radians(3.0))  # m, rad: a refinement that moves the middle by more has lost its way
+
+
+@dataclass(frozen=True)
+class Resort:
+    """Poses T_ab that are made only where the best pose of the correlation is less probable than `below`."""
+
+    make: Callable[[], Sequence[Sim3]]
+    below: float
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ def register(
     b: Map | Prepared,
     *,
     scale: str = "fixed",
-    proposed: Proposed = (),
+    proposed: Sequence[Sim3] | Resort = (),
     free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
     searched: bool = True,
     rigid: bool = False,
@@ -79,8 +85,8 @@ def register(
     Args:
         a, b: topometric maps or occupied cells, or what `prepare` made of them.
         scale: "fixed", or "free" where b's unit may differ (looked for between 0.5 and 2).
-        proposed: poses T_ab of matched rooms, tried beside those of the correlation; or what makes them, which is asked only
-            where the best pose of the correlation is not believed.
+        proposed: poses T_ab of matched rooms: their yaws are searched, too, and they are tried beside what the correlation
+            finds; or a resort, whose poses are tried, if at all, after that.
         free: cells of a and of b known to be empty; topometric maps bring their own.
         searched: look for poses by correlation? Else the proposed ones are all there is.
         rigid: give the best rigid pose? Else both maps are bent, too. They are judged as bent all the same: drift is no
@@ -97,19 +103,24 @@ def register(
     a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
-        poses = partial(_inverses, proposed) if callable(proposed) else _inverses(proposed)
+        poses = (
+            replace(proposed, make=lambda: _inverses(proposed.make())) if isinstance(proposed, Resort) else _inverses(proposed)
+        )
         swapped = register(b, a, scale=scale, proposed=poses, searched=searched, rigid=rigid, same=same)
         return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
     pair = _Pair(a, b, scale == "free", clock)
-    if searched and callable(proposed):
+    if not isinstance(proposed, Resort):
+        (pair.search if searched else pair.add)(proposed)
+        registration = pair.registered(rigid, same)
+    elif not searched:
+        pair.add(proposed.make())
+        registration = pair.registered(rigid, same)
+    else:
         pair.search(())
         registration = pair.registered(rigid, same)
-        if not registration.accepted:
-            pair.add(_made(proposed))
+        if registration.probability < proposed.below:
+            pair.add(proposed.make())
             registration = pair.registered(rigid, same)
-    else:
-        (pair.search if searched else pair.add)(_made(proposed))
-        registration = pair.registered(rigid, same)
     if registration.transform is None:
         reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
         registration = replace(registration, reason=reason)
@@ -154,12 +165,8 @@ class _Pair:
         return replace(believed, transform=bent.transform, features=features, bend=None if rigid else bent)
 
 
-def _made(poses: Proposed) -> Sequence[Sim3]:
-    return poses() if callable(poses) else poses
-
-
-def _inverses(poses: Proposed) -> list[Sim3]:
-    return [pose.inverse() for pose in _made(poses)]
+def _inverses(poses: Sequence[Sim3]) -> list[Sim3]:
+    return [pose.inverse() for pose in poses]
 
 
 def _refined(a: Prepared, b: Prepared, best: Candidate, scaled: bool, rigid: bool) -> tuple[Bend, float]:

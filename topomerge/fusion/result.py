@@ -54,7 +54,7 @@ class MergeResult:
         registration: the evidence, of two maps.
         atlas: the evidence, of more than two.
         warnings: what the user should know.
-        descriptor: of the rooms, by which they were matched.
+        descriptor: of the rooms, by which they were matched where walls were not believed.
         bends: k -> how map k is bent in its own frame, before its transform is applied; rigid ones are left out.
         points: k -> name of the file beside merge.json that holds the points of map k, of those that `merge --points` wrote.
     """

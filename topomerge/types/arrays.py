@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
@@ -17,3 +18,9 @@ def require(condition: bool, message: str) -> None:
     """
     if not condition:
         raise ValueError(message)
+
+
+def within_turn(angle: Any, turn: float) -> Any:
+    """The same angle, rad, in [0, turn): the remainder of next to nothing below 0 is `turn` itself by rounding, which is 0."""
+    rest = np.asarray(angle, float) % turn
+    return np.where(rest < turn, rest, 0.0)

@@ -29,6 +29,7 @@ from topomerge.extraction.elevations.stretches import (
 )
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.types import FIXTURE_DTYPE, FIXTURE_KINDS, Array, TopometricMap
+from topomerge.types.arrays import within_turn
 
 LIKELY_FIXTURE = 0.8  # probability of a niche or a cupboard, on average of its places
 LEAST_FIXTURE = {"niche": 0.3, "cupboard": 0.5}  # m, width: narrower ones are parts of wider ones
@@ -89,7 +90,7 @@ def _fixture(kind: str, face: Array, strip: Array, ends: tuple[int, int], likely
     sizes = (_recess if kind == "niche" else _front)(strip, start, stop, wall)
     off = 0.0 if wall is None else (wall + 0.5) * ACROSS - BEFORE
     middle = face["start"] + (start + stop) / 2 * PLACE * face["along"] + off * face["out"]
-    direction = float(np.arctan2(face["out"][1], face["out"][0]) % (2 * np.pi))
+    direction = float(within_turn(np.arctan2(face["out"][1], face["out"][0]), 2 * np.pi))
     centre = (*middle.tolist(), float(face["floor"]))
     return kind, int(face["room"]), centre, (stop - start) * PLACE, *sizes, direction, likely
 

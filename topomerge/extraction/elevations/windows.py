@@ -27,6 +27,7 @@ from topomerge.extraction.elevations.stretches import (
 )
 from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.types import WINDOW_DTYPE, Array, TopometricMap
+from topomerge.types.arrays import within_turn
 
 LIKELY_WINDOW = 0.85  # probability of a window, on average of its places
 LEAST_WINDOW = 0.4  # m, width
@@ -91,7 +92,7 @@ def _window(face: Array, chance: Array, strip: Array, start: int, stop: int) -> 
     depth = wall_depth(strip, start, stop)
     off = (depth + 0.5) * ACROSS - BEFORE + HALF_WALL
     middle = face["start"] + (start + stop) / 2 * PLACE * face["along"] + off * face["out"]
-    direction = float(np.arctan2(face["out"][1], face["out"][0]) % np.pi)
+    direction = float(within_turn(np.arctan2(face["out"][1], face["out"][0]), np.pi))
     centre = (*middle.tolist(), float(face["floor"]))
     likely = float(chance[start:stop].mean())
     return (int(face["room"]), -1), centre, (stop - start) * PLACE, *_heights(strip, start, stop, depth), direction, likely

@@ -25,6 +25,7 @@ from topomerge.types import ROOM_ODDS, Array, TopometricMap
 
 LEAF_THICKNESS, IFC_SLAB, CEILING_THICKNESS = 0.1, 0.1, 0.05  # m, thickness
 IFC_LINTEL = 2.0  # m, of doors without anything seen above
+LEAST_VOID = 0.05  # m, height of an opening at least
 CUT_THROUGH = 0.05  # m by which the body of an opening stands out of its wall, so that nothing of that stays
 
 
@@ -204,7 +205,9 @@ class _Building(Model):
         """A hole in a wall; `span`: where it begins, m in the input's frame, and its height, at most up to the wall's top."""
         low, height = span
         storey_height = float(self.map.storeys["floor"][wall["storey"]])
-        height = min(height, float(wall["high"]) + CUT_THROUGH - low)
+        top = min(low + height, float(wall["high"]) + CUT_THROUGH)
+        low = min(low, top - LEAST_VOID)  # of what begins above the top of its wall, as far as that was seen
+        height = top - low
         shape = shapely.MultiPolygon([outline])
         body = {"Representation": self.prisms(shape, low - storey_height, height), "PredefinedType": "OPENING"}
         at = self.place(voided.ObjectPlacement, 0, 0, 0)
