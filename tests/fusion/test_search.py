@@ -52,7 +52,7 @@ def test_hypotheses_of_rooms_never_push_out_those_of_the_correlation():
     rooms = [PoseHypothesis(Sim3(), 0.0, from_rooms=True) for _ in range(3)]
     others = [PoseHypothesis(Sim3(), float(k)) for k in range(SEARCH.hypotheses + 20)]
     chosen = strongest([*others, *rooms])
-    assert chosen[:3] == rooms and [h.score for h in chosen[3:]] == [float(k) for k in range(119, 19, -1)]
+    assert chosen[:3] == rooms and [h.score for h in chosen[3:]] == [float(k) for k in range(SEARCH.hypotheses + 19, 19, -1)]
 
 
 def walls_of(corridors: tuple[float, ...], rows: tuple[float, ...], scale: float = 1.0, turn: float = 0.0) -> Any:
