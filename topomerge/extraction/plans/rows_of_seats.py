@@ -119,8 +119,8 @@ def _links(pieces: Sequence[_Piece], linked: Callable[[_Beside, int], Array]) ->
         others = np.flatnonzero(others)
         pairs.append(np.column_stack([np.full(len(others), i), others]))
         nearest[i] = off[others].min(initial=np.inf)
-    i, j = np.concatenate(pairs).T if pairs else np.zeros((2, 0), np.int64)
-    graph = coo_matrix((np.ones(len(i)), (i, j)), (len(pieces),) * 2)
+    table = np.concatenate(pairs) if pairs else np.zeros((0, 2), np.int64)
+    graph = coo_matrix((np.ones(len(table)), tuple(table.T)), (len(pieces),) * 2)
     return connected_components(graph, directed=False)[1], nearest
 
 
@@ -166,7 +166,7 @@ def _runs_beyond(piece: _Piece, wall: Array, edge: float) -> list[float]:
 def _lines(pieces: Sequence[_Piece], gap: float) -> list[list[_Piece]]:
     """Pieces that lie in one line, at most `gap` m from each other."""
     group, _ = _links(pieces, lambda b, i: b.parallel & (b.across < IN_LINE[0]) & (b.along - b.length < gap))
-    return [[pieces[i] for i in np.flatnonzero(group == k)] for k in np.unique(group)]
+    return [[pieces[i] for i in np.flatnonzero(group == k).tolist()] for k in np.unique(group)]
 
 
 def _rows(pieces: Sequence[_Piece], edge: float) -> list[_Piece]:
