@@ -94,6 +94,7 @@ def test_rooms_are_matched_only_where_walls_are_not_believed(merged, refused, ha
     assert refused.seconds["embed"] > 0 and refused.seconds["match"] > 0
     stricter = tm.merge(halves, threshold=1.0)
     assert not stricter.merged and stricter.seconds["embed"] > 0
+    assert tm.merge(halves, threshold=0.0, poses="rooms").seconds["embed"] > 0  # there are no others
     by_rooms = tm.merge(halves, poses="rooms")
     assert by_rooms.merged and by_rooms.seconds["embed"] > 0
     with pytest.raises(InputError, match="nobody"):  # before anything is done

@@ -100,8 +100,8 @@ def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> Merge
     threshold = checked_threshold(settings.threshold)
     clock = _Clock()
     describe = _Timed(settings.embedder, clock, settings.poses == "rooms")
-    hypotheses = Resort(partial(_room_hypotheses, a, b, settings, describe), threshold)
     searched = settings.poses == "search"
+    hypotheses = Resort(partial(_room_hypotheses, a, b, settings, describe), threshold if searched else np.inf)
     choices: dict[str, Any] = {"rigid": settings.rigid, "same": settings.same}
     registration = register(a, b, scale=settings.scale, proposed=hypotheses, searched=searched, **choices)
     believed = registration.transform is not None and registration.probability >= threshold

@@ -32,10 +32,14 @@ DRIFTED = (0.5, np.radians(3.0))  # m, rad: a refinement that moves the middle b
 
 @dataclass(frozen=True)
 class Resort:
-    """Poses T_ab that are made only where the best pose of the correlation is less probable than `below`."""
+    """Poses T_ab that are made only where the best pose there is without them is less probable than `below`."""
 
     make: Callable[[], Sequence[Sim3]]
     below: float
+
+    def inverse(self) -> Resort:
+        """That of the maps the other way round."""
+        return replace(self, make=lambda: _inverses(self.make()))
 
 
 @dataclass(frozen=True)
@@ -103,28 +107,23 @@ def register(
     a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
     clock("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
-        poses = (
-            replace(proposed, make=lambda: _inverses(proposed.make())) if isinstance(proposed, Resort) else _inverses(proposed)
-        )
+        poses = proposed.inverse() if isinstance(proposed, Resort) else _inverses(proposed)
         swapped = register(b, a, scale=scale, proposed=poses, searched=searched, rigid=rigid, same=same)
         return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
     pair = _Pair(a, b, scale == "free", clock)
-    if not isinstance(proposed, Resort):
-        (pair.search if searched else pair.add)(proposed)
-        registration = pair.registered(rigid, same)
-    elif not searched:
-        pair.add(proposed.make())
-        registration = pair.registered(rigid, same)
+    resort, first = (proposed, ()) if isinstance(proposed, Resort) else (None, proposed)
+    if searched:
+        pair.search(first)
     else:
-        pair.search(())
-        registration = pair.registered(rigid, same)
-        if registration.probability < proposed.below:
-            pair.add(proposed.make())
-            registration = pair.registered(rigid, same)
-    if registration.transform is None:
+        pair.add(first)
+    chance = pair.look(same)
+    if resort is not None and chance < resort.below:
+        pair.add(resort.make())
+        pair.look(same)
+    if pair.verdict is None:
         reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
-        registration = replace(registration, reason=reason)
-    return replace(registration, seconds=clock.seconds)
+        return Registration(None, 0.0, False, reason=reason, seconds=clock.seconds)
+    return replace(pair.registration(pair.verdict, rigid), seconds=clock.seconds)
 
 
 class _Pair:
@@ -134,7 +133,9 @@ class _Pair:
         self.a, self.b, self.scaled, self.clock = a, b, scaled, clock
         self.judge = Judge(a.storeys, b.storeys)
         self.ranked: list[PoseHypothesis] = []
+        self.looked: list[Candidate] = []
         self.bent: dict[int, Candidate] = {}
+        self.verdict: Verdict | None = None
 
     def search(self, poses: Sequence[Sim3]) -> None:
         """Add hypotheses of the correlation, and of given poses T_ab."""
@@ -151,16 +152,20 @@ class _Pair:
         self.ranked = rank(hypotheses, self.judge, self.ranked)
         self.clock("verify")
 
-    def registered(self, rigid: bool, same: str) -> Registration:
-        """The registration by the hypotheses there are."""
+    def look(self, same: str) -> float:
+        """Look closely at the best hypotheses there are; the probability of the best one."""
         if not self.ranked:
-            return Registration(None, 0.0, False)
-        looked = candidates(self.a, self.b, self.ranked, self.scaled, self.bent)
+            return 0.0
+        self.looked = candidates(self.a, self.b, self.ranked, self.scaled, self.bent)
+        self.verdict = verdict([c.features for c in self.looked], self.looked[0].closely(), same)
         self.clock("bend")
-        bent, rmse = _refined(self.a, self.b, looked[0], self.scaled, rigid)
+        return self.verdict.each[0]
+
+    def registration(self, said: Verdict, rigid: bool) -> Registration:
+        """The best hypothesis, finely registered, with what was said of it."""
+        bent, rmse = _refined(self.a, self.b, self.looked[0], self.scaled, rigid)
         self.clock("refine")
-        said = verdict([c.features for c in looked], looked[0].closely(), same)
-        believed = _verdict(self.ranked, looked, said)
+        believed = _verdict(self.ranked, self.looked, said)
         features = {**believed.features, "rmse": rmse}
         return replace(believed, transform=bent.transform, features=features, bend=None if rigid else bent)
 
