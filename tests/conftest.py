@@ -40,7 +40,7 @@ def data_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def case_dir(data_dir: Path) -> Path:
-    """The folder `cases` beside that of real data: small inputs of strangers that failed once. None of it is in the repository."""
+    """The folder `cases` beside that of real data: small files of strangers that failed once, not in the repository."""
     folder = data_dir.parent / "cases"
     if not folder.is_dir():
         pytest.skip("TOPOMERGE_DATA has no folder `cases` beside it")

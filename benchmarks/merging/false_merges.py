@@ -18,10 +18,17 @@ PRIOR = {
     "other storey": 0.2,
     "twin wing": 0.1,
     "repeated modules": 0.1,
-    "own mirror image": 0.05,
-    "other look-alikes": 0.05,
+    "own mirror image": 0.03,
+    "own other half": 0.03,
+    "other look-alikes": 0.04,
 }
-MADE_ALIKE = {"modules": "repeated modules", "shifted-row": "repeated modules", "mirror": "own mirror image"}
+MADE_ALIKE = {
+    "modules": "repeated modules",
+    "shifted-row": "repeated modules",
+    "mirror": "own mirror image",
+    "storeys": "other storey",
+    "point-symmetric": "own other half",
+}
 PRIOR_ROUNDS = 20_000
 NEGATIVE_HEADS = (
     "kind", "pairs", "believed", "physical buildings", "with a false merge (exact 95 %)", "indistinguishable pairs",

@@ -1,9 +1,11 @@
 """Where look-alikes are taken: two places made to be alike, the rooms that are visited in each, and the poses at which one lies
 on the other.
 
-Kinds (`LOOKALIKES`): ``shifted-row``, parts of a row of equal rooms, some rooms apart; ``modules``, parts of two of the equal
-modules of a building, two rooms or more each; ``hotel-corridors``, two corridors of one hotel or ward; ``same-room``, two rooms
-of one size; ``mirror``, a part of a building and its own mirror image.
+Kinds (`LOOKALIKES`): ``shifted-row``, parts of a row of equal rooms, some rooms apart; ``modules``, parts of two of the
+equal modules of a building, two rooms or more each; ``hotel-corridors``, two corridors of one hotel or ward; ``same-room``,
+two rooms of one size; ``mirror``, a part of a building and its own mirror image; ``storeys``, parts of two storeys of one
+plan, of which half have columns and ends of walls at other places; ``point-symmetric``, the two halves of a building that
+lies on itself when it is turned by half.
 
 Furniture (`FURNISHED`): ``same``, thing by thing; ``clutter``, the same but for what lies on the floor; ``other``, furnished
 anew; ``empty``, none.
@@ -20,10 +22,13 @@ from scipy.signal import fftconvolve
 from topomerge.datasets.buildings.drafting import Draft
 from topomerge.datasets.buildings.erect import erect
 from topomerge.datasets.buildings.modules import EQUAL, ROOM_KINDS, ModuleRow, draw_module, make_row, rooms_of
-from topomerge.datasets.buildings.procedural import make_building
-from topomerge.datasets.buildings.refurnish import copied, refurnished, restrewn
-from topomerge.datasets.core.building import Building
+from topomerge.datasets.buildings.procedural import connected, make_building, make_plans
+from topomerge.datasets.buildings.profiles import PROFILES
+from topomerge.datasets.buildings.refurnish import Added, copied, refurnished, replaced, restrewn
+from topomerge.datasets.core.building import SURFACES, Building
 from topomerge.datasets.core.difficulty import Difficulty
+from topomerge.datasets.core.plan import Plan, Point
+from topomerge.datasets.core.solids import boxes
 from topomerge.datasets.pairs.parts import CONNECTING
 from topomerge.datasets.simulation.floors import fill
 from topomerge.datasets.simulation.twin_wing import bent
@@ -31,7 +36,7 @@ from topomerge.datasets.simulation.walk import part
 
 from topomerge.types import Array, Sim3
 
-LOOKALIKES = ("shifted-row", "hotel-corridors", "same-room", "mirror", "modules")
+LOOKALIKES = ("shifted-row", "hotel-corridors", "same-room", "mirror", "modules", "storeys", "point-symmetric")
 FURNISHED = ("same", "clutter", "other", "empty")
 MOST_ROOMS_SEEN = 12  # rooms of a map of a row
 INNER_SHARE = 0.6  # of the rows: neither map visits an end
@@ -40,6 +45,13 @@ CORRIDOR_KINDS = ("hotel", "hotel", "hospital")  # of buildings with corridors t
 ROOMS_MIRRORED = (1, 1, 1, 2, 3, 4)  # of a map
 LEAST_AREA = 8.0  # m2 of a room to start from
 MIRRORED_KINDS = ("office", "hotel", "hospital", "school", "lab", "apartment", "house")  # of buildings
+FEW_THINGS, ORDINARY_THINGS = 0.25, 1.2  # density of the furniture of storeys and halves: from few pieces a room to a usual one
+ROOMS_OF_STOREY = (4, 14)  # fewest and most rooms that a map of a storey visits
+SAME_PART, ALTERED = 0.3, 0.5  # shares of the storeys whose maps visit the same rooms; that have pilasters at other places
+PILASTERS = (0.02, 0.06)  # a metre of wall, fewest and most
+PILASTER_WIDTH, PILASTER_DEPTH = (0.25, 0.8), (0.2, 0.5)  # m
+HALVES_TRIED = 20
+HALF_SHAPES = ("single", "double")  # of corridors that reach the end of their building
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +124,7 @@ def _furnished_row(row: ModuleRow, furniture: str, difficulty: Difficulty, rng: 
 def _corridors(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
     """A corridor with rooms beside it, and another one like it elsewhere: the same plan a second time."""
     a = make_building(str(rng.choice(CORRIDOR_KINDS)), seed, 1, difficulty, str(rng.choice(["single", "double"])))
-    areas = [shapely.Polygon(r.polygon).area if r.kind == "corridor" else 0.0 for r in a.rooms]
-    rooms = part(a, int(rng.integers(4, 8)), rng, start=int(np.argmax(areas)))
+    rooms = part(a, int(rng.integers(4, 8)), rng, start=_largest_corridor(a))
     return Places((a, _again(a, furniture, rooms, difficulty, rng)), (rooms, rooms), (Sim3(),))
 
 
@@ -142,8 +153,110 @@ def _mirror(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: n
     return Places((a, b), (rooms, rooms), tuple(laid(a, b, rooms, yaw) for yaw in (0.0, np.pi)))
 
 
+def _draw_storeys(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+    """Parts of two storeys of one plan. They begin in one corridor, where there is one."""
+    difficulty = replace(difficulty, furniture=_draw_density(furniture, rng))
+    a = make_building(str(rng.choice(MIRRORED_KINDS)), seed, 1, difficulty)
+    start = _largest_corridor(a) if rng.random() < 0.7 else _a_room(a, rng)
+    visited = [part(a, int(rng.integers(*ROOMS_OF_STOREY)), rng, start=start)]
+    visited.append(visited[0] if rng.random() < SAME_PART else part(a, int(rng.integers(*ROOMS_OF_STOREY)), rng, start=start))
+    b = _again(a, furniture, np.arange(len(a.rooms)), difficulty, rng)
+    if rng.random() < ALTERED:
+        share = float(rng.uniform(*PILASTERS))
+        a, b = add_pilasters(a, share, rng), add_pilasters(b, share, rng)
+    return Places((a, b), (visited[0], visited[1]), (Sim3(),))
+
+
+def _draw_halves(kind: str, furniture: str, seed: int, difficulty: Difficulty, rng: np.random.Generator) -> Places:
+    """Parts of the two halves of a building that half a turn lays on itself; each has furniture of its own."""
+    difficulty = replace(difficulty, furniture=_draw_density(furniture, rng), curved=0.0)
+    for _ in range(HALVES_TRIED):
+        profile = replace(PROFILES[str(rng.choice(MIRRORED_KINDS))], shapes=HALF_SHAPES)
+        half = make_plans(profile, 1, difficulty, rng)[0]
+        whole, middle = mirror_by_point(half)
+        building = replace(erect([whole], difficulty, rng, f"{kind}-{seed}", "halves"), seed=seed)
+        if connected(building):
+            break
+    count = len(half.rooms)
+    starts = [int(np.argmax([shapely.Polygon(r.polygon).area * (r.kind == "corridor") for r in half.rooms]))] * 2
+    rooms = [int(rng.integers(*ROOMS_OF_STOREY)) for _ in range(2)]
+    first, second = (part(building, n, rng, start=s + k * count) for k, (n, s) in enumerate(zip(rooms, starts, strict=True)))
+    visited = (first[first < count], second[second >= count])
+    x, y = (2 * middle).tolist()
+    return Places((building, building), visited, (Sim3(np.pi, (x, y, 0.0)),), same=True)
+
+
+def mirror_by_point(half: Plan) -> tuple[Plan, Array]:
+    """A plan and its image by half a turn about the end of its corridor, joined there by an opening; and that point (2,), m.
+
+    The building lies on itself when it is turned by half a turn about the point.
+    """
+    corridor = max((r for r in half.rooms if r.kind == "corridor"), key=lambda r: float(r.polygon[:, 0].max()))
+    wall = next((o.thickness for o in half.openings), 0.2)
+    corners = np.concatenate([r.polygon for r in half.rooms])
+    end = corridor.polygon[corridor.polygon[:, 0] > corridor.polygon[:, 0].max() - 0.05]
+    low, high = end[:, 1].min(), end[:, 1].max()
+    middle = np.array([corners[:, 0].max() + wall / 2, (low + high) / 2])
+
+    def turn(point: Point) -> Point:
+        x, y = (2 * middle - np.array(point)).tolist()
+        return x, y
+
+    rooms = tuple(replace(r, name=f"{r.name} turned", polygon=2 * middle - r.polygon) for r in half.rooms)
+    walls = tuple(replace(w, start=turn(w.start), end=turn(w.end)) for w in half.walls)
+    openings = tuple(replace(o, start=turn(o.start), end=turn(o.end)) for o in half.openings)
+    at = float(middle[0])
+    reach = (high - low) / 2 - 0.05
+    join = replace(half.openings[0], kind="opening", start=(at, middle[1] - reach), end=(at, middle[1] + reach), thickness=wall)
+    join = replace(join, bottom=0.0, top=0.0, state="")
+    kept = tuple(o for o in half.openings if not _is_near(o.start, o.end, middle))
+    turned = tuple(o for o in openings if not _is_near(o.start, o.end, middle))
+    every = (*kept, *turned, join)
+    return replace(half, rooms=half.rooms + rooms, walls=half.walls + walls, openings=every, flights=()), middle
+
+
+def _is_near(start: Point, end: Point, middle: Array) -> bool:
+    """Does an opening lie where the two halves are joined?"""
+    return shapely.LineString([start, end]).distance(shapely.Point(middle)) < 0.6
+
+
+def add_pilasters(building: Building, share: float, rng: np.random.Generator) -> Building:
+    """The building with pillars and ends of walls along the walls of its rooms, `share` of them a metre, clear of doors."""
+    added = []
+    clear = shapely.union_all([shapely.Point(*d["centre"][:2]).buffer(d["width"] / 2 + 0.5) for d in building.doors])
+    for number, room in enumerate(building.rooms):
+        shape = shapely.orient_polygons(shapely.Polygon(room.polygon))
+        for _ in range(rng.poisson(share * shape.length)):
+            line, at = shape.exterior, float(rng.uniform(0, shape.length))
+            wide, deep = float(rng.uniform(*PILASTER_WIDTH)), float(rng.uniform(*PILASTER_DEPTH))
+            p, q = (np.array(line.interpolate((at + d) % shape.length).coords[0]) for d in (0.0, wide))
+            if np.hypot(*(q - p)) < 0.99 * wide:  # around a corner
+                continue
+            along = (q - p) / wide
+            middle = (p + q) / 2 + deep / 2 * np.array([-along[1], along[0]])  # outlines run with the room to their left
+            yaw, tall = float(np.arctan2(along[1], along[0])), room.ceiling - room.floor
+            vertices, triangles = boxes(np.array([[0, 0, tall / 2, wide, deep, tall]]), np.array([*middle, room.floor]), yaw)
+            footprint = shapely.MultiPoint(vertices[:, :2]).convex_hull
+            if footprint.intersects(clear) or footprint.intersection(shape).area < 0.9 * footprint.area:
+                continue
+            centre = (*middle.tolist(), room.floor + tall / 2)
+            row = ("column", number, -1, centre, (wide, deep, tall), yaw, tuple(middle.tolist()), False)
+            added.append(Added(row, vertices, triangles, SURFACES.index("column")))
+    return replaced(building, np.zeros(len(building.things), bool), added)
+
+
+def _draw_density(furniture: str, rng: np.random.Generator) -> float:
+    return 0.0 if furniture == "empty" else float(rng.uniform(FEW_THINGS, ORDINARY_THINGS))
+
+
+def _largest_corridor(building: Building) -> int:
+    areas = [shapely.Polygon(r.polygon).area if r.kind == "corridor" else 0.0 for r in building.rooms]
+    return int(np.argmax(areas))
+
+
 PLACES_OF: dict[str, Callable[[str, str, int, Difficulty, np.random.Generator], Places]] = {
     "shifted-row": _row, "modules": _row, "hotel-corridors": _corridors, "same-room": _same_room, "mirror": _mirror,
+    "storeys": _draw_storeys, "point-symmetric": _draw_halves,
 }  # fmt: skip
 
 

@@ -38,6 +38,7 @@ from topomerge.types import Array, Sim3, VoxelGrid
 LOOKALIKE_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
 LEAST_SHARED = 1.0  # m2 of the same place that both maps show, from which on a pair has a truth
 POINT_SPACING = 0.06  # m between points of a scan, at least: the grids' cells are 0.1 m
+SENSORS_OF = {"storeys": {**WEIGHTS["sensors"], "laser2d": 4.0}}  # robots' grids are of storeys whose corridors have one plan
 DAY = Difficulty(moved=0.03, gone=0.02, doors_moved=0.3, people=0.1)  # what a day changes
 MONTHS = Difficulty(moved=0.15, gone=0.1, doors_moved=0.3, people=0.1)  # between two visits of one place
 FURNITURE_SHARES = {
@@ -46,6 +47,8 @@ FURNITURE_SHARES = {
     "same-room": (0.05, 0.05, 0.75, 0.15),
     "mirror": (0.55, 0.05, 0.25, 0.15),
     "modules": (0.2, 0.15, 0.5, 0.15),
+    "storeys": (0.0, 0.05, 0.8, 0.15),
+    "point-symmetric": (0.0, 0.0, 0.85, 0.15),
 }  # of `FURNISHED`
 
 
@@ -113,9 +116,6 @@ def lookalike_items(recipe: LookalikeRecipe) -> list[LookalikeItem]:
     if not any((*recipe.pairs.values(), *recipe.again.values())) or not 0 <= recipe.scaled <= 1:
         raise InputError("data.pairs: give pairs of a kind or more, and data.scaled from 0 to 1")
     first, last = splits.seeds(recipe.split)
-    sensors = dict(recipe.sensors or WEIGHTS["sensors"])
-    names = sorted(sensors)
-    weights = np.array([sensors[get_sensor(name).name] for name in names])
     out = []
     both = ((recipe.pairs, False), (recipe.again, True))
     rows = [
@@ -123,6 +123,9 @@ def lookalike_items(recipe: LookalikeRecipe) -> list[LookalikeItem]:
     ]
     for number, kind, again in rows:
         rng = np.random.default_rng([recipe.seed, LOOKALIKES.index(kind), number])
+        sensors = dict(recipe.sensors or SENSORS_OF.get(kind, WEIGHTS["sensors"]))
+        names = sorted(sensors)
+        weights = np.array([sensors[get_sensor(name).name] for name in names])
         a, b = rng.choice(len(names), 2, p=weights / weights.sum()).tolist()
         furniture = str(rng.choice(FURNISHED, p=FURNITURE_SHARES[kind]))
         seed, scaled = int(rng.integers(first, last + 1)), bool(rng.random() < recipe.scaled)

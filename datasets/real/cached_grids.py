@@ -11,7 +11,7 @@ import numpy as np
 from topomerge.datasets.core.builder import Say
 from topomerge.datasets.pairs.grid_pairs import GRID_FORMAT, GridPair, common_area, free_of, grid_arrays, grid_of
 from topomerge.datasets.pairs.pairs import Pair
-from topomerge.datasets.real.sources import DEVELOPMENT_FOLDERS, iter_real_pairs
+from topomerge.datasets.real.sources import iter_real_pairs
 
 from topomerge.io import archive
 
@@ -48,7 +48,7 @@ def build_floor(folder: str | Path, cache: str | Path, say: Say = lambda text: N
     if rows and all((place / row["file"]).exists() for row in rows):
         return [place / row["file"] for row in rows]
     rows = []
-    for pair in real_grid_pairs(folder, tuple(DEVELOPMENT_FOLDERS)):
+    for pair in real_grid_pairs(folder, ("office_floor",)):
         name = hashlib.sha256(json.dumps(["floor", GRID_FORMAT, pair.name]).encode()).hexdigest()[:24]
         about = {**pair.about, "sensors": SLICES, "scaled": True, "common": pair.common, "captures": pair.name.rpartition("/")[2]}
         arrays = {**grid_arrays("a", pair.a, pair.free[0]), **grid_arrays("b", pair.b, pair.free[1])}

@@ -30,7 +30,8 @@ REAL_FOLDERS = {  # source -> folder of its files within that of the real data
     "ifc": "ifc_buildings",
 }
 REAL_SOURCES = tuple(REAL_FOLDERS)
-DEVELOPMENT_FOLDERS = {"office_floor": "halmstad_office_f5"}  # likewise of what one chooses by, and never reports
+# Likewise of what one chooses by, and never reports.
+DEVELOPMENT_FOLDERS = {"office_floor": "halmstad_office_f5", "storeys": "storeys_jsk"}
 FOLDERS_BY_SOURCE = {**REAL_FOLDERS, **DEVELOPMENT_FOLDERS}
 TABLE_HEAD = (
     "pair",

@@ -14,20 +14,21 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.types import Array
 
-WRONG = ("elsewhere", "storey", "wing", "building", "outside")
+WRONG = ("elsewhere", "storey", "half", "wing", "building", "outside")
 POSTERIOR = ("here", *WRONG)
 # Of the pairs that somebody would try, how many are of each kind, and (elsewhere) how often maps that do share a place are laid
 # on another one: an assumption, not a measurement; the models are fitted to pairs weighed so.
-PRIORS = {"here": 0.5, "elsewhere": 0.1, "storey": 0.08, "wing": 0.1, "building": 0.16, "outside": 0.06}
+PRIORS = {"here": 0.5, "elsewhere": 0.1, "storey": 0.08, "half": 0.03, "wing": 0.08, "building": 0.15, "outside": 0.06}
 SAME = {
     "nothing": POSTERIOR,
-    "building": ("here", "elsewhere", "storey", "wing", "outside"),
-    "storey": ("here", "elsewhere", "wing", "outside"),
+    "building": ("here", "elsewhere", "storey", "half", "wing", "outside"),
+    "storey": ("here", "elsewhere", "half", "wing", "outside"),
 }
 WORDS = {
     "here": "the same place",
     "elsewhere": "another place in these maps",
     "storey": "another storey with the same plan",
+    "half": "the other half of the building, which half a turn lays on this one",
     "wing": "a wing, module or room that looks the same",
     "building": "another building",
     "outside": "a place outside the other map",
@@ -47,7 +48,7 @@ def posterior(here: float, kinds: Mapping[str, Any], x: Array, same: str = "noth
 
     Args:
         here: probability of this place where nothing is known.
-        kinds: model of what it is if it is not: ``mean``, ``scale`` (F,), ``weight`` (5, F), ``bias`` (5,).
+        kinds: model of what it is if it is not: ``mean``, ``scale`` (F,), ``weight`` (6, F), ``bias`` (6,).
         x: (F,) what that model sees.
         same: what the user knows the maps to be of, a key of `SAME`.
     """

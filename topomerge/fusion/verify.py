@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import betaln
 
 from topomerge.fusion.judge import Judge
 from topomerge.fusion.posterior import evidence_limit, limited, posterior
@@ -20,6 +21,10 @@ MARGIN_CAP = 6.0
 BASIN = PoseTolerance(1.2, float(np.radians(3.0)), 0.05)  # a worse pose nearer than that is no rival
 ENOUGH_FLOOR = 200.0  # m2 of free floor that both maps saw
 RIVAL_WALLS = 0.3  # of the walls that the best hypothesis brings together
+FURNITURE_STAYS = (7.0, 2.5)  # beta distribution of the share of the furniture that stands where it stood at an earlier visit
+BY_CHANCE = (1.4, 0.02, 0.7, 6.0)  # share that another room's furniture meets: so many times that of shifted furniture, and so
+# much more, at most so much (furniture follows walls), with so much certainty (sum of the parameters of its beta distribution)
+INDEPENDENT_PIECES = 0.5  # of the pieces of 0.4 m2: a bed is several
 Features = Mapping[str, float]
 
 POSE_VECTOR = (
@@ -148,8 +153,8 @@ def _logit(fitted: Mapping[str, Any], x: Array) -> float:
 
 LEAD_VECTOR = ("margin", "ahead", "alone", "repeats")
 WINNER_VECTOR = (
-    "tall", "crossing", "worst_ratio", "squares", "bad_squares", "in_place", "out_of_place", "kept", "moved_walls", "hanging",
-    "fallen", "held",
+    "tall", "crossing", "worst_ratio", "squares", "bad_squares", "furniture", "in_place", "out_of_place", "kept", "moved_walls",
+    "hanging", "fallen", "held", "spots",
 )  # fmt: skip
 
 
@@ -178,8 +183,24 @@ def bent_pose_vector(f: Features) -> Array:
     return np.append(vector(f), [mean, mean * np.log1p(f["place_area"] / PLACE_AREA), f["place_worst"]])
 
 
+def furniture_log_odds(f: Features) -> float:
+    """Log odds that furniture which both maps could see is of one room at two visits and not of two rooms of one plan.
+
+    Of n pieces m stand in place: a beta-binomial likelihood of m by how much stays over time (`FURNITURE_STAYS`) against that by
+    what would meet by chance, measured where all furniture is moved (`winner_features`). A few pieces seen clearly by both say
+    more than any amount of walls of one plan; nothing says anything where a map shows no furniture.
+    """
+    n = INDEPENDENT_PIECES * f["pieces"]
+    met = min(INDEPENDENT_PIECES * f["in_place"], n)
+    factor, least, most, certainty = BY_CHANCE
+    chance = float(np.clip(factor * f["by_chance"] / max(f["pieces"], 1e-6) + least, least, most))
+    a, b = FURNITURE_STAYS
+    c, d = certainty * chance, certainty * (1 - chance)
+    return float(betaln(a + met, b + n - met) - betaln(a, b) - betaln(c + met, d + n - met) + betaln(c, d))
+
+
 def winner_vector(f: Features) -> Array:
-    """(12,) what the model of the best hypothesis sees of `winner_features`, named `WINNER_VECTOR`.
+    """(14,) what the model of the best hypothesis sees of `winner_features`, named `WINNER_VECTOR`.
 
     Amounts are those of `ENOUGH_FLOOR` m2 at most: on a floor ten times as large ten times as much is out of place, and says
     no more.
@@ -193,6 +214,7 @@ def winner_vector(f: Features) -> Array:
             f["worst_ratio"],
             np.log1p(f["squares"]),
             f["bad_squares"],
+            furniture_log_odds(f),
             np.log1p(part * gain),
             np.log1p(part * (pieces - gain)),
             gain / (pieces + 1.0),
@@ -200,6 +222,7 @@ def winner_vector(f: Features) -> Array:
             np.log1p(part * f["hanging_met"]),
             np.log1p(part * (f["hanging"] - f["hanging_met"])),
             f["hanging_met"] / (f["hanging"] + 1.0),
+            np.log1p(part * f["spots"]),
         ]
     )
 

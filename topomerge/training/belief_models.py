@@ -21,6 +21,7 @@ SIGN = {
     "level": -1, "ceilings": -1, "margin": 1, "ahead": 1, "tall": -1, "crossing": 1, "worst_ratio": 1, "squares": 1,
     "bad_squares": -1, "in_place": 1, "out_of_place": -1, "kept": 1, "moved_walls": -1, "hanging": 1, "fallen": -1, "held": 1,
     "alone": 1, "strain": -1, "doubted": -1, "place_mean": 1, "place_total": 1, "place_worst": 1,
+    "furniture": 1, "spots": -1,
 }  # fmt: skip
 
 
@@ -58,7 +59,7 @@ def what_it_is(row: dict[str, Any], label: int) -> str:
     if label == 1:
         return "here"
     if row.get("lookalike"):
-        return "wing"
+        return {"storeys": "storey", "point-symmetric": "half"}.get(row["lookalike"], "wing")
     if row["kind"] == "overlap":
         return "outside" if kind_of(row).startswith("none") else "elsewhere"
     return {"other-storey": "storey", "twin-wing": "wing"}.get(row["kind"], "building")

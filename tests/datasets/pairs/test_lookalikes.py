@@ -16,7 +16,15 @@ from topomerge.datasets.buildings.refurnish import _of_item, replaced
 from topomerge.datasets.core.building import Building
 from topomerge.datasets.core.difficulty import Difficulty
 from topomerge.datasets.pairs.grid_pairs import unpacked
-from topomerge.datasets.pairs.lookalike_places import FURNISHED, LOOKALIKES, draw_places, laid, row_poses
+from topomerge.datasets.pairs.lookalike_places import (
+    FURNISHED,
+    LOOKALIKES,
+    add_pilasters,
+    draw_places,
+    laid,
+    mirror_by_point,
+    row_poses,
+)
 from topomerge.datasets.pairs.lookalike_rule import Shown, differences, judged_poses, tells
 from topomerge.datasets.pairs.lookalikes import LookalikeItem, LookalikeRecipe, lookalike_arrays, lookalike_items
 from topomerge.datasets.plans import splits
@@ -154,7 +162,7 @@ def test_a_mirror_image_is_a_reflection_and_lies_on_the_building_where_it_can() 
 def test_places_of_each_kind_hold_the_furniture_that_is_asked_for(kind: str, furniture: str) -> None:
     places = draw_places(kind, furniture, 21)
     a, b = places.buildings
-    assert places.same == (kind in ("shifted-row", "modules")) and len(places.poses) >= 1
+    assert places.same == (kind in ("shifted-row", "modules", "point-symmetric")) and len(places.poses) >= 1
     assert all(len(v) and v.max() < len(x.rooms) for v, x in zip(places.visited, places.buildings, strict=True))
     loose = [x.things[~np.isin(x.things["kind"], ("leaf", "column"))] for x in (a, b)]
     if furniture == "empty":
@@ -168,7 +176,8 @@ def test_sets_of_two_splits_share_no_seed_and_longer_sets_begin_with_shorter_one
     train, test = (lookalike_items(LookalikeRecipe(pairs=pairs, split=split)) for split in ("train", "test"))
     for items, split in ((train, "train"), (test, "test")):
         first, last = splits.seeds(split)
-        assert all(first <= item.seed <= last for item in items) and len({item.name for item in items}) == len(items) == 200
+        assert all(first <= item.seed <= last for item in items)
+        assert len({item.name for item in items}) == len(items) == 40 * len(LOOKALIKES)
     assert not {i.seed for i in train} & {i.seed for i in test}
     shorter = lookalike_items(LookalikeRecipe(pairs=dict.fromkeys(LOOKALIKES, 3)))
     assert shorter == train[: len(shorter)]
@@ -227,3 +236,52 @@ def test_a_place_visited_again_is_a_right_merge_and_changes_no_other_item() -> N
     )
     both = {tuple(row) for row in a.tolist()} & {tuple(row) for row in b.tolist()}
     assert len(both) > 0.8 * min(len(a), len(b))
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_storeys_have_one_plan_and_furniture_of_their_own(seed: int) -> None:
+    a, b = draw_places("storeys", "other", seed).buildings
+    assert all(np.array_equal(r.polygon, s.polygon) for r, s in zip(a.rooms, b.rooms, strict=True))
+    assert np.array_equal(a.doors["centre"], b.doors["centre"])
+    first, second = (x.things[x.things["movable"] & (x.things["kind"] != "leaf")] for x in (a, b))
+    assert len(first) and len(second)
+    far = np.linalg.norm(first["centre"][:, None] - second["centre"][None], axis=2).min(axis=1)
+    assert (far > 0.05).mean() > 0.8
+
+
+def test_the_halves_of_a_point_symmetric_building_lie_on_each_other() -> None:
+    places = draw_places("point-symmetric", "empty", 2)
+    building, (pose,) = places.buildings[0], places.poses
+    half = len(building.rooms) // 2
+    for room, other in zip(building.rooms[:half], building.rooms[half:], strict=True):
+        turned = pose.apply(np.pad(other.polygon, ((0, 0), (0, 1))))[:, :2]
+        assert shapely.Polygon(turned).symmetric_difference(shapely.Polygon(room.polygon)).area < 1e-6
+    assert (places.visited[0] < half).all() and (places.visited[1] >= half).all()
+    assert len(set(building.parts())) == 1 or {r.kind for r in building.rooms} >= {"lift"}
+
+
+def test_a_plan_mirrored_by_a_point_is_one_building_through_the_joint() -> None:
+    draft = Draft(0.1, np.random.default_rng(0))
+    corridor = draft.box((0.0, 0.0), (10.0, 2.0), "corridor")
+    office = draft.box((0.0, 2.0), (10.0, 6.0), "office")
+    draft.cut(draft.outlines[corridor].intersection(draft.outlines[office]), 0.9, "door", 0.5)
+    whole, middle = mirror_by_point(draft.plan(3.2, 2.7))
+    assert middle == pytest.approx([10.0, 1.0], abs=0.11) and len(whole.rooms) == 4
+    building = erect([whole], EQUAL, 0, "whole")
+    assert {frozenset(e) for e in building.edges().tolist()} == {frozenset(e) for e in ((0, 1), (2, 3), (0, 2))}
+
+
+def test_pilasters_stand_along_walls_and_clear_of_doors() -> None:
+    plain = room()
+    with_some = add_pilasters(plain, 0.5, np.random.default_rng(3))
+    added = with_some.things[with_some.things["kind"] == "column"]
+    assert len(added) >= 4
+    line = shapely.Polygon(plain.rooms[0].polygon).exterior
+    for thing in added:
+        point = shapely.Point(*thing["centre"][:2])
+        assert line.distance(point) == pytest.approx(thing["size"][1] / 2, abs=0.02)
+        assert min(np.hypot(*(d["centre"][:2] - thing["centre"][:2])) for d in plain.doors) > 0.5
+    one, other = (add_pilasters(plain, 0.5, np.random.default_rng(k)) for k in (3, 4))
+    amount = differences(shown(one), shown(other), Sim3())
+    assert amount["fitted"] > 0.5 and tells(amount)
+    assert not tells(differences(shown(one), shown(one), Sim3()))

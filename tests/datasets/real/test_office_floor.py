@@ -52,7 +52,7 @@ def test_it_is_read_where_it_is_named_only(floor: Path) -> None:
     results = dict(sources.iter_real_pairs(floor.parent, ["office_floor"]))
     assert isinstance(results["office_floor/F5_01-F5_02"], Pair)
     assert not any("F5" in name for name, _ in sources.iter_real_pairs(floor.parent))
-    with pytest.raises(InputError, match="office_floor are possible"):
+    with pytest.raises(InputError, match="office_floor, storeys are possible"):
         sources.iter_real_pairs(floor.parent, ["office"])
 
 
