@@ -21,8 +21,9 @@ MARGIN_CAP = 6.0
 BASIN = PoseTolerance(1.2, float(np.radians(3.0)), 0.05)  # a worse pose nearer than that is no rival
 ENOUGH_FLOOR = 200.0  # m2 of free floor that both maps saw
 RIVAL_WALLS = 0.3  # of the walls that the best hypothesis brings together
-FURNITURE_STAYS = (7.0, 2.5)  # beta distribution of the share of the furniture that stands where it stood at an earlier visit
-BY_CHANCE = (1.4, 0.02, 0.7, 6.0)  # share that another room's furniture meets: so many times that of shifted furniture, and so
+AMOUNT_COUNTS = 0.6  # of the log odds of rivals that amounts of evidence make: how much can agree depends on how far maps overlap
+FURNITURE_STAYS = (5.0, 3.0)  # beta distribution of the share of the furniture that stands where it stood at an earlier visit
+BY_CHANCE = (1.25, 0.03, 0.6, 8.0)  # share that another room's furniture meets: so many times that of shifted furniture, and so
 # much more, at most so much (furniture follows walls), with so much certainty (sum of the parameters of its beta distribution)
 INDEPENDENT_PIECES = 0.5  # of the pieces of 0.4 m2: a bed is several
 Features = Mapping[str, float]
@@ -37,7 +38,7 @@ QUALITY = [POSE_VECTOR.index(n) for n in QUALITY_NAMES]
 
 
 def vector(f: Features) -> Array:
-    """(14,) what the logistic models see of a pose, named `POSE_VECTOR`: amounts in logarithms, clutter weighed by how much."""
+    """(12,) what the logistic models see of a pose, named `POSE_VECTOR`: amounts in logarithms, clutter weighed by how much."""
     amount = f["walls"] + f["conflict"]  # shares of little are drawn towards what is usual: no conflict of nothing is no praise
     shares = f["conflict_share"], f["worst_conflict"]
     conflict, worst = (np.log((s * amount + USUAL_CONFLICT * PRIOR_WALLS) / (amount + PRIOR_WALLS) + 0.01) for s in shares)
@@ -96,17 +97,21 @@ def bent_score(f: Features) -> float:
 
 def lead(scores: Array, vectors: Array, weights: Array, scales: Array) -> tuple[float, float, float, float]:
     """How far the first of ranked hypotheses is ahead, named `LEAD_VECTOR`: in log odds; in log odds without the amounts, of
-    those that explain a share of what it does; in log odds of its share of the odds of all; and that share.
+    those that explain a share of what it does; in log odds of its share of the odds of all; and its share where the amounts of
+    rivals count in part (`AMOUNT_COUNTS`).
 
-    A shift by one room along a row of rooms explains less, but nothing speaks against it: it is as good.
+    A shift by one room along a row of rooms explains less, but nothing speaks against it: it is nearly as good.
     """
     margin = min(float(scores[0] - scores[1]), MARGIN_CAP) if len(scores) > 1 else MARGIN_CAP
     quality = vectors[:, BENT_QUALITY] @ (weights / scales)[BENT_QUALITY]
     rival = vectors[1:, 1] >= vectors[0, 1] + np.log(RIVAL_WALLS)
     ahead = float(quality[0] - quality[1:][rival].max()) if rival.any() else MARGIN_CAP
-    share = float(1 / np.exp(scores - scores[0]).sum())
-    alone = float(np.clip(np.log(share / (1 - share + 1e-3)), -2.0, MARGIN_CAP))
-    return margin, float(np.clip(ahead, -2.0, MARGIN_CAP)), alone, share
+    behind = scores - scores[0]
+    of_odds = float(1 / np.exp(behind).sum())
+    alone = float(np.clip(np.log(of_odds / (1 - of_odds + 1e-3)), -2.0, MARGIN_CAP))
+    as_good = AMOUNT_COUNTS * behind + (1 - AMOUNT_COUNTS) * np.minimum(quality - quality[0], 0.0)
+    behind[1:] = np.where(rival, np.maximum(behind, as_good)[1:], behind[1:])
+    return margin, float(np.clip(ahead, -2.0, MARGIN_CAP)), alone, float(1 / np.exp(behind).sum())
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,8 @@ def verdict(rivals: Sequence[Features], winner: Features, same: str = "nothing")
     leads = lead(scores, vectors, np.array(models["bent"]["weight"]), np.array(models["bent"]["scale"]))
     seen = belief_vector(vectors[0], leads[:3], winner)
     here = float(1 / (1 + np.exp(-_logit(models["winner"], seen))))
-    every = limited(posterior(here, models["kinds"], seen, same), min(leads[3], evidence_limit(winner)))
+    plan = _logit(models["plan"], plan_vector(winner))
+    every = limited(posterior(here, plan, models["kinds"], seen, same), min(leads[3], evidence_limit(winner)))
     shares = np.exp(scores - scores[0])
     return Verdict(every, (every["here"] * shares).tolist(), dict(winner))
 
@@ -153,8 +159,8 @@ def _logit(fitted: Mapping[str, Any], x: Array) -> float:
 
 LEAD_VECTOR = ("margin", "ahead", "alone", "repeats")
 WINNER_VECTOR = (
-    "tall", "crossing", "worst_ratio", "squares", "bad_squares", "furniture", "in_place", "out_of_place", "kept", "moved_walls",
-    "hanging", "fallen", "held", "spots",
+    "tall", "crossing", "worst_ratio", "squares", "bad_squares", "in_place", "out_of_place", "kept", "moved_walls", "hanging",
+    "fallen", "held",
 )  # fmt: skip
 
 
@@ -200,7 +206,7 @@ def furniture_log_odds(f: Features) -> float:
 
 
 def winner_vector(f: Features) -> Array:
-    """(14,) what the model of the best hypothesis sees of `winner_features`, named `WINNER_VECTOR`.
+    """(12,) what the model of the best hypothesis sees of `winner_features`, named `WINNER_VECTOR`.
 
     Amounts are those of `ENOUGH_FLOOR` m2 at most: on a floor ten times as large ten times as much is out of place, and says
     no more.
@@ -214,7 +220,6 @@ def winner_vector(f: Features) -> Array:
             f["worst_ratio"],
             np.log1p(f["squares"]),
             f["bad_squares"],
-            furniture_log_odds(f),
             np.log1p(part * gain),
             np.log1p(part * (pieces - gain)),
             gain / (pieces + 1.0),
@@ -222,7 +227,32 @@ def winner_vector(f: Features) -> Array:
             np.log1p(part * f["hanging_met"]),
             np.log1p(part * (f["hanging"] - f["hanging_met"])),
             f["hanging_met"] / (f["hanging"] + 1.0),
-            np.log1p(part * f["spots"]),
+        ]
+    )
+
+
+PLAN_VECTOR = (
+    "furniture", "furniture_sliced", "conflict", "place_mean", "moved_walls", "spots", "spots_sliced", "sliced",
+)  # fmt: skip
+
+
+def plan_vector(f: Features) -> Array:
+    """(8,) what tells a place from another one of the same plan (another storey, the other half of the building), named
+    `PLAN_VECTOR`: how much walls agree is no evidence there. Slices see legs in place of furniture, and are weighed apart."""
+    furniture, sliced = furniture_log_odds(f), f["sliced"]
+    spots = np.log1p(ENOUGH_FLOOR / (ENOUGH_FLOOR + f["free"]) * f["spots"])
+    moved = np.log(f["moved_walls"] + 0.004)
+    conflict = vector(f)[POSE_VECTOR.index("conflict")]
+    return np.array(
+        [
+            furniture * (1 - sliced),
+            furniture * sliced,
+            conflict,
+            f["place_mean"],
+            moved,
+            spots * (1 - sliced),
+            spots * sliced,
+            sliced,
         ]
     )
 

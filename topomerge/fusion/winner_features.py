@@ -18,6 +18,7 @@ from topomerge.types import Array, Sim3
 
 WALL_RUN = 0.8  # m, length from which walls on free ground are no noise
 SPOT_AREA = 0.03  # m2 of wall in one piece on free floor of the other map, from which on it is no noise
+SPOT_FLOOR = 0.6  # share of the columns around such a piece that are free floor: nothing is near that drift could move
 SQUARE_SIDE = 3.0  # m, side of the squares in which walls are compared
 SQUARE_WALLS = 0.3  # m2 of walls in a square, below which it tells nothing
 AGREES, DISAGREES = 0.7, 0.4  # share of a square's walls that agree
@@ -56,7 +57,8 @@ def winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
 
 def _walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, float, int]:
     """(n, 6) of each wall column: place in the other map, is it on known ground, does it agree, direction, m2; the m2 of high
-    walls in runs that stand on free ground; and in how many places walls of any length do."""
+    walls in runs that stand on free ground; and how many pieces of any length stand in
+    the midst of free floor (ends of walls, columns, niches: another storey of one plan has them elsewhere)."""
     points = source.walls
     at = move.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
     cells = np.floor((at - target.plan.origin) / target.plan.edge).astype(np.int64)
@@ -68,15 +70,16 @@ def _walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, f
     area = source.plan.edge**2
     rows = np.column_stack([at, seen, near, source.directions, np.full(len(at), area)])
     mask = np.zeros(source.plan.wall.shape, bool)
-    mask[source.plan.wall] = clash
-    label, count = ndimage.label(mask, np.ones((3, 3), int))
-    spots = int((np.bincount(label.ravel(), minlength=count + 1)[1:] * area * move.scale**2 >= SPOT_AREA).sum())
     mask[source.plan.wall] = clash & source.tall
-    label, _ = ndimage.label(mask, np.ones((3, 3), int))
+    label, count = ndimage.label(mask, np.ones((3, 3), int))
     long = 0.0
     for number, box in enumerate(ndimage.find_objects(label), 1):
         if max(s.stop - s.start for s in box) * source.plan.edge >= WALL_RUN:
             long += float((label[box] == number).sum())
+    piece = label[source.plan.wall]
+    size = np.bincount(piece, minlength=count + 1)[1:]
+    around = np.bincount(piece, weights=target.open_floor[i, j], minlength=count + 1)[1:] / np.maximum(size, 1)
+    spots = int(((size * area * move.scale**2 >= SPOT_AREA) & (around >= SPOT_FLOOR)).sum())
     return rows, long * area, spots
 
 

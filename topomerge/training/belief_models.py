@@ -9,19 +9,20 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from topomerge.fusion.posterior import PRIORS, WRONG
+from topomerge.fusion.posterior import KINDS, PRIORS, SAME_PLAN, WRONG
 from topomerge.numpy_nn import softmax
 from topomerge.training.belief_hypotheses import kind_of
 from topomerge.types import Array
 
 LEAST_SPREAD = 1e-4  # the file of weights holds five decimals: less would be 0 there
+SAME_PLAN_KINDS = {"storeys": "storey", "point-symmetric": "half"}  # kind of look-alikes -> what they are
 THRESHOLDS = [round(0.5 + 0.01 * k, 2) for k in range(50)]
 SIGN = {
     "ratio": 1, "walls": 1, "conflict": -1, "worst": -1, "free": 1, "opposed": -1, "lift": 1, "met": 1, "missed": -1, "share": 1,
     "level": -1, "ceilings": -1, "margin": 1, "ahead": 1, "tall": -1, "crossing": 1, "worst_ratio": 1, "squares": 1,
     "bad_squares": -1, "in_place": 1, "out_of_place": -1, "kept": 1, "moved_walls": -1, "hanging": 1, "fallen": -1, "held": 1,
     "alone": 1, "strain": -1, "doubted": -1, "place_mean": 1, "place_total": 1, "place_worst": 1,
-    "furniture": 1, "spots": -1,
+    "furniture": 1, "furniture_sliced": 1, "spots": -1, "spots_sliced": -1,
 }  # fmt: skip
 
 
@@ -59,10 +60,26 @@ def what_it_is(row: dict[str, Any], label: int) -> str:
     if label == 1:
         return "here"
     if row.get("lookalike"):
-        return {"storeys": "storey", "point-symmetric": "half"}.get(row["lookalike"], "wing")
+        return SAME_PLAN_KINDS.get(row["lookalike"], "wing")
     if row["kind"] == "overlap":
         return "outside" if kind_of(row).startswith("none") else "elsewhere"
     return {"other-storey": "storey", "twin-wing": "wing"}.get(row["kind"], "building")
+
+
+def is_same_plan(row: dict[str, Any]) -> bool:
+    """Is it a pair of places that were made of one plan, of which the one is not the other?"""
+    return SAME_PLAN_KINDS.get(row.get("lookalike", ""), "") in SAME_PLAN
+
+
+def plan_weights(alike: Array, weight: Array) -> Array:
+    """(n,) weights of pairs that are of one place and of those that are alike by plan (n,) bool, as frequent as `PRIORS` state;
+    their sum is that of `weight`."""
+    out = np.zeros(len(alike))
+    for mine, prior in ((alike, sum(PRIORS[name] for name in SAME_PLAN)), (~alike, PRIORS["here"])):
+        if weight[mine].sum() > 0:
+            out[mine] = prior * weight[mine] / weight[mine].sum()
+    scaled: Array = out * weight.sum() / max(out.sum(), 1e-9)
+    return scaled
 
 
 def prior_weights(truth: Array, weight: Array) -> Array:
@@ -98,19 +115,19 @@ def risk_curve(believed: Array, true: Array, truth: Array, weight: Array) -> lis
 
 
 def fitted_kinds(x: Array, truth: Array, weight: Array, strength: float) -> dict[str, Any]:
-    """Standardised multinomial logistic regression: what it is (`WRONG`) where the best hypothesis is wrong."""
+    """Standardised multinomial logistic regression: what it is (`KINDS`) where the best hypothesis is wrong."""
     mean, scale = x.mean(axis=0), spread(x)
     z = np.column_stack([(x - mean) / scale, np.ones(len(x))])
-    one = (truth[:, None] == np.array(WRONG)).astype(float)
+    one = (truth[:, None] == np.array(KINDS)).astype(float)
 
     def loss(flat: Array) -> tuple[float, Array]:
-        w = flat.reshape(len(WRONG), -1)
+        w = flat.reshape(len(KINDS), -1)
         chance = softmax(z @ w.T)
         pull = np.pad(w[:, :-1], ((0, 0), (0, 1))) / strength
         value = -(weight * np.log(np.maximum((chance * one).sum(axis=1), 1e-12))).sum() + (w[:, :-1] ** 2).sum() / (2 * strength)
         return float(value), ((weight[:, None] * (chance - one)).T @ z + pull).ravel()
 
-    w = minimize(loss, np.zeros(len(WRONG) * z.shape[1]), jac=True, method="L-BFGS-B").x.reshape(len(WRONG), -1)
+    w = minimize(loss, np.zeros(len(KINDS) * z.shape[1]), jac=True, method="L-BFGS-B").x.reshape(len(KINDS), -1)
     return {"mean": mean.tolist(), "scale": scale.tolist(), "weight": w[:, :-1].tolist(), "bias": w[:, -1].tolist()}
 
 

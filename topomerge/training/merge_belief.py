@@ -21,19 +21,31 @@ from topomerge.fusion.verify import (
     BASIN,
     BELIEF_VECTOR,
     BENT_POSE_VECTOR,
+    PLAN_VECTOR,
     POSE_VECTOR,
     Features,
     belief_vector,
     bent_pose_vector,
     lead,
     model,
+    plan_vector,
     vector,
 )
 from topomerge.matching.poses import PoseHypothesis, distinct_hypotheses
 from topomerge.training.belief_floor import floor_rows
 from topomerge.training.belief_hypotheses import belief_rows, fair, kind_of
 from topomerge.training.belief_lookalikes import lookalike_rows, lookalike_scores
-from topomerge.training.belief_models import fitted, fitted_kinds, folds, logits, prior_weights, risk_curve, what_it_is
+from topomerge.training.belief_models import (
+    fitted,
+    fitted_kinds,
+    folds,
+    is_same_plan,
+    logits,
+    plan_weights,
+    prior_weights,
+    risk_curve,
+    what_it_is,
+)
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.task_settings import MergeBelief
@@ -125,9 +137,9 @@ def tabled(rows: list[dict[str, Any]]) -> Table:
     )  # fmt: skip
 
 
-def best(t: Table, scores: Array, bent: dict[str, Any], i: int, wrong: bool = False) -> tuple[int, Array, float] | None:
+def best(t: Table, scores: Array, bent: dict[str, Any], i: int, wrong: bool = False) -> tuple[int, Array, float, Array] | None:
     """Row of the best hypothesis of pair i (of the wrong ones only, as if no search had found a right one), what the
-    second model sees of it, and its share of the odds."""
+    second model sees of it, its share of the odds, and what the model of places of one plan sees of it."""
     rows = np.flatnonzero((t.owner == i) & t.looked & ((t.y == 0) if wrong else t.rival))
     rows = rows[np.argsort(-scores[rows], kind="stable")]
     if not len(rows):
@@ -135,7 +147,7 @@ def best(t: Table, scores: Array, bent: dict[str, Any], i: int, wrong: bool = Fa
     rows = rows[_distinct(t.poses[rows], np.array(t.rows[i]["middle"]))]
     leads = lead(scores[rows], t.bent[rows], np.array(bent["weight"]), np.array(bent["scale"]))
     first = int(rows[0])
-    return first, belief_vector(t.bent[first], leads[:3], t.closely[first]), leads[3]
+    return first, belief_vector(t.bent[first], leads[:3], t.closely[first]), leads[3], plan_vector(t.closely[first])
 
 
 def _distinct(poses: Array, middle: Array) -> list[int]:
@@ -146,51 +158,105 @@ def _distinct(poses: Array, middle: Array) -> list[int]:
 
 
 def fit_models(rows: list[dict[str, Any]], flat: bool, settings: MergeBelief) -> tuple[dict[str, Any], tuple[Any, Array, Array]]:
-    """The three models of these pairs; and of those that are flat, or are not: the rows, what left-out buildings' models believe
-    of their best hypothesis, and its label.
+    """The models of these pairs; and of those that are flat, or are not: the rows, what left-out buildings' models believe of
+    their best hypothesis, and its label.
 
     Raises:
         InputError: too few pairs or buildings.
     """
     t = tabled(rows)
+    ranking, scores = fit_ranking(t, flat, settings)
+    w = collect_winners(t, scores, ranking["bent"], settings)
+    verdict, believed = fit_verdict(w, flat, t.ordinary, settings)
+    mine = w.first & np.array([is_flat(row) == flat for row in w.rows], bool)
+    scored = [row for row, so in zip(w.rows, mine, strict=True) if so]
+    pairs = int(sum(t.trains[i] for i in np.unique(t.owner[t.looked])))
+    return {"pairs": pairs, **ranking, **verdict}, (scored, np.minimum(believed, w.share)[mine], w.y[mine])
+
+
+def fit_ranking(t: Table, flat: bool, settings: MergeBelief) -> tuple[dict[str, Any], Array]:
+    """The models by which hypotheses are ranked, before (``pose``) and after the maps are bent (``bent``), and (n,) the log odds
+    of each that was looked at, by models of other buildings.
+
+    Raises:
+        InputError: too few pairs or buildings.
+    """
     sure = (t.y >= 0) & t.trains[t.owner]
     closely = sure & t.looked
     if len(np.unique(t.building)) < 2 or len(np.unique(t.y[closely] > 0)) < 2:
         raise InputError("data.sets: too few pairs: right and wrong hypotheses of two buildings are needed")
-    if settings.refit == "all":
-        pose = fitted(t.x[sure], t.y[sure] > 0, POSE_VECTOR, settings.pose_strength)
-    else:
-        pose = model()["flat" if flat else "solid"]["pose"]
-    strength = settings.pose_strength
-    bent = fitted(t.bent[closely], t.y[closely] > 0, BENT_POSE_VECTOR, strength)
+    shipped, strength = model()["flat" if flat else "solid"], settings.pose_strength
+    pose = fitted(t.x[sure], t.y[sure] > 0, POSE_VECTOR, strength) if settings.refit == "all" else shipped["pose"]
     scores = np.full(len(t.y), -np.inf)
+    if settings.refit == "plan":
+        scores[t.looked] = logits(shipped["bent"], t.bent[t.looked])
+        return {"pose": pose, "bent": shipped["bent"]}, scores
     for train, test in folds(t.building[t.owner], settings.folds, t.ordinary):
         train, test = train[closely[train]], test[t.looked[test]]
         scores[test] = logits(fitted(t.bent[train], t.y[train] > 0, BENT_POSE_VECTOR, strength), t.bent[test])
+    return {"pose": pose, "bent": fitted(t.bent[closely], t.y[closely] > 0, BENT_POSE_VECTOR, strength)}, scores
+
+
+@dataclass(frozen=True, eq=False)
+class Winners:
+    """The best hypothesis of each pair and, as if no search had found a right one, the best wrong one of those that have one: the
+    row of its pair, is it the best at all (``first``), its label ``y``, what the models see of it (``x``, ``plan``), its share of
+    the odds, its building, how much it counts (``weight``), and does it train?"""
+
+    rows: list[dict[str, Any]]
+    first: Array
+    y: Array
+    x: Array
+    plan: Array
+    share: Array
+    building: Array
+    weight: Array
+    trains: Array
+
+
+def collect_winners(t: Table, scores: Array, bent: dict[str, Any], settings: MergeBelief) -> Winners:
+    """The best hypotheses of the pairs of a table by the scores of its rows."""
     first = [(i, b) for i in range(len(t.rows)) if (b := best(t, scores, bent, i)) is not None]
     others = [(i, best(t, scores, bent, i, True)) for i, _ in first if (t.y[t.owner == i] > 0).any()]
     both = [*first, *((i, b) for i, b in others if b is not None)]
-    x = np.array([b[1] for _, b in both])
     y = np.array([t.y[b[0]] for _, b in first] + [0] * (len(both) - len(first)))
-    share = np.array([b[2] for _, b in first])
+    is_first = np.arange(len(both)) < len(first)
+    weight = np.where(is_first, 1.0, settings.missed) * [t.rows[i].get("weight", 1.0) for i, _ in both]
+    trains = (y >= 0) & np.array([t.trains[i] for i, _ in both])
+    columns = [np.array([b[k] for _, b in both]) for k in (1, 3, 2)]
     building = np.array([t.building[i] for i, _ in both])
-    certain = (y >= 0) & np.array([t.trains[i] for i, _ in both])
-    truth = np.array([what_it_is(t.rows[i], int(label)) for (i, _), label in zip(both, y, strict=True)])
-    missed = np.where(np.arange(len(y)) < len(first), 1.0, settings.missed)
-    missed *= [t.rows[i].get("weight", 1.0) for i, _ in both]
-    weight = prior_weights(truth, missed * certain) * np.where(flat & (y == 0), settings.strict, 1.0)
-    believed = np.zeros(len(y))
-    for train, test in folds(building, settings.folds, t.ordinary):
-        train = train[certain[train]]
-        left_out = fitted(x[train], y[train] > 0, BELIEF_VECTOR, settings.winner_strength, weight[train])
-        believed[test] = 1 / (1 + np.exp(-logits(left_out, x[test])))
-    winner = fitted(x[certain], y[certain] > 0, BELIEF_VECTOR, settings.winner_strength, weight[certain])
-    same_kind = np.array([is_flat(t.rows[i]) == flat for i, _ in first], bool)
-    scored = [t.rows[i] for (i, _), so in zip(first, same_kind, strict=True) if so]
-    wrong = certain & (y == 0)
-    kinds = fitted_kinds(x[wrong], truth[wrong], weight[wrong], settings.kinds_strength)
-    fit_of = {"pairs": int(sum(t.trains[i] for i, _ in first)), "pose": pose, "bent": bent, "winner": winner, "kinds": kinds}
-    return fit_of, (scored, np.minimum(believed[: len(first)], share)[same_kind], y[: len(first)][same_kind])
+    return Winners([t.rows[i] for i, _ in both], is_first, y, *columns, building, weight, trains)
+
+
+def fit_verdict(w: Winners, flat: bool, ordinary: int, settings: MergeBelief) -> tuple[dict[str, Any], Array]:
+    """The models of the verdict, and (n,) what those of other buildings believe.
+
+    Places of one plan (`is_same_plan`) train the model that tells them by furniture (``plan``) and no other one: they are an
+    alternative with a likelihood of its own, and how much walls agree is no evidence against it.
+    """
+    alike = np.array([is_same_plan(row) for row in w.rows]) & (w.y == 0)
+    of_plan, other = w.trains & (alike | (w.y == 1)), w.trains & ~alike
+    truth = np.array([what_it_is(row, int(label)) for row, label in zip(w.rows, w.y, strict=True)])
+    weight = prior_weights(truth, w.weight * other) * np.where(flat & (w.y == 0), settings.strict, 1.0)
+    balance = plan_weights(alike, w.weight * of_plan)
+    shipped = model()["flat" if flat else "solid"] if settings.refit == "plan" else {}
+
+    def fit_place(rows: Array) -> dict[str, Any]:
+        rows = rows[other[rows]]
+        fresh = None if shipped else fitted(w.x[rows], w.y[rows] > 0, BELIEF_VECTOR, settings.winner_strength, weight[rows])
+        return fresh or dict(shipped["winner"])
+
+    def fit_plan(rows: Array) -> dict[str, Any]:
+        rows = rows[of_plan[rows]]
+        return fitted(w.plan[rows], w.y[rows] > 0, PLAN_VECTOR, settings.plan_strength, balance[rows])
+
+    believed = np.zeros(len(w.y))
+    for train, test in folds(w.building, settings.folds, ordinary):
+        against = np.exp(-logits(fit_place(train), w.x[test])) + np.exp(-logits(fit_plan(train), w.plan[test]))
+        believed[test] = 1 / (1 + against)
+    every, wrong = np.arange(len(w.y)), other & (w.y == 0)
+    kinds = shipped.get("kinds") or fitted_kinds(w.x[wrong], truth[wrong], weight[wrong], settings.kinds_strength)
+    return {"winner": fit_place(every), "kinds": kinds, "plan": fit_plan(every)}, believed
 
 
 def belief_scores(rows: Sequence[dict[str, Any]], believed: Array, true: Array, threshold: float) -> dict[str, float]:
@@ -242,8 +308,9 @@ def judge(settings: MergeBelief, file: Path, say: Say) -> dict[str, Any]:
         for i, row in enumerate(of):
             if (first := best(t, scores, models["bent"], i)) is not None:
                 odds = float(logits(models["winner"], first[1][None])[0])
+                by_plan = float(logits(models["plan"], first[3][None])[0])
                 scored_rows.append(row)
-                believed.append(min(1 / (1 + np.exp(-odds)), first[2]))
+                believed.append(min(1 / (1 + np.exp(-odds) + np.exp(-by_plan)), first[2]))
                 true.append(t.y[first[0]])
     if not scored_rows:
         raise InputError(f"{settings.heldout.name}: no pair has a hypothesis that can be judged")

@@ -34,8 +34,8 @@ def check_task(settings: TaskSettings) -> None:
         raise InputError(f"half must be 0, 1 or 2, not {settings.half}")  # type: ignore[attr-defined]
     if isinstance(settings, MergeBelief) and settings.lookalikes not in LOOKALIKES_TAKEN:
         raise InputError(f"lookalikes must be {', '.join(LOOKALIKES_TAKEN)}, not {settings.lookalikes!r}")
-    if isinstance(settings, MergeBelief) and settings.refit not in ("all", "closely"):
-        raise InputError(f"refit must be all or closely, not {settings.refit!r}")
+    if isinstance(settings, MergeBelief) and settings.refit not in ("all", "closely", "plan"):
+        raise InputError(f"refit must be all, closely or plan, not {settings.refit!r}")
     if getattr(settings, "accelerator", "cpu") not in ("cpu", "cuda"):
         raise InputError(f"accelerator must be cpu or cuda, not {settings.accelerator!r}")  # type: ignore[attr-defined]
     if len(getattr(settings, "halves", [])) not in (0, 2):

@@ -59,13 +59,14 @@ class PlaceEvidence(RasterTask):
 class MergeBelief(TaskSettings):
     """Args:
     hypotheses: of a pair; inspected: how many of them are looked at more closely.
-    pose_strength, winner_strength, kinds_strength: of the models; the smaller, the simpler.
+    pose_strength, winner_strength, kinds_strength, plan_strength: of the models; the smaller, the simpler.
     missed: weight of a pair whose right hypothesis is taken away.
     strict: weight of a wrong hypothesis where a slice or a drawing hides what tells storeys apart: rather refused than wrong.
     folds: of buildings, for the scores.
     floor: weight of a pair of the development floor; 0: it is not fitted to.
     risk: false merges in a thousand pairs, drawn by the stated priors, that the threshold allows.
-    refit: all, or closely (the models that rank rigid poses stay as they are).
+    refit: all; closely (the models that rank rigid poses stay as they are); or plan (only the one of places of one plan is made
+        anew, and the risks are measured).
     halves: runs of `place_evidence` on one half of the buildings each (half=1, half=2); a pair is judged by the network
         that did not see its building. Empty: by the one that ships.
     lookalikes: none, judged (left-out models are tried on them) or fitted (they train, too; `belief_lookalikes`).
@@ -81,6 +82,7 @@ class MergeBelief(TaskSettings):
     pose_strength: float = 1.0
     winner_strength: float = 0.3
     kinds_strength: float = 0.03
+    plan_strength: float = 1.0
     missed: float = 0.2
     strict: float = 1.25
     folds: int = 8
