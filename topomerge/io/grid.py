@@ -24,7 +24,7 @@ from topomerge.errors import InputError
 from topomerge.io.grey_levels import find_grey_levels, is_clear_cut, surrounds
 from topomerge.io.grid_doubts import doubt_outside, is_inverted
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, Piece, damaged, too_many
+from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, Piece, damaged, refuse_pointer, too_many
 from topomerge.types import Array
 
 PIXELS = 100_000_000  # more is refused
@@ -107,7 +107,8 @@ def read_yaml(path: Path) -> Plan:
     if mode not in MODES or negate not in (0, 1) or not resolution > 0:
         wrong = f"mode {_shown(mode)}, negate {_shown(negate)} or resolution {resolution:g}"
         raise InputError(f"{path}: {wrong} can't be used; mode is one of {', '.join(MODES)}, negate 0 or 1, resolution above 0")
-    occupied, free = _number(path, values, "occupied_thresh", 0.65), _number(path, values, "free_thresh", 0.196)
+    thresholds = (_number(path, values, *known) for known in (("occupied_thresh", 0.65), ("free_thresh", 0.196)))
+    occupied, free = (min(max(value, -1.0), 2.0) for value in thresholds)  # beyond 0 to 1 all are alike
     return Plan(image, resolution, (x, y, yaw), bool(negate), occupied, free, mode, said)
 
 
@@ -158,6 +159,7 @@ def read_image(path: Path) -> tuple[Array, Array]:
     """
     from PIL import Image, UnidentifiedImageError
 
+    refuse_pointer(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # our own limit is stricter than the library's warning
@@ -204,10 +206,14 @@ def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
         free, said = _without_unknown(path, image, plan, occupied, free)
         doubts += [said] if said else []
     if is_inverted(occupied, free, plan.resolution):
-        advice = f"set negate: {1 - plan.negate}" if path != plan.image else "invert it, or give a map_server yaml with negate: 1"
-        doubts.append(f"{plan.image.name}: {occupied.mean():.0%} of the picture counts as wall; are its colours inverted? {advice}")
+        advice = (
+            f"set negate: {1 - plan.negate}" if path != plan.image else "invert it, or give a yaml of map_server with negate: 1"
+        )
+        wall = f"{occupied.mean():.0%} of the picture counts as wall"
+        doubts.append(f"{plan.image.name}: {wall}; are its colours inverted? {advice}")
     for doubt in doubt_outside(occupied, free, plan.resolution):
-        doubts.append(f"{plan.image.name}: {doubt}; if nobody saw it, lower free_thresh below its grey, or paint it grey (205)")
+        advice = "if nobody saw it, lower free_thresh below its grey, or paint it in the grey of unknown (205)"
+        doubts.append(f"{plan.image.name}: {doubt}; {advice}")
     return occupied, free, tuple(doubts)
 
 

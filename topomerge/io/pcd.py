@@ -158,10 +158,15 @@ def _colors(rows: Array) -> Array | None:
 
 def _pose(viewpoint: tuple[float, ...]) -> Array | None:
     """(1, 4, 4) pose of the sensor; None for the default, which says nothing."""
-    norm = float(np.linalg.norm(viewpoint[3:]))
-    if viewpoint == (0, 0, 0, 1, 0, 0, 0) or not np.isfinite(viewpoint).all() or norm == 0:
+    if viewpoint == (0, 0, 0, 1, 0, 0, 0) or not np.isfinite(viewpoint).all() or not any(viewpoint[3:]):
         return None
-    return pose(np.array(viewpoint[3:]) / norm, np.array(viewpoint[:3]))[None]
+    return pose(unit_quaternion(np.array(viewpoint[3:])), np.array(viewpoint[:3]))[None]
+
+
+def unit_quaternion(quaternion: Array) -> Array:
+    """The quaternion (4,), of any length but 0, as one of length 1."""
+    scaled = quaternion / np.abs(quaternion).max()  # its length may be beyond any number
+    return scaled / np.linalg.norm(scaled)
 
 
 def pose(quaternion: Array, translation: Array) -> Array:

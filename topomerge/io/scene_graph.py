@@ -41,7 +41,7 @@ def pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> Iterat
         )
     vertices = _table(path, mesh["points"], "points")
     faces = _table(path, mesh.get("faces") or np.zeros((0, 3)), "faces")
-    if not np.isfinite(faces).all() or (faces != np.round(faces)).any():
+    if not (np.abs(faces) < len(vertices)).all() or (faces != np.round(faces)).any():  # so of nan, too
         raise damaged(path, GRAPH_KIND, "a face of its mesh names a vertex that does not exist")
     colors = _colors(path, mesh, len(vertices))
     yield Piece(vertices, colors, done=0.5)
