@@ -13,22 +13,26 @@ JUDGED_FLOOR = 4.0  # m2 of floor below which nothing is judged
 OUTSIDE_SHARE = 1 / 3  # of the floor: more outside of every wall is suspicious; of real maps that are read rightly up to .26 is
 FEW_WALLS = 4  # of 8 directions in which a place outside of the walls meets one, at most
 PIXELS_LOOKED_AT = 4_000_000  # of a larger picture every second, third ... pixel
-WALL_SHARE = 0.5  # of the picture: where more counts as wall, its colours may be inverted
 BODY_RADIUS = 0.25  # m; floor where no body fits is no floor but the lines of walls
-WIDE_SHARE = 0.1  # of the floor of an inverted picture is as far from what is no floor, at most
+NARROW, WIDE = 0.1, 0.3  # of the pixels of walls, at most, and of floor, at least, that lie deeper than that in what is like them
 
 
 def is_inverted(occupied: Array, free: Array, resolution: float) -> bool:
-    """Is most of the picture wall, and what is floor as narrow as the lines of walls?
+    """Is what counts as floor as narrow as the lines of walls, and what counts as wall as wide as a floor?
 
     Args:
         occupied, free: (h, w) bool.
         resolution: m a pixel.
     """
-    if occupied.mean() <= WALL_SHARE or not free.any():
+    if occupied.sum() <= free.sum() or not free.any():  # there is more floor than walls
         return False
-    far = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1][free] * resolution
-    return bool((far > BODY_RADIUS).mean() <= WIDE_SHARE)
+    return _deep(free, resolution) <= NARROW and _deep(occupied, resolution) >= WIDE
+
+
+def _deep(mask: Array, resolution: float) -> float:
+    """Share of the pixels of a mask (h, w) that lie deeper in it than `BODY_RADIUS`."""
+    inside = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1][mask]
+    return float((inside * resolution > BODY_RADIUS).mean())
 
 
 def doubt_outside(occupied: Array, free: Array, resolution: float) -> list[str]:
