@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,20 @@ def test_a_negated_picture_and_one_of_16_bits(tmp_path: Path) -> None:
     _, free, said = read(write(tmp_path, picture.astype(np.uint16) * 257, "map.png", "free_thresh: 0.3\n"))
     np.testing.assert_array_equal(free, picture == FLOOR)
     assert len(said) == 1
+
+
+def test_numbers_that_are_none_are_unknown(tmp_path: Path) -> None:
+    picture = two_rooms().astype(np.float32)
+    picture[picture == UNKNOWN] = np.nan
+    picture[0, :5] = np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        occupied, free, said = read(write(tmp_path, picture, "map.tif"))
+        np.testing.assert_array_equal(occupied, picture == WALL)
+        np.testing.assert_array_equal(free, picture == FLOOR)
+        assert said == ()
+        with pytest.raises(InputError, match="shows neither floor nor walls"):
+            read(write(tmp_path, np.full((9, 9), np.nan, np.float32), "map.tif"))
 
 
 def test_transparent_pixels_are_not_counted(tmp_path: Path) -> None:

@@ -170,7 +170,8 @@ def read_image(path: Path) -> tuple[Array, Array]:
                     raise InputError(f"{path}: has {width} x {height} pixels and {limit}; crop it or make it smaller")
                 if image.mode.startswith(("I", "F")):
                     values = np.array(image, np.float32)
-                    values /= 65535.0 if image.mode.startswith("I") else max(float(np.nanmax(values)), 1.0)
+                    values[~np.isfinite(values)] = np.nan
+                    values /= 65535.0 if image.mode.startswith("I") else np.fmax.reduce(values, axis=None, initial=1.0)
                     return values, np.zeros(values.shape, bool)
                 kind = "RGBA" if image.has_transparency_data else "L" if image.mode in ("1", "L") else "RGB"
                 rgba = np.asarray(image if image.mode == kind else image.convert(kind))
@@ -220,8 +221,9 @@ def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
 def _without_unknown(path: Path, image: tuple[Array, Array], plan: Plan, occupied: Array, free: Array) -> tuple[Array, str]:
     """The free pixels without those that are unknown by their grey, and the warning about them, "" for none."""
     bright, clear = image
-    counted = ~(occupied | clear)
-    levels = np.rint((1.0 - bright if plan.negate else bright) * 255.0).astype(np.uint8)
+    counted = ~(occupied | clear | np.isnan(bright))
+    levels = np.round(np.nan_to_num(bright.clip(0.0, 1.0)) * 255.0).astype(np.uint8)
+    levels = 255 - levels if plan.negate else levels
     with plan.image.open("rb") as stream:
         lossy = stream.read(len(JPEG_MAGIC)) == JPEG_MAGIC
     grey = find_grey_levels(levels[counted], lossy)

@@ -26,6 +26,10 @@ def is_inverted(occupied: Array, free: Array, resolution: float) -> bool:
     """
     if occupied.sum() <= free.sum() or not free.any():  # there is more floor than walls
         return False
+    step = max(1, math.ceil(math.sqrt(occupied.size / PIXELS_LOOKED_AT)))
+    occupied, free, resolution = occupied[::step, ::step], free[::step, ::step], resolution * step
+    if not (occupied.any() and free.any()):
+        return False
     return _deep(free, resolution) <= NARROW and _deep(occupied, resolution) >= WIDE
 
 
