@@ -143,6 +143,16 @@ def test_a_link_out_of_its_folder_shows_nothing(tmp_path: Path) -> None:
     assert "swordfish" not in refusal_of(walk / "a.xyz")
 
 
+@pytest.mark.parametrize("text", ["swordfish: [x\n  y: }\n", "swordfish:x:0\n"])
+def test_a_linked_index_of_a_bag_shows_nothing(tmp_path: Path, text: str) -> None:
+    pytest.importorskip("rosbags")
+    (tmp_path / "secret").write_text(text)
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "metadata.yaml").symlink_to(tmp_path / "secret")
+    (tmp_path / "walk" / "walk.db3").write_bytes(b"SQLite format 3\0")
+    assert "swordfish" not in refusal_of(tmp_path / "walk")
+
+
 @pytest.mark.parametrize("value", ["1e300", "-1e300", "1e200", "1e31", "inf", "nan"])
 @pytest.mark.parametrize("column", [0, 3])
 def test_poses_beyond_any_number(tmp_path: Path, value: str, column: int) -> None:

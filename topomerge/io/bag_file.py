@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.errors import InputError
-from topomerge.io.piece import damaged
+from topomerge.io.piece import damaged, leads_outside
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
 BAG_KIND = "a ROS bag"
@@ -130,6 +130,14 @@ class Bag:
         return self._store.deserialize_ros1(data, kind) if first else self._store.deserialize_cdr(data, kind)
 
 
+def _reason(path: Path, error: Exception) -> str:
+    """What the library says, unless it may quote what a link out of the bag's folder points to."""
+    about = path / "metadata.yaml"
+    if leads_outside(path) or (path.is_dir() and about.exists() and leads_outside(about)):
+        return type(error).__name__
+    return " ".join(str(error).split())[:160] or type(error).__name__
+
+
 @contextmanager
 def _index_faults(path: Path) -> Iterator[None]:
     """Turns what the library says of a bag whose index it can't follow into an error that says what helps."""
@@ -138,10 +146,10 @@ def _index_faults(path: Path) -> Iterator[None]:
     except (InputError, OSError, MemoryError):
         raise
     except Exception as error:
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        reason = _reason(path, error)
         file = path if path.is_file() else next(iter(bag_files(path)), path)
         if file.is_file() and not _start(file).startswith(BAG_STARTS.get(file.suffix, b"")):
-            raise damaged(path, BAG_KIND, error) from error
+            raise damaged(path, BAG_KIND, reason) from error
         tool = BAG_TOOLS.get(file.suffix, "ros2 bag reindex")
         wrong = f"its index does not fit its records, or it is cut short ({reason})"
         raise InputError(f"{path}: {wrong}; copy it again, or run `{tool}` on a copy") from error
@@ -171,7 +179,7 @@ def _readers(path: Path) -> list[Any]:
     try:
         return [Reader2(file) for file in files]
     except Exception as error:
-        raise damaged(path, BAG_KIND, error) from error
+        raise damaged(path, BAG_KIND, _reason(path, error)) from error
 
 
 def _start(file: Path) -> bytes:

@@ -62,7 +62,7 @@ def outside_share(occupied: Array, free: Array) -> float:
     if step > 1:  # no wall may be lost, or it would not enclose anything
         padded = np.pad(occupied, [(0, -side % step) for side in occupied.shape])
         rows, columns = padded.shape
-        occupied = padded.reshape(rows // step, step, columns // step, step).any(axis=(1, 3))
+        occupied = np.logical_or.reduce(padded.reshape(rows // step, step, columns // step, step), axis=(1, 3))
         free = free[::step, ::step] & ~occupied
     met = np.zeros(free.shape, np.uint8)
     for back in (1, -1):

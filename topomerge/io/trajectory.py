@@ -137,7 +137,8 @@ def _kitti(path: Path, numbers: Array, rows: Array) -> Trajectory:
 def no_rotations(poses: Array) -> Array:
     """Rows of the poses whose upper left part turns nothing, or mirrors."""
     turns = poses[:, :3, :3]
-    turning = (np.abs(turns) <= 1.0 + UNIT_TOLERANCE).all(axis=(1, 2))  # others may be too large to be multiplied, or no numbers
+    small = np.abs(turns) <= 1.0 + UNIT_TOLERANCE  # others may be too large to be multiplied, or no numbers
+    turning: Array = np.logical_and.reduce(small, axis=(1, 2))
     fits = turns[turning]
     off = np.abs(fits @ fits.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     turning[turning] = (off <= UNIT_TOLERANCE) & (np.linalg.det(fits) > 0)
