@@ -92,11 +92,17 @@ def too_many(path: Path, count: float, spacing: float) -> InputError:
     )
 
 
+def single(values: Array) -> Array:
+    """The values as float32; what is beyond its reach is infinite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(np.float32)
+
+
 def bytes8(colors: Array) -> Array:
     """(n, 3) uint8 colours from bytes, 16-bit integers or floats in 0..1 or 0..255."""
     if colors.dtype == np.uint8 or not len(colors):
         return np.ascontiguousarray(colors, np.uint8)
-    values = np.nan_to_num(colors.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    values = np.nan_to_num(single(colors), nan=0.0, posinf=0.0, neginf=0.0)
     top = float(values.max())
     if np.issubdtype(colors.dtype, np.floating) and top <= 1.0:
         values = values * 255.0
