@@ -81,7 +81,7 @@ def read_flat(path: Path, resolution: float | None = None, rays: bool = True) ->
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the folder")
     plan = grid.read_yaml(path) if resolution is None else grid.Plan(path, resolution)
-    occupied, free = grid.classify(grid.read_image(plan.image), plan)
+    occupied, free, _ = grid.read_pixels(path, plan)
     return from_masks(occupied, free, plan.resolution, plan.origin, rays, source=path.name)
 
 

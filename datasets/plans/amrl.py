@@ -25,6 +25,7 @@ FRONT_GAP = 5.0  # m; wider gaps in the outer walls make what lies behind them o
 LINE_MAP_MARGIN = FRONT_GAP  # m of outside around the map
 SMALLEST_LINE_ROOM = 1.5  # m2 of a room
 LINE_MAP_CAVITY = 0.5  # m; narrower space lies within the walls
+LINE_MAP_REACH = 1e9  # m from the origin that a wall may be
 LINE_MAP_BYTES, LINE_MAP_CELLS = 50 << 20, 50_000_000
 
 
@@ -90,6 +91,9 @@ def _outdoor(labels: Array, free: Array, wall: Array) -> Array:
 
 def _drawn(lines: Array) -> tuple[Array, Array]:
     """(h, w) bool raster of the walls, and its origin, m."""
+    reach = float(np.abs(lines).max())
+    if reach > LINE_MAP_REACH:
+        raise InputError(f"absurd scale: a map that reaches {reach:.3g} m")
     low, high = lines.min(axis=(0, 1)) - LINE_MAP_MARGIN, lines.max(axis=(0, 1)) + LINE_MAP_MARGIN
     shape = np.ceil((high - low) / LINE_MAP_CELL).astype(int)
     if shape.astype(float).prod() > LINE_MAP_CELLS:

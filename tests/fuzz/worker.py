@@ -8,6 +8,7 @@ It may die: of a fault in a native library, or by the hand of the driver, which 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import resource
 import sys
@@ -27,7 +28,32 @@ def _size() -> int:
     return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
 
 
+class Records(logging.Handler):
+    """The lines that libraries log: none may reach a terminal before the one that explains."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep what is not of this package."""
+        if not record.name.startswith("topomerge"):
+            self.lines.append(f"{record.name}: {record.getMessage()}")
+
+
 def attempt(path: Path) -> tuple[str, str]:
+    """(read | refused | fault, message) of reading a file; a fault, too, where a warning or a library's log line gets out."""
+    records = Records()
+    logging.getLogger().addHandler(records)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        answer = _read(path)
+    logging.getLogger().removeHandler(records)
+    said = [f"{w.category.__name__} at {Path(w.filename).name}:{w.lineno}: {w.message}" for w in caught] + records.lines
+    return ("fault", f"{said[0]} ({answer[0]})"[:500]) if said and answer[0] != "fault" else answer
+
+
+def _read(path: Path) -> tuple[str, str]:
     """(read | refused | fault, message) of reading a file."""
     try:
         return "read", str(reader(path)(path))
@@ -44,7 +70,6 @@ def attempt(path: Path) -> tuple[str, str]:
 
 def main(corpus: Path, folder: Path) -> None:
     """Warm up on the valid files, limit the memory, then do what is asked for."""
-    warnings.simplefilter("ignore")
     told = json.loads((folder / "names.json").read_text())
     data = {name: Path(path).read_bytes() for name, path in told["files"].items()}
     for name in told["tried"]:

@@ -11,6 +11,7 @@ import logging
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -125,10 +126,23 @@ def _drop_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _show_log(verbose: int, debug: bool) -> None:
+    """Show what this package logs; what libraries log or warn of, in words of theirs, only to those who look for a fault."""
+    if not logging.getLogger().handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("topomerge: %(message)s"))
+        if not debug:
+            handler.addFilter(logging.Filter("topomerge"))
+        logging.getLogger().addHandler(handler)
+    level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    logging.getLogger("topomerge").setLevel(level)
+    if not debug and not sys.warnoptions:
+        warnings.simplefilter("ignore")
+
+
 def _run(args: argparse.Namespace) -> int:
     debug = args.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
-    logging.basicConfig(format="topomerge: %(message)s")
-    logging.getLogger("topomerge").setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[min(args.verbose, 2)])
+    _show_log(args.verbose, debug)
     try:
         status = int(args.run(args))
         with printing():

@@ -12,8 +12,12 @@ from topomerge.extraction.flying_cells import without_flying_cells
 from topomerge.extraction.gaps import bridge_gaps
 from topomerge.extraction.parameters import SharedParameters
 from topomerge.extraction.scan import Scan, reasons
+from topomerge.extraction.slices import is_raised
 from topomerge.extraction.unobstructed import unobstructed
 from topomerge.types import Array, VoxelGrid
+
+CLOUD_ADVICE = "check --up and --unit, or take larger voxels if the points are sparse"
+PLAN_ADVICE = "check the map's resolution, its thresholds and negate, and that its free floor is white"
 
 
 def navigable_volume(scan: Scan, p: SharedParameters) -> tuple[Scan, VoxelGrid]:
@@ -51,9 +55,9 @@ def _navigable(grid: VoxelGrid, p: SharedParameters, places: Array = NOWHERE) ->
     dilated = dilate_upwards(standing, p.dilation)  # 2.3.2
     navigable = largest_component(dilated) if p.largest_only else floor_components(dilated)  # 2.3.3
     if not len(navigable):
+        check = PLAN_ADVICE if is_raised(grid) else CLOUD_ADVICE
         raise InputError(
-            f"no floor found: nowhere is an area of 1 m2 with {p.standing_height:g} m of empty space above it; check "
-            "--up and --unit, or take larger voxels if the points are sparse"
+            f"no floor found: nowhere is an area of 1 m2 with {p.standing_height:g} m of empty space above it; {check}"
         )
     return navigable
 

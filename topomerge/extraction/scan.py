@@ -74,8 +74,8 @@ def read_scan(
         least_neighbours: that the median cell has, of 26; the cells are doubled until it has them. 0: never.
 
     Raises:
-        InputError: no finite point, hardly any cells, an absurd extent, cells of a size that shows no rooms and doors, or a path
-            or a list in place of points.
+        InputError: no finite point, hardly any cells, an absurd extent, cells of a size that shows no rooms and doors, or a path,
+            a list or an array of another shape in place of points.
     """
     if isinstance(source, str | Path):
         raise InputError(f"{source}: extract takes points, not the name of a file; read it with read_points or read_chunks")
@@ -87,7 +87,7 @@ def read_scan(
         return Scan(source, source if "offset" in source.properties and edge <= LEAST_FINE * FINE_CELL else None)
     parts = max(round(edge / FINE_CELL), 1)
     fine = LatticeCells(edge / parts, MOST_FINE_CELLS) if parts > 1 else None
-    chunks = _Chunks([PointCloud(source)] if isinstance(source, np.ndarray) else source, fine)
+    chunks = _Chunks([_cloud_of(source)] if isinstance(source, np.ndarray) else source, fine)
     with reasons(chunks.warnings):
         grid = voxelise(chunks, edge, chunks.warnings)
         if len(grid) * edge < SHORTEST_ROW:
@@ -99,6 +99,14 @@ def read_scan(
     if least_neighbours:
         grid = without_gaps(grid, least_neighbours, chunks.warnings)
     return Scan(grid, close, chunks.rays, chunks.shades.all(), chunks.free, chunks.source, tuple(chunks.warnings))
+
+
+def _cloud_of(points: Array) -> PointCloud:
+    """A cloud of an array from the user."""
+    try:
+        return PointCloud(points)
+    except ValueError as error:
+        raise InputError(f"extract: {error}; give x, y and z of each point, in metres") from error
 
 
 @contextmanager

@@ -17,6 +17,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
+from topomerge.io.piece import refuse_pointer
 from topomerge.types import Array
 
 DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can tell
@@ -78,6 +79,7 @@ def _archive_of(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int
     if path.exists() and not path.is_file():  # to open a pipe would wait for ever
         raise InputError(f"{path}: is no regular file (a pipe or a device), not a {kind}; name a file")
     try:
+        refuse_pointer(path)
         with path.open("rb") as file:
             start = file.read(4)
             if not start:

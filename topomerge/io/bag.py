@@ -20,6 +20,7 @@ from topomerge.io.bag_file import BAG_KIND, Bag, Message, Topic
 from topomerge.io.bag_messages import LASER_SCAN, OCCUPANCY_GRID, POINT_CLOUD, cloud_points, laser_points, occupancy_plan, stamp
 from topomerge.io.bag_poses import SensorPoses, sensor_poses
 from topomerge.io.grid import classify, extrude
+from topomerge.io.grid_doubts import doubt_outside
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import Piece, damaged
 from topomerge.io.posed import PosedScan, pieces
@@ -93,6 +94,8 @@ def _map(bag: Bag, topic: Topic, options: ReadOptions) -> Iterator[Piece]:
     assert newest is not None
     image, plan = occupancy_plan(bag.path, newest)
     occupied, free = classify(image, plan)
+    outside = [f"{bag.path}: {doubt}; is unknown (-1) 0 in this map?" for doubt in doubt_outside(occupied, free, plan.resolution)]
+    yield Piece(np.empty((0, 3)), warnings=(*plan.warnings, *outside))
     yield from extrude(bag.path, occupied, free, plan, options)
 
 

@@ -5,20 +5,23 @@ Only messages of common types are decoded, by their definitions of ROS itself: t
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from heapq import merge
 from pathlib import Path
 from typing import Any
 
 from topomerge.errors import InputError
-from topomerge.io.piece import damaged
+from topomerge.io.piece import damaged, leads_outside
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
 BAG_KIND = "a ROS bag"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 SAME_LAYOUT = {"tf/msg/tfMessage": TRANSFORMS}  # of ROS 1, before tf2
+BAG_STARTS = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP", ".db3": b"SQLite format 3"}
+BAG_TOOLS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # that make a new index
 MOST_LISTED = 12  # topics in a message
 
 
@@ -60,7 +63,10 @@ class Bag:
 
     def __enter__(self) -> Bag:
         try:
-            self.readers = [self._stack.enter_context(reader) for reader in _readers(self.path)]
+            self.readers = []
+            for file, reader in zip(bag_files(self.path), _readers(self.path), strict=True):
+                with _index_faults(file):
+                    self.readers.append(self._stack.enter_context(reader))
         except BaseException:
             self._stack.close()
             raise
@@ -100,7 +106,7 @@ class Bag:
         for reader in self.readers:
             chosen = [c for c in reader.connections if c.topic in numbers]
             streams += [reader.messages(connections=chosen)] if chosen else []
-        for connection, nanoseconds, data in merge(*streams, key=lambda m: m[1]):
+        for connection, nanoseconds, data in self._recorded(streams):
             numbers[connection.topic] += 1
             message = Message(connection.topic, numbers[connection.topic], nanoseconds * 1e-9, None)
             try:
@@ -109,9 +115,44 @@ class Bag:
                 raise message.fault(self.path, f"can't be decoded ({type(error).__name__})") from error
             yield Message(message.topic, message.number, message.recorded, content)
 
+    def _recorded(self, streams: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        """Connection, time (ns) and bytes of the messages of some streams, in the order of their times."""
+        merged = merge(*streams, key=lambda m: m[1])
+        while True:
+            with _index_faults(self.path):
+                message = next(merged, None)
+            if message is None:
+                return
+            yield message
+
     def _decode(self, data: bytes, kind: str) -> Any:
         first = type(self.readers[0]).__module__.startswith("rosbags.rosbag1")
         return self._store.deserialize_ros1(data, kind) if first else self._store.deserialize_cdr(data, kind)
+
+
+def _reason(path: Path, error: Exception) -> str:
+    """What the library says, unless it may quote what a link out of the bag's folder points to."""
+    about = path / "metadata.yaml"
+    if leads_outside(path) or (path.is_dir() and about.exists() and leads_outside(about)):
+        return type(error).__name__
+    return " ".join(str(error).split())[:160] or type(error).__name__
+
+
+@contextmanager
+def _index_faults(path: Path) -> Iterator[None]:
+    """Turns what the library says of a bag whose index it can't follow into an error that says what helps."""
+    try:
+        yield
+    except (InputError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        reason = _reason(path, error)
+        file = path if path.is_file() else next(iter(bag_files(path)), path)
+        if file.is_file() and not _start(file).startswith(BAG_STARTS.get(file.suffix, b"")):
+            raise damaged(path, BAG_KIND, reason) from error
+        tool = BAG_TOOLS.get(file.suffix, "ros2 bag reindex")
+        wrong = f"its index does not fit its records, or it is cut short ({reason})"
+        raise InputError(f"{path}: {wrong}; copy it again, or run `{tool}` on a copy") from error
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -130,13 +171,29 @@ def _readers(path: Path) -> list[Any]:
     if files[0].suffix == ".bag":
         from rosbags.rosbag1 import Reader as Reader1
 
+        for file in files:
+            _refuse_old_format(file)
         return [Reader1(file) for file in files]
     from rosbags.rosbag2 import Reader as Reader2
 
     try:
         return [Reader2(file) for file in files]
     except Exception as error:
-        raise damaged(path, BAG_KIND, error) from error
+        raise damaged(path, BAG_KIND, _reason(path, error)) from error
+
+
+def _start(file: Path) -> bytes:
+    """The first bytes, which name the format."""
+    with file.open("rb") as stream:
+        return stream.read(32)
+
+
+def _refuse_old_format(file: Path) -> None:
+    """Refuse a bag of ROS before 2010, which the library does not read."""
+    match = re.match(rb"#ROSBAG V(\d{1,3}\.\d{1,3})\s", _start(file))
+    if match and match[1] != b"2.0":
+        version = match[1].decode()
+        raise InputError(f"{file}: is a bag of format {version}, not 2.0; convert it with `rosbag fix old.bag new.bag` of ROS 1")
 
 
 def _typestore(readers: list[Any]) -> Any:

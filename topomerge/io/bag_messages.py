@@ -49,7 +49,8 @@ def cloud_points(path: Path, message: Message) -> tuple[Array, Array | None]:
     layout = np.dtype({"names": names, "formats": kinds, "offsets": [offsets[n][0] for n in names], "itemsize": step})
     rows = data[: height * row].reshape(height, row)[:, : width * step].reshape(height * width, step)
     points = np.ascontiguousarray(rows).view(layout)[:, 0] if len(rows) else np.empty(0, layout)
-    xyz = np.stack([points[n].astype(np.float64) for n in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # a damaged number may be a nan that warns
+        xyz = np.stack([points[n].astype(np.float64) for n in "xyz"], axis=1)
     name = next((n for n in ("rgb", "rgba") if n in names and layout[n].itemsize == 4), None)
     if name is None:
         return xyz, None
@@ -85,8 +86,14 @@ def occupancy_plan(path: Path, message: Message) -> tuple[tuple[Array, Array], P
         raise message.fault(path, f"has {len(cells):,} cells for {height} x {width}")
     place, turn = info.origin.position, info.origin.orientation
     yaw = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
+    said: tuple[str, ...] = ()
+    if math.isnan(yaw):
+        yaw, said = (
+            0.0,
+            (f"{path}: the map on {message.topic} is turned by a quaternion that is no number; it was read as no turn",),
+        )
     if not (info.resolution > 0 and np.isfinite((info.resolution, place.x, place.y, yaw)).all()):
         raise message.fault(path, f"has a resolution of {info.resolution:g} m or an origin that can't be used")
     values = cells.reshape(height, width)[::-1]  # the first row of a grid is the lowest, of an image the highest
-    plan = Plan(path, float(info.resolution), (float(place.x), float(place.y), yaw))
+    plan = Plan(path, float(info.resolution), (float(place.x), float(place.y), yaw), warnings=said)
     return (1.0 - values.clip(0, 100) / np.float32(100), values < 0), plan

@@ -11,6 +11,9 @@ LARGE, HIGH = 2000.0, 100.0  # m, extents beyond what is scanned as one building
 SLAB_THICKNESS = 0.1  # m
 STOREY_HEIGHT = 4.5  # m
 LOWEST_ROOM, HIGHEST_ROOM = 2.0, 3.6  # m, usual heights of a room
+DEGREES_ACROSS = 0.1  # degrees, 11 km: no scan of a building is as wide
+DEGREES_TALLER = 20.0  # times as tall (m) as across (degrees): no building in metres is
+DEGREES_AWAY = 1.0  # degrees from 0, 0, which lies in the sea
 JUDGED_POINTS = 200  # points below which nothing is judged
 
 
@@ -47,7 +50,20 @@ def warn_about(points: Array, up: str | None) -> list[str]:
     low, high = np.percentile(points, (1, 99), axis=0)
     if up is None:
         return _unit_warning(high - low, ())
-    return _unit_warning(high - low, (("mm", 0.001), ("cm", 0.01))) or _up_warning(points, low, high, up)
+    units = (("mm", 0.001), ("cm", 0.01))
+    return _degrees_warning(low, high) or _unit_warning(high - low, units) or _up_warning(points, low, high, up)
+
+
+def _degrees_warning(low: Array, high: Array) -> list[str]:
+    """Are x and y longitude and latitude, and only z a length?"""
+    across, tall = float((high - low)[:2].max()), float(high[2] - low[2])
+    on_earth = bool((np.abs((low, high))[:, :2] <= 180.0).all() and (np.abs((low, high))[:, :2].min(axis=1) <= 90.0).all())
+    if not (0 < across <= DEGREES_ACROSS and tall >= DEGREES_TALLER * across and on_earth):
+        return []
+    if np.hypot(*low[:2]) < DEGREES_AWAY:
+        return []
+    x, y = (f"{axis} {low[k]:.5f} to {high[k]:.5f}" for k, axis in enumerate("xy"))
+    return [f"coordinates look like degrees of longitude and latitude ({x}, {y}): project them to metres first, as to UTM"]
 
 
 def _unit_warning(extent: Array, units: tuple[tuple[str, float], ...]) -> list[str]:

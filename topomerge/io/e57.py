@@ -17,7 +17,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.options import ReadOptions
-from topomerge.io.pcd import pose
+from topomerge.io.pcd import pose, unit_quaternion
 from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, read_head
 from topomerge.io.subprocess_reader import read_in_subprocess
 from topomerge.kernels.codecs import crc32c
@@ -72,8 +72,8 @@ def _pose(header: Any) -> Array:
     if not header.has_pose():
         return np.eye(4)
     quaternion = np.asarray(header.rotation, np.float64)
-    norm = float(np.linalg.norm(quaternion))
-    return pose(quaternion / norm if norm > 0 else np.array([1.0, 0, 0, 0]), np.asarray(header.translation, np.float64))
+    turn = unit_quaternion(quaternion) if quaternion.any() else np.array([1.0, 0, 0, 0])
+    return pose(turn, np.asarray(header.translation, np.float64))
 
 
 def _scan(path: Path, file: Any, header: Any) -> Iterator[tuple[Array, Array | None, Array | None, int]]:

@@ -2,7 +2,8 @@
 
 Occupied pixels beside others become walls, free pixels a floor at z = 0. Unknown pixels give nothing, nor does the inside of a
 solid area: a sensor sees surfaces, and many plans are black all around the building. The frame is map_server's: x right and y
-up from the lower left corner of the image, turned by the yaw of the origin and moved to it.
+up from the lower left corner of the image, turned by the yaw of the origin and moved to it. In a picture of three values the grey
+of unknown is unknown whatever the threshold says (`grey_levels`).
 Source: http://wiki.ros.org/map_server (values, thresholds and modes).
 """
 
@@ -20,8 +21,10 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
+from topomerge.io.grey_levels import find_grey_levels, is_clear_cut, surrounds
+from topomerge.io.grid_doubts import doubt_outside, is_inverted
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, Piece, damaged, too_many
+from topomerge.io.piece import BLOCK_POINTS, MOST_POINTS, Piece, damaged, refuse_pointer, too_many
 from topomerge.types import Array
 
 PIXELS = 100_000_000  # more is refused
@@ -30,6 +33,9 @@ IMAGES = (".pgm", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 # What those are by their content (PPM holds PGM): other plugins of Pillow start programs, as that of PostScript does.
 IMAGE_FORMATS = ("PPM", "PNG", "JPEG", "BMP", "TIFF")
 MODES = ("trinary", "scale", "raw")
+JPEG_MAGIC = b"\xff\xd8\xff"
+NOISE_SHARE = 0.05  # of the floor: less in a picture without loss are edges that somebody smoothed, and stay
+TOLD_SHARE = 0.01  # of the floor: more noise around the grey of unknown is told
 
 
 @dataclass(frozen=True)
@@ -58,8 +64,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         raise InputError(f"{path}: an image does not say how large a pixel is; give --resolution in metres a pixel{hint}")
     else:
         plan = Plan(path, options.resolution)
-    occupied, free = classify(read_image(plan.image), plan)
-    yield Piece(np.empty((0, 3)), warnings=plan.warnings, done=0.1)
+    occupied, free, doubts = read_pixels(path, plan)
+    yield Piece(np.empty((0, 3)), warnings=(*plan.warnings, *doubts), done=0.1)
     # The grid is metric already; only a --scale is left to undo in the lengths that are given in metres.
     yield from extrude(path, occupied, free, plan, options)
 
@@ -90,14 +96,28 @@ def read_yaml(path: Path) -> Plan:
     origin = values.get("origin", [0.0, 0.0, 0.0])
     if not isinstance(origin, list) or len(origin) < 2:
         raise InputError(f"{path}: origin is {_shown(origin)}; it is a list of x, y and yaw")
-    x, y, yaw = (_number(path, {"origin": v}, "origin", None) for v in [*origin, 0.0][:3])
+    x, y = (_number(path, {"origin": v}, "origin", None) for v in origin[:2])
+    yaw = 0.0
+    if len(origin) > 2 and _is_nan(origin[2]):  # map_saver writes that for a quaternion of zeros
+        said = (*said, f"{path.name}: the yaw of its origin is {_shown(origin[2])} and was read as 0; write 0 in its place")
+    elif len(origin) > 2:
+        yaw = _number(path, {"origin": origin[2]}, "origin", None)
     mode = values.get("mode", "trinary").lower()
     negate = values.get("negate", 0)
     if mode not in MODES or negate not in (0, 1) or not resolution > 0:
         wrong = f"mode {_shown(mode)}, negate {_shown(negate)} or resolution {resolution:g}"
         raise InputError(f"{path}: {wrong} can't be used; mode is one of {', '.join(MODES)}, negate 0 or 1, resolution above 0")
-    occupied, free = _number(path, values, "occupied_thresh", 0.65), _number(path, values, "free_thresh", 0.196)
+    thresholds = (_number(path, values, *known) for known in (("occupied_thresh", 0.65), ("free_thresh", 0.196)))
+    occupied, free = (min(max(value, -1.0), 2.0) for value in thresholds)  # beyond 0 to 1 all are alike
     return Plan(image, resolution, (x, y, yaw), bool(negate), occupied, free, mode, said)
+
+
+def _is_nan(value: object) -> bool:
+    """Is it the number that is none, as YAML or as C++ writes it (-nan)?"""
+    try:
+        return isinstance(value, str | float) and math.isnan(float(value))
+    except ValueError:
+        return False
 
 
 def _number(path: Path, values: dict[str, Any], key: str, default: float | None) -> float:
@@ -139,6 +159,7 @@ def read_image(path: Path) -> tuple[Array, Array]:
     """
     from PIL import Image, UnidentifiedImageError
 
+    refuse_pointer(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # our own limit is stricter than the library's warning
@@ -149,7 +170,8 @@ def read_image(path: Path) -> tuple[Array, Array]:
                     raise InputError(f"{path}: has {width} x {height} pixels and {limit}; crop it or make it smaller")
                 if image.mode.startswith(("I", "F")):
                     values = np.array(image, np.float32)
-                    values /= 65535.0 if image.mode.startswith("I") else max(float(np.nanmax(values)), 1.0)
+                    values[~np.isfinite(values)] = np.nan
+                    values /= 65535.0 if image.mode.startswith("I") else np.fmax.reduce(values, axis=None, initial=1.0)
                     return values, np.zeros(values.shape, bool)
                 kind = "RGBA" if image.has_transparency_data else "L" if image.mode in ("1", "L") else "RGB"
                 rgba = np.asarray(image if image.mode == kind else image.convert(kind))
@@ -165,8 +187,65 @@ def read_image(path: Path) -> tuple[Array, Array]:
     return bright, clear
 
 
+def read_pixels(path: Path, plan: Plan) -> tuple[Array, Array, tuple[str, ...]]:
+    """(h, w) bool occupied and free pixels of the image of a plan, and what is doubtful about them.
+
+    Args:
+        path: what the user named: the yaml, or the image itself.
+        plan: what it says.
+
+    Raises:
+        InputError: as `read_image`; or no pixel is occupied or free.
+    """
+    image = read_image(plan.image)
+    occupied, free = classify(image, plan)
+    if not occupied.any() and not free.any():
+        wrong = f"shows neither floor nor walls (free_thresh {plan.free:g}, occupied_thresh {plan.occupied:g})"
+        raise InputError(f"{path}: {wrong}; is free space white and are walls black? mend thresholds, negate or mode")
+    doubts: list[str] = []
+    if plan.mode == "trinary":
+        free, said = _without_unknown(path, image, plan, occupied, free)
+        doubts += [said] if said else []
+    if is_inverted(occupied, free, plan.resolution):
+        advice = (
+            f"set negate: {1 - plan.negate}" if path != plan.image else "invert it, or give a yaml of map_server with negate: 1"
+        )
+        wall = f"{occupied.mean():.0%} of the picture counts as wall"
+        doubts.append(f"{plan.image.name}: {wall}; are its colours inverted? {advice}")
+    for doubt in doubt_outside(occupied, free, plan.resolution):
+        advice = "if nobody saw it, lower free_thresh below its grey, or paint it in the grey of unknown (205)"
+        doubts.append(f"{plan.image.name}: {doubt}; {advice}")
+    return occupied, free, tuple(doubts)
+
+
+def _without_unknown(path: Path, image: tuple[Array, Array], plan: Plan, occupied: Array, free: Array) -> tuple[Array, str]:
+    """The free pixels without those that are unknown by their grey, and the warning about them, "" for none."""
+    bright, clear = image
+    counted = ~(occupied | clear | np.isnan(bright))
+    levels = np.round(np.nan_to_num(bright.clip(0.0, 1.0)) * 255.0).astype(np.uint8)
+    levels = 255 - levels if plan.negate else levels
+    with plan.image.open("rb") as stream:
+        lossy = stream.read(len(JPEG_MAGIC)) == JPEG_MAGIC
+    grey = find_grey_levels(levels[counted], lossy)
+    if grey is None or grey.threshold >= plan.free:
+        return free, ""
+    is_floor = bool((free & (levels == grey.unknown)).any())
+    if is_floor and not surrounds(grey, levels, counted):
+        return free, ""
+    known = free & (levels > grey.middle)
+    noise = 1.0 - known.sum() / max(int(free.sum()), 1)
+    if not (is_floor or lossy or (noise >= NOISE_SHARE and is_clear_cut(grey, levels[free]))):
+        return free, ""
+    if not is_floor and noise < TOLD_SHARE:
+        return known, ""
+    what = "its grey of unknown" if is_floor else f"noise of {noise:.0%} of the floor around its grey of unknown"
+    where = path.name if path != plan.image else "a map_server yaml"
+    said = f"{plan.image.name}: {what} ({grey.unknown}) counts as floor by free_thresh {plan.free:g} and was read as unknown"
+    return known, f"{said}; write free_thresh: {grey.threshold:.2g} into {where}"
+
+
 def classify(image: tuple[Array, Array], plan: Plan) -> tuple[Array, Array]:
-    """(h, w) bool occupied and free pixels of an image, as map_server has them."""
+    """(h, w) bool occupied and free pixels of an image by the thresholds alone, as map_server has them."""
     bright, clear = image
     if plan.mode == "raw":
         share = bright * 255.0 / 100.0  # the value itself is the probability in percent; above 100 is unknown

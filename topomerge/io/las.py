@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
@@ -58,6 +59,7 @@ def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
     """The header, a block of records with all their dimensions, and the share of the file that is read with it."""
     import laspy
 
+    logging.getLogger("laspy").setLevel(logging.CRITICAL)  # it logs what it also raises
     _check_head(path)
     done = 0
     # The parallel decoder believes the table of chunks and ends the process where a damaged one asks for too much memory.

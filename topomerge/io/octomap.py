@@ -6,7 +6,6 @@ Source: Hornung et al., "OctoMap", Autonomous Robots 2013, and the format's own 
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +21,7 @@ from topomerge.types import Array, VoxelGrid
 MAGICS = {".bt": b"# Octomap OcTree binary file", ".ot": b"# Octomap OcTree file"}
 NODE_BYTES = {b"OcTree": 5, b"ColorOcTree": 8}  # of a full tree: log-odds, a colour, which children there are
 CENTRE = 1 << (LEAF_LEVEL - 1)  # the cell whose lower corner is the origin of coordinates
+LARGEST_CELL = 1e6  # units of the file, of the smallest cell
 MOST_OCTOMAP_CELLS = 30_000_000  # smallest cells that leaves may be cut into
 TRUSTED_CELLS, CELLS_A_BYTE = 1 << 20, 100  # beyond so many cells, at most so many a byte: a real map has 7
 
@@ -66,7 +66,7 @@ def _split(path: Path, data: bytes, binary: bool) -> tuple[bytes, float, Array]:
     if kind not in able:
         names = " and ".join(name.decode() for name in able)
         raise InputError(f"{path}: holds a tree of the kind {kind[:40].decode('latin-1')}; only {names} is read")
-    if not (math.isfinite(resolution) and resolution > 0):
+    if not 0 < resolution <= LARGEST_CELL:
         raise damaged(path, "an OctoMap", f"res {resolution}")
     return kind, resolution, np.frombuffer(data, np.uint8, offset=header.end())
 

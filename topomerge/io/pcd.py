@@ -15,7 +15,7 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io import text
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK_POINTS, Piece, cut_short, damaged
+from topomerge.io.piece import BLOCK_POINTS, Piece, cut_short, damaged, single
 from topomerge.kernels.codecs import lzf_unpack
 from topomerge.types import Array
 
@@ -52,7 +52,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         xyz = np.stack([rows[n] for n in "xyz"], axis=1)
         pose_of = None if pose is None else np.zeros(len(rows), np.int32)
         first = pose if done == len(rows) else None
-        bright = rows[INTENSITY].astype(np.float32) if INTENSITY in names and not header.dtype[INTENSITY].shape else None
+        bright = single(rows[INTENSITY]) if INTENSITY in names and not header.dtype[INTENSITY].shape else None
         yield Piece(xyz, _colors(rows), poses=first, pose_of=pose_of, done=done / header.points, intensities=bright)
     if done < header.points:
         raise cut_short(path, done, header.points)
@@ -140,7 +140,8 @@ def _ascii(path: Path, header: Header) -> Iterator[Array]:
             for i, name in enumerate(wanted):
                 integers = kind[name].kind in "iu"
                 column = values[:, i]
-                rows[name] = np.nan_to_num(column).clip(0, 2**32 - 1).astype(np.int64) if integers and i > 2 else column
+                with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 a number is as good as infinite
+                    rows[name] = np.nan_to_num(column).clip(0, 2**32 - 1).astype(np.int64) if integers and i > 2 else column
             yield rows
 
 
@@ -158,10 +159,15 @@ def _colors(rows: Array) -> Array | None:
 
 def _pose(viewpoint: tuple[float, ...]) -> Array | None:
     """(1, 4, 4) pose of the sensor; None for the default, which says nothing."""
-    norm = float(np.linalg.norm(viewpoint[3:]))
-    if viewpoint == (0, 0, 0, 1, 0, 0, 0) or not np.isfinite(viewpoint).all() or norm == 0:
+    if viewpoint == (0, 0, 0, 1, 0, 0, 0) or not np.isfinite(viewpoint).all() or not any(viewpoint[3:]):
         return None
-    return pose(np.array(viewpoint[3:]) / norm, np.array(viewpoint[:3]))[None]
+    return pose(unit_quaternion(np.array(viewpoint[3:])), np.array(viewpoint[:3]))[None]
+
+
+def unit_quaternion(quaternion: Array) -> Array:
+    """The quaternion (4,), of any length but 0, as one of length 1."""
+    scaled = quaternion / np.abs(quaternion).max()  # its length may be beyond any number
+    return scaled / np.linalg.norm(scaled)
 
 
 def pose(quaternion: Array, translation: Array) -> Array:

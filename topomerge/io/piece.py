@@ -15,6 +15,7 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.types import Array, TrueRoom, VoxelGrid
 
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
 BLOCK_POINTS = 1 << 19  # points a reader hands over at a time
 MOST_POINTS = 100_000_000  # points that a sampled or extruded file may become; more is a wrong unit, not a building
 
@@ -36,12 +37,29 @@ class Piece:
     intensities: Array | None = None  # (n,) float32, in whatever the file counts in
 
 
+def refuse_pointer(path: Path) -> None:
+    """Refuse a file that Git LFS put in place of the one that is wanted.
+
+    Raises:
+        InputError: it is a pointer of Git LFS.
+    """
+    with path.open("rb") as stream:
+        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
+            raise InputError(f"{path}: is a Git LFS pointer, not the file; run `git lfs pull`")
+
+
+def leads_outside(path: Path) -> bool:
+    """Is it a link to a place outside of its folder? What stands there is not for the one who reads a message."""
+    return not path.resolve().is_relative_to(path.parent.resolve())
+
+
 def read_head(path: Path, kind: str, magic: bytes, length: int) -> bytes:
     """The first bytes of a file that must start with `magic`.
 
     Raises:
         InputError: it does not, or has fewer than `length` bytes.
     """
+    refuse_pointer(path)
     with path.open("rb") as stream:
         head = stream.read(length)
     if not head.startswith(magic):
@@ -60,8 +78,10 @@ def cut_short(path: Path, have: int, promised: int, what: str = "points") -> Inp
 
 
 def damaged(path: Path, kind: str, reason: object) -> InputError:
-    """The error for a file that is not what its name says."""
+    """The error for a file that is not what its name says. Of a link to another place nothing is quoted."""
     text = " ".join(str(reason).split())[:160] or type(reason).__name__
+    if leads_outside(path):
+        text = "it is a link out of its folder, so nothing of it is shown"
     return InputError(f"{path}: damaged, or not {kind} ({text}); export it again")
 
 
@@ -72,11 +92,17 @@ def too_many(path: Path, count: float, spacing: float) -> InputError:
     )
 
 
+def single(values: Array) -> Array:
+    """The values as float32; what is beyond its reach is infinite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(np.float32)
+
+
 def bytes8(colors: Array) -> Array:
     """(n, 3) uint8 colours from bytes, 16-bit integers or floats in 0..1 or 0..255."""
     if colors.dtype == np.uint8 or not len(colors):
         return np.ascontiguousarray(colors, np.uint8)
-    values = np.nan_to_num(colors.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    values = np.nan_to_num(single(colors), nan=0.0, posinf=0.0, neginf=0.0)
     top = float(values.max())
     if np.issubdtype(colors.dtype, np.floating) and top <= 1.0:
         values = values * 255.0

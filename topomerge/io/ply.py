@@ -16,7 +16,7 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.io import text
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged
+from topomerge.io.piece import BLOCK_POINTS, Piece, bytes8, cut_short, damaged, single
 from topomerge.types import Array
 
 LONGEST_HEADER = 1 << 20  # bytes
@@ -146,7 +146,7 @@ def _read_binary(path: Path, header: Header, before: list[Element], vertex: Elem
     for first in range(0, vertex.count, BLOCK_POINTS):
         block = rows[first : first + BLOCK_POINTS]
         done = (first + len(block)) / vertex.count
-        bright = block[shade].astype(np.float32) if shade else None
+        bright = single(block[shade]) if shade else None
         yield Piece(_stack(block, ("x", "y", "z")), _colors(block, colors), done=done, intensities=bright)
 
 
@@ -175,7 +175,7 @@ def _read_ascii(path: Path, header: Header, before: list[Element], vertex: Eleme
         for values in text.rows(path, lines, columns, skip=skip):
             count += len(values)
             colors = values[:, 3:6] if shades else None
-            bright = values[:, -1].astype(np.float32) if shade else None
+            bright = single(values[:, -1]) if shade else None
             if colors is not None and vertex.properties[columns[3]][1] not in ("f4", "f8"):
                 colors = colors.clip(0, 65535).astype(np.int64)
             shown = None if colors is None else bytes8(colors)

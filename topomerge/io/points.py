@@ -7,6 +7,7 @@ every failure into an `InputError` of one line. Only the reader that is needed i
 from __future__ import annotations
 
 import importlib
+import itertools
 import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -17,11 +18,12 @@ from typing import Any, TypeVar
 from topomerge.errors import InputError
 from topomerge.io.gather import Gatherer
 from topomerge.io.options import ReadOptions, read_options
-from topomerge.io.piece import Piece, damaged
+from topomerge.io.piece import Piece, damaged, refuse_pointer
 from topomerge.types import PointCloud
 
 Progress = Callable[[float, str], None]
 Block = TypeVar("Block")
+MOST_FILES_LOOKED_AT = 1000  # in a folder that can't be read
 MESSAGE_LETTERS = 500  # of a message beside the path, at most: what it quotes of a damaged file may be long
 log = logging.getLogger(__name__)
 
@@ -142,6 +144,7 @@ def format_of(path: Path) -> Format:
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is no regular file (a pipe or a device); give the name of a file")
     try:
+        refuse_pointer(path)
         with path.open("rb") as stream:
             first = stream.read(1)
     except FileNotFoundError:
@@ -189,6 +192,7 @@ def guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterator[Bl
     try:
         yield from blocks(importlib.import_module(f"topomerge.io.{file_format.module}"))
     except InputError as error:
+        _refuse_pointers_in(path)
         text, most = str(error), len(str(path)) + MESSAGE_LETTERS
         raise error if len(text) <= most else InputError(f"{text[:most]} ...") from error.__cause__
     except (GeneratorExit, KeyboardInterrupt, SystemExit):
@@ -202,7 +206,16 @@ def guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterator[Bl
         raise InputError(f"{path}: can't be read ({error.strerror or error}); copy it again") from error
     except BaseException as error:  # native readers raise their own kinds, panics of lazrs not even an Exception
         log.debug("reading %s failed", path, exc_info=True)
+        _refuse_pointers_in(path)
         raise damaged(path, file_format.name, error) from error
+
+
+def _refuse_pointers_in(folder: Path) -> None:
+    """Refuse a folder that can't be read since files in it are pointers of Git LFS."""
+    if folder.is_dir():
+        for file in itertools.islice(folder.rglob("*"), MOST_FILES_LOOKED_AT):
+            if file.is_file():
+                refuse_pointer(file)
 
 
 def _chunks(path: Path, pieces: Iterable[Piece], gatherer: Gatherer, progress: Progress | None) -> Iterator[PointCloud]:

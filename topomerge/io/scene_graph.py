@@ -19,6 +19,7 @@ from topomerge.io.options import ReadOptions
 from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array
 
+BEYOND_NUMBERS = 2**53  # of a vertex: from here on not every whole number is a float64
 GRAPH_KIND = "a scene graph"
 
 
@@ -41,7 +42,7 @@ def pieces(path: Path, graph: Mapping[str, Any], options: ReadOptions) -> Iterat
         )
     vertices = _table(path, mesh["points"], "points")
     faces = _table(path, mesh.get("faces") or np.zeros((0, 3)), "faces")
-    if not np.isfinite(faces).all() or (faces != np.round(faces)).any():
+    if not (np.abs(faces) < BEYOND_NUMBERS).all() or (faces != np.round(faces)).any():  # so of nan, too
         raise damaged(path, GRAPH_KIND, "a face of its mesh names a vertex that does not exist")
     colors = _colors(path, mesh, len(vertices))
     yield Piece(vertices, colors, done=0.5)

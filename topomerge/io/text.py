@@ -19,7 +19,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.options import ReadOptions
-from topomerge.io.piece import Piece, bytes8
+from topomerge.io.piece import Piece, bytes8, leads_outside
 from topomerge.types import Array
 
 LINES_A_TIME = 1 << 18  # lines parsed at a time
@@ -80,7 +80,8 @@ def rows(
                 values = _parse(block, columns, delimiter)
             except (ValueError, IndexError) as error:
                 number, line = _first_bad(block, columns, delimiter)
-                what = f"line {before + number} is not a row of numbers ({line[:40]!r})"
+                shown = "" if leads_outside(path) else f" ({line[:40]!r})"
+                what = f"line {before + number} is not a row of numbers{shown}"
                 raise InputError(f"{path}: {what}; mend or remove it") from error
         before += len(block)
         if len(values):

@@ -17,11 +17,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from topomerge.errors import InputError
+from topomerge.io.piece import leads_outside, refuse_pointer
 from topomerge.types import Array
 
 KITTI_NUMBERS, TUM_NUMBERS = 12, 8  # a line
 POSE_NUMBERS = {KITTI_NUMBERS: "KITTI", TUM_NUMBERS: "TUM"}
 LONGEST_GAP = 0.2  # s between a scan and the nearest pose
+BEYOND = 1e30  # of any number: larger ones are as good as infinite
 BACKWARD = 1.0  # s: by less, messages may be out of order; by more the clock was set back
 UNIT_TOLERANCE = 0.05  # of a quaternion's length and of the product of a rotation with its transpose
 
@@ -74,6 +76,7 @@ def read_trajectory(path: Path) -> Trajectory:
         InputError: it is neither, a number is missing or not finite, or time runs backwards; with the number of the line.
     """
     try:
+        refuse_pointer(path)
         lines = list(number_rows(path, POSE_NUMBERS))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; --poses names a trajectory (KITTI or TUM)") from None
@@ -106,14 +109,15 @@ def number_rows(path: Path, widths: Mapping[int, str]) -> Iterator[tuple[int, li
             try:
                 row = [float(word) for word in words]
             except ValueError as error:
-                shown = line.strip()[:40]
-                raise InputError(f"{path}: line {number} is not a row of numbers ({shown!r}); mend or remove it") from error
+                shown = "" if leads_outside(path) else f" ({line.strip()[:40]!r})"
+                raise InputError(f"{path}: line {number} is not a row of numbers{shown}; mend or remove it") from error
             width = width or len(row)
             if len(row) != width or width not in widths:
                 said = ", one of ".join(f"{name} has {count}" for count, name in widths.items())
                 raise InputError(f"{path}: line {number} has {len(row)} numbers; a line of {said}: give the trajectory like that")
-            if not np.isfinite(row).all():
-                raise InputError(f"{path}: line {number} holds a number that is not finite; mend it, or remove it with its scan")
+            if not (np.abs(row) < BEYOND).all():  # so of nan, too
+                wrong = f"line {number} holds a number that is not finite, or beyond {BEYOND:g}"
+                raise InputError(f"{path}: {wrong}; mend it, or remove it with its scan")
             yield number, row
 
 
@@ -133,8 +137,12 @@ def _kitti(path: Path, numbers: Array, rows: Array) -> Trajectory:
 def no_rotations(poses: Array) -> Array:
     """Rows of the poses whose upper left part turns nothing, or mirrors."""
     turns = poses[:, :3, :3]
-    off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    rows: Array = np.flatnonzero((off > UNIT_TOLERANCE) | (np.linalg.det(turns) < 0))
+    small = np.abs(turns) <= 1.0 + UNIT_TOLERANCE  # others may be too large to be multiplied, or no numbers
+    turning: Array = np.logical_and.reduce(small, axis=(1, 2))
+    fits = turns[turning]
+    off = np.abs(fits @ fits.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    turning[turning] = (off <= UNIT_TOLERANCE) & (np.linalg.det(fits) > 0)
+    rows: Array = np.flatnonzero(~turning)
     return rows
 
 

@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.io import grid
+from topomerge.io.grid_doubts import doubt_outside
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array
@@ -64,7 +65,8 @@ def pieces(path: Path, about: Mapping[str, Any], options: ReadOptions) -> Iterat
     if walled < WALLED:
         walls |= outline
         warnings = (f"{path}: draws walls along {walled:.0%} of its floor's outline; the outline was taken for walls",)
-    yield Piece(np.empty((0, 3)), warnings=warnings, done=0.1)
+    outside = [f"{path}: {doubt}; save the map again" for doubt in doubt_outside(walls, free, drawn.resolution)]
+    yield Piece(np.empty((0, 3)), warnings=(*warnings, *outside), done=0.1)
     x, y = (drawn.origin - drawn.resolution).tolist()
     plan = grid.Plan(path, drawn.resolution, (x, y, 0.0))
     yield from grid.extrude(path, np.flipud(walls), np.flipud(free), plan, options)
