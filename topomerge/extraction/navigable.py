@@ -49,7 +49,7 @@ def _navigable(grid: VoxelGrid, p: SharedParameters, places: Array = NOWHERE) ->
     if p.bridge:
         standing = bridge_gaps(grid, standing, body, p.bridge)
     dilated = dilate_upwards(standing, p.dilation)  # 2.3.2
-    navigable = largest_component(dilated) if p.largest_only else floor_components(dilated)  # 2.3.3
+    navigable = largest_component(dilated) if p.largest_only else floor_components(dilated, grid)  # 2.3.3
     if not len(navigable):
         raise InputError(
             f"no floor found: nowhere is an area of 1 m2 with {p.standing_height:g} m of empty space above it; check "

@@ -134,6 +134,11 @@ def _filled_columns(points: Array, edge: float) -> Array:
 
 def enclosed_columns(wall: Array, edge: float) -> Array:
     """(nx, ny) columns around which walls stand in most directions."""
+    return np.asarray(walled_directions(wall, edge) >= ENCLOSED_SHARE * SIGHT_DIRECTIONS)
+
+
+def walled_directions(wall: Array, edge: float) -> Array:
+    """(nx, ny) int32 in how many of `SIGHT_DIRECTIONS` a wall stands, from each column."""
     hits = np.zeros(wall.shape, np.int32)
     far = round(SIGHT_RANGE / edge)
     for angle in np.arange(SIGHT_DIRECTIONS) * 2 * np.pi / SIGHT_DIRECTIONS:
@@ -145,7 +150,7 @@ def enclosed_columns(wall: Array, edge: float) -> Array:
             seen |= _shifted(seen, int(dx), int(dy))
             step *= 2
         hits += seen
-    return np.asarray(hits >= ENCLOSED_SHARE * SIGHT_DIRECTIONS)
+    return hits
 
 
 def _shifted(mask: Array, dx: int, dy: int) -> Array:
