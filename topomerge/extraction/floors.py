@@ -76,8 +76,8 @@ def _has_ceiling(occupied: VoxelGrid, cells: Array) -> bool:
 
 
 def _on_furniture(top: Array, floors: Array, below: cKDTree, reach: float) -> bool:
-    """Do the cells `top` (k, 3) lie a table's height above the floor around them, at most `reach` away? All in m; `below` searches
-    the floors' plan.
+    """Do the cells `top` (k, 3) lie a table's height above the floor around them, at most `reach` away? All in m; `below`
+    searches the floors' plan.
 
     Only a floor that is larger than the top counts: it is the one that goes around it.
     """

@@ -51,7 +51,7 @@ class LevelledChunks:
         normals = fit_patches(points) if high - low > SLICE_HEIGHT else np.zeros((0, 3))
         if len(normals) < LEAST_PATCHES:
             return sum(map(len, held)) > HELD_POINTS
-        up = find_up(normals)
+        up = find_up(points, normals)
         if up is not None:
             finite = points[np.isfinite(points).all(axis=1)]
             self.matrix = rotation_about(np.round(np.median(finite, axis=0), DIGITS), rotation_to_z(up))

@@ -20,16 +20,16 @@ PATCH_EDGES = (0.4, 0.8)  # m, of the cubes in which planes are fitted; the larg
 LEAST_POINTS = 8  # of a patch
 FLATNESS = 0.075  # of a patch: rms of its points about its plane, by the edge of its cube
 ROUNDNESS, THINNESS = 0.3, 0.33  # of a patch: its width by its length, and its thickness by its width; else a line or a ball
-ENOUGH_PATCHES, LEAST_PATCHES = 240, 60  # some 40 and 10 m2 of floors, ceilings and walls in cubes of 0.4 m
+ENOUGH_PATCHES, LEAST_PATCHES = 480, 120  # some 40 and 10 m2 of floors, ceilings and walls in cubes of 0.4 m, seen twice
 SEARCH_STEP = 1.0  # degrees
 SEARCHED_PATCHES = 2000
 SEARCH_WIDTH = 2.0  # degrees (standard deviation) within which a patch agrees with a direction
 REACHES = (6.0, 4.5, 3.0, 3.0, 3.0, 3.0)  # degrees, from where a patch has no say in each round of the least squares
 WALL_REACH = 6.0  # degrees by which a wall may miss what is upright, in the file or along the direction found
 ACROSS = 0.7  # cosine between the normal of a wall and the side to which a cloud leans: the walls that would lean, too
-LEAST_WITNESSES = 20  # such walls
+LEAST_WITNESSES = 40  # such walls
 WITNESSED = 0.5  # of the tilt, by which the median of them leans
-SURE = 4.0  # times its standard error
+SURE = 6.0  # times its standard error
 LEAST_AGREEMENT = 0.2  # of all patches that agree with the direction found; of clouds of a building 0.3 to 0.85 do
 
 
@@ -41,15 +41,17 @@ class _Wall(NamedTuple):
     number: int
 
 
-def find_up(normals: Array) -> Array | None:
+def find_up(points: Array, normals: Array | None = None) -> Array | None:
     """Find the direction that is up in a tilted cloud.
 
     Args:
-        normals: (n, 3) of its `fit_patches`, z roughly up.
+        points: (N, 3) m, z roughly up.
+        normals: (n, 3), `fit_patches` of them, where that is known.
 
     Returns:
         (3,) float64 unit vector, `LEAST_TILT` to `LARGEST_TILT` from z; None where the cloud is level, or nothing says it is not.
     """
+    normals = fit_patches(points) if normals is None else normals
     if len(normals) < LEAST_PATCHES:
         return None
     up = _refined(normals, _most_agreed(normals))
@@ -58,7 +60,10 @@ def find_up(normals: Array) -> Array | None:
         return None
     walls = _walls_across(normals, up, tilt)
     witnessed = walls.number >= LEAST_WITNESSES and walls.lean >= max(WITNESSED * tilt, SURE * walls.error)
-    return up if witnessed else None
+    if not witnessed:
+        return None
+    rotation = rotation_to_z(up)  # borders of cubes that cut noisy planes askew draw their normals to the axes: look once more
+    return np.asarray(_refined(fit_patches(_sample(points) @ rotation.T), np.array([0.0, 0.0, 1.0])) @ rotation)
 
 
 def degrees_from_z(up: Array) -> float:
@@ -73,14 +78,23 @@ def rotation_to_z(up: Array) -> Array:
 
 
 def fit_patches(points: Array) -> Array:
-    """(n, 3) float64 unit normals, of either sign, of the cubes of space whose points (N, 3) lie on a plane."""
-    sample = np.asarray(points[:: max(len(points) // SAMPLE, 1)], np.float64)
-    sample = sample[np.isfinite(sample).all(axis=1)]
-    normals = np.zeros((0, 3))
+    """(n, 3) float64 unit normals, of either sign, of the cubes of space whose points (N, 3) lie on a plane.
+
+    Space is cut twice, half an edge apart: a cube that holds both faces of a wall shows no plane.
+    """
+    sample, normals = _sample(points), np.zeros((0, 3))
     for edge in PATCH_EDGES:
         if len(normals) < ENOUGH_PATCHES and len(sample):
-            normals = max(normals, _fit(sample - np.median(sample, axis=0), edge), key=len)
+            local = sample - np.median(sample, axis=0)
+            both = np.concatenate([_fit(local, edge), _fit(local + edge / 2, edge)])
+            normals = max(normals, both, key=len)
     return normals
+
+
+def _sample(points: Array) -> Array:
+    """Every n-th point, float64, without what is not finite."""
+    sample = np.asarray(points[:: max(len(points) // SAMPLE, 1)], np.float64)
+    return sample[np.isfinite(sample).all(axis=1)]
 
 
 def _fit(points: Array, edge: float) -> Array:

@@ -93,9 +93,8 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, cr
     on_floor = (profile & np.uint64(bands.mask(-0.3, 0.3))) != 0
     reach = np.where(_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
     covered = ~np.isnan(clear)
-    if covered[seen].sum() < ROOFLESS_SHARE * seen.sum():  # the scan ends below the ceiling: furniture stands on floor all the same
-        low_things = (profile & np.uint64(bands.mask(*FURNITURE_HEIGHTS))) != 0
-        covered |= low_things & enclosed_columns(wall, e)
+    if covered[seen].sum() < ROOFLESS_SHARE * seen.sum():  # the scan ends below the ceiling, but furniture stands on floor
+        covered |= ((profile & np.uint64(bands.mask(*FURNITURE_HEIGHTS))) != 0) & enclosed_columns(wall, e)
     if crossed is not None:
         covered |= _looked_through(crossed, grid, low, base) & enclosed_columns(wall, e)  # what lies before windows is no room
     inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (covered & (far * e <= reach))
