@@ -81,6 +81,7 @@ def scan(
         pose_of=hits.pose.astype(np.int32),
         rooms=building.rooms,
         source=f"{building.name}:{kind.name}",
+        upright=True,
     )
     return moved(cloud, frame) if frame else cloud
 

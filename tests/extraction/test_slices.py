@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import topomerge as tm
+from tests import scenes
+from topomerge.errors import InputError
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import with_raised_slice
 from topomerge.extraction.voxels import voxelise
@@ -113,3 +115,23 @@ def standing(grid, x: float, y: float) -> bool:
     """Is anything above the floor within 0.1 m?"""
     above = grid.centroids()[grid.cells[:, 2] > grid.cells[:, 2].min() + 3]
     return bool((np.abs(above[:, :2] - (x, y)) < 0.11).all(axis=1).any())
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_a_cloud_of_a_floor_only_is_named_and_no_slice(noise: float) -> None:
+    """Cut out of a scan of two rooms: the doorway and what stood on the floor are holes in it."""
+    floor = scenes.two_rooms().points(noise)
+    floor = floor[floor[:, 2] < 0.15]
+    table = (np.abs(floor[:, 0] - 2) < 0.7) & (np.abs(floor[:, 1] - 3) < 0.5)
+    for points in (floor, floor[~table], floor[::5], floor + (0, 0, 2.7)):
+        with pytest.raises(InputError, match=r"^only a floor or a ceiling was seen .* no walls: .* give a scan that shows walls"):
+            tm.extract(points.astype(np.float32))
+
+
+def test_a_slice_with_furniture_is_still_one() -> None:
+    scene = scenes.corridor()
+    for x, y in ((1.0, 1.0), (5.0, 7.0), (13.0, 1.0)):
+        scene.box(x, y, 0.0, x + 1.4, y + 0.8, 0.9)
+    points = scene.points()
+    map = tm.extract(points[np.abs(points[:, 2] - 0.6) < 0.2])
+    assert len(map.rooms) >= 7 and any("is a slice" in w for w in map.warnings)

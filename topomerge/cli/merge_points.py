@@ -76,14 +76,17 @@ def _earlier_points(folder: Path, inputs: Sequence[str]) -> set[Path]:
 
 def _write(result: MergeResult, k: int, path: Path, args: argparse.Namespace) -> None:
     from topomerge.io.moved_points import save_moved
-    from topomerge.types import Sim3
+    from topomerge.types import Sim3, is_level, transformed
 
-    place, options = result.placements[k], given(args, "up", "unit")
+    place, options, levelling = result.placements[k], given(args, "up", "unit"), result.maps[k].levelling
     with Bars(enabled=not args.quiet) as bars:
-        own_frame, progress = place.pose == Sim3(), bars.task("points")
-        done = save_moved(
-            args.inputs[k], path, place.apply, _middle(result, k), same_frame=own_frame, progress=progress, **options
-        )
+        own_frame, progress = place.pose == Sim3() and is_level(levelling), bars.task("points")
+
+        def move(points: np.ndarray) -> np.ndarray:
+            moved: np.ndarray = place.apply(points if is_level(levelling) else transformed(levelling, points))
+            return moved
+
+        done = save_moved(args.inputs[k], path, move, _middle(result, k), same_frame=own_frame, progress=progress, **options)
     if done.beyond:
         warn([f"{args.inputs[k]}: {done.beyond:,} points are too far from all others for LAS and are left out"])
     if not args.quiet:

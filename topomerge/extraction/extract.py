@@ -34,7 +34,7 @@ from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.views.view_rooms import rooms_of_views
 from topomerge.extraction.walked_doors import with_walked_doors
 from topomerge.extraction.walked_rooms import walked_rooms
-from topomerge.types import Array, PointCloud, TopometricMap, VoxelGrid, with_outline_odds
+from topomerge.types import LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, with_outline_odds
 
 COARSE_CELL = 0.15  # m: in larger ones, the walls beside a door leave too little of it
 
@@ -87,6 +87,8 @@ def extract(
     free = free_space(scan, navigable, p.range) if p.carve else scan.free
 
     chosen = {**asdict(p), **floor.chosen_parameters, "voxel_size": scan.grid.edge}
+    if scan.levelling is not None:
+        chosen[LEVELLED] = scan.levelling.tolist()
     return replace(
         map,
         free=free,
@@ -114,7 +116,7 @@ def rooms_and_passages(
         InputError: as `extract`.
     """
     watch.begin("read and voxelise", 0.0)
-    scan = read_scan(source, voxel_size, p.sparse)  # 2.2
+    scan = read_scan(source, voxel_size, p.sparse, p.level)  # 2.2
     flat = is_slice(scan.grid)
     scan = with_raised_slice(scan) if p.assume else scan
 

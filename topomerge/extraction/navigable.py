@@ -53,7 +53,7 @@ def _navigable(grid: VoxelGrid, p: SharedParameters, places: Array = NOWHERE) ->
     if p.bridge:
         standing = bridge_gaps(grid, standing, body, p.bridge)
     dilated = dilate_upwards(standing, p.dilation)  # 2.3.2
-    navigable = largest_component(dilated) if p.largest_only else floor_components(dilated)  # 2.3.3
+    navigable = largest_component(dilated) if p.largest_only else floor_components(dilated, grid)  # 2.3.3
     if not len(navigable):
         check = PLAN_ADVICE if is_raised(grid) else CLOUD_ADVICE
         raise InputError(

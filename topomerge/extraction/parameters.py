@@ -12,6 +12,7 @@ from topomerge.errors import InputError
 class SharedParameters:
     """What both presets have: cells, navigable volume (seeds 2.3), free space. The defaults are ours; docs/adr/0003 says why."""
 
+    level: bool = True  # tilted clouds are levelled first
     noise: float = 0.4  # cells with a smaller share of the usual number of neighbours are in nobody's way; 0: all are
     sparse: float = 3.5  # cells are doubled until they have that many neighbours of 26 (median): fewer are no surface; 0: never
     stem_height: float = 0.25  # a step may stand beside the foot
@@ -45,9 +46,10 @@ class DefaultParameters(SharedParameters):
 class ThesisParameters(SharedParameters):
     """The thesis: rooms from clusters of views (seeds 2.4 to 2.6; values of the finished thesis, docs/method.md).
 
-    Of the shared parameters the thesis knows neither noise nor assumed floors; they are off and can be turned on one by one.
+    Of the shared parameters the thesis knows no levelling, noise or assumed floors; they are off and can be turned on one by one.
     """
 
+    level: bool = False
     noise: float = 0.0
     sparse: float = 0.0
     body_height: float = 0.75

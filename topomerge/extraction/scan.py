@@ -11,6 +11,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.extraction.lattice_cells import LatticeCells
+from topomerge.extraction.levelling import LevelledChunks
 from topomerge.extraction.sparsity import COARSEST_CELL, without_gaps
 from topomerge.extraction.voxels import voxelise
 from topomerge.types import Array, PointCloud, VoxelGrid
@@ -39,6 +40,7 @@ class Scan:
         source: where it comes from.
         warnings: what the user should know.
         crossed: cells that its rays crossed (`free_space.with_crossed_cells`); None where that is unknown.
+        levelling: (4, 4) that took the points of a tilted cloud into the frame of the grid; None where it was level.
     """
 
     grid: VoxelGrid
@@ -49,6 +51,7 @@ class Scan:
     source: str = ""
     warnings: tuple[str, ...] = ()
     crossed: VoxelGrid | None = None
+    levelling: Array | None = None
 
     @property
     def places(self) -> Array:
@@ -64,7 +67,10 @@ class Scan:
 
 
 def read_scan(
-    source: PointCloud | VoxelGrid | Array | Iterable[PointCloud], voxel_size: float, least_neighbours: float = 0.0
+    source: PointCloud | VoxelGrid | Array | Iterable[PointCloud],
+    voxel_size: float,
+    least_neighbours: float = 0.0,
+    level: bool = False,
 ) -> Scan:
     """Points -> cells, so large that surfaces hold together (seeds 2.2). A grid is taken as it is.
 
@@ -72,6 +78,7 @@ def read_scan(
         source: a cloud, chunks of one, (N, 3) points, or occupied cells.
         voxel_size: edge length of a cell, m (a grid keeps its own).
         least_neighbours: that the median cell has, of 26; the cells are doubled until it has them. 0: never.
+        level: rotate the points of a tilted cloud first, and what else its file knows (`levelling`).
 
     Raises:
         InputError: no finite point, hardly any cells, an absurd extent, cells of a size that shows no rooms and doors, or a path,
@@ -87,7 +94,9 @@ def read_scan(
         return Scan(source, source if "offset" in source.properties and edge <= LEAST_FINE * FINE_CELL else None)
     parts = max(round(edge / FINE_CELL), 1)
     fine = LatticeCells(edge / parts, MOST_FINE_CELLS) if parts > 1 else None
-    chunks = _Chunks([_cloud_of(source)] if isinstance(source, np.ndarray) else source, fine)
+    clouds = [_cloud_of(source)] if isinstance(source, np.ndarray) else [source] if isinstance(source, PointCloud) else source
+    levelled = LevelledChunks(clouds) if level else None
+    chunks = _Chunks(clouds if levelled is None else levelled, fine)
     with reasons(chunks.warnings):
         grid = voxelise(chunks, edge, chunks.warnings)
         if len(grid) * edge < SHORTEST_ROW:
@@ -98,7 +107,8 @@ def read_scan(
         chunks.warnings.append("the scan is large: doors are read off its plan alone, not off its walls")
     if least_neighbours:
         grid = without_gaps(grid, least_neighbours, chunks.warnings)
-    return Scan(grid, close, chunks.rays, chunks.shades.all(), chunks.free, chunks.source, tuple(chunks.warnings))
+    scan = Scan(grid, close, chunks.rays, chunks.shades.all(), chunks.free, chunks.source, tuple(chunks.warnings))
+    return scan if levelled is None else replace(scan, levelling=levelled.matrix, warnings=(*levelled.warnings, *scan.warnings))
 
 
 def _cloud_of(points: Array) -> PointCloud:
@@ -123,8 +133,8 @@ def reasons(warnings: Sequence[str]) -> Iterator[None]:
 class _Chunks:
     """The chunks of a cloud, to be read once; it gathers what they know beside their points."""
 
-    def __init__(self, chunks: PointCloud | Iterable[PointCloud], fine: LatticeCells | None) -> None:
-        self.chunks = [chunks] if isinstance(chunks, PointCloud) else chunks
+    def __init__(self, chunks: Iterable[PointCloud], fine: LatticeCells | None) -> None:
+        self.chunks = chunks
         self.fine = fine
         self.source = ""
         self.free: VoxelGrid | None = None

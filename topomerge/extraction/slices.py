@@ -7,15 +7,18 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from topomerge.errors import InputError
 from topomerge.extraction.cell_means import MIDDLE
+from topomerge.extraction.levelling import SLICE_HEIGHT
 from topomerge.extraction.scan import Scan
 from topomerge.kernels.carve import count_rays
 from topomerge.types import Array, VoxelGrid
 
-SLICE_HEIGHT = 0.6  # m: what is flatter is a slice
 EXTRUDED_HEIGHT = 2.4  # m, of the walls that a slice becomes
 RAISED_SHARE = 0.999  # of the columns of a raised plan are filled alike; of scans at most 0.6 were, usually a tenth
 RAISED_FROM, BELOW_TOP = 0.5, 0.3  # m above the floor, and m below the top of the walls, between which these are looked at
+WALL_THICKNESS = 1.0  # m: what is wider both ways is no wall, nor a row of legs
+FLOOR_SHARE = 0.7  # of the columns of a floor lie in such areas; of slices 0 to 0.2 do
 ENCLOSED_SHARE = 0.75  # of the directions in which a place inside sees a wall
 SIGHT_DIRECTIONS = 24
 SIGHT_RANGE = 15.0  # m
@@ -26,9 +29,16 @@ COLUMNS_AROUND = 0.3  # m
 
 def with_raised_slice(scan: Scan) -> Scan:
     """A scan that is a slice gets walls over its columns, and a floor; any other stays as it is, but for the walls of a raised
-    plan, at which nobody needs to look closely."""
+    plan, at which nobody needs to look closely.
+
+    Raises:
+        InputError: it is a floor, or a ceiling.
+    """
     if not is_slice(scan.grid):
         return replace(scan, fine=None) if is_raised(scan.grid) else scan
+    if is_floor(scan.grid):
+        flat = f"only a floor or a ceiling was seen (all within {SLICE_HEIGHT:g} m of height, over whole areas), and no walls"
+        raise InputError(f"{flat}: rooms can't be told from it; give a scan that shows walls, too")
     warning = f"the scan is a slice: walls of {EXTRUDED_HEIGHT:g} m and a floor were assumed"
     return replace(scan.with_grid(_extruded(scan.grid, scan.rays), warning), fine=None)
 
@@ -39,6 +49,16 @@ def is_slice(grid: VoxelGrid) -> bool:
         return False
     low, high = _extent(grid)
     return (high - low) * grid.edge <= SLICE_HEIGHT
+
+
+def is_floor(grid: VoxelGrid) -> bool:
+    """Does what is flat fill areas, as a floor does, rather than lines, as the walls in a slice do?"""
+    seen = np.zeros(grid.shape[:2], bool)
+    seen[tuple(grid.cells[:, :2].T)] = True
+    size = 2 * round(WALL_THICKNESS / 2 / grid.edge) + 1
+    seen = np.pad(seen, size)
+    areas = ndimage.binary_opening(ndimage.binary_closing(seen, np.ones((3, 3))), np.ones((size, size)))
+    return bool((areas & seen).sum() >= FLOOR_SHARE * seen.sum())
 
 
 def is_raised(grid: VoxelGrid) -> bool:
@@ -114,6 +134,11 @@ def _filled_columns(points: Array, edge: float) -> Array:
 
 def enclosed_columns(wall: Array, edge: float) -> Array:
     """(nx, ny) columns around which walls stand in most directions."""
+    return np.asarray(walled_directions(wall, edge) >= ENCLOSED_SHARE * SIGHT_DIRECTIONS)
+
+
+def walled_directions(wall: Array, edge: float) -> Array:
+    """(nx, ny) int32 in how many of `SIGHT_DIRECTIONS` a wall stands, from each column."""
     hits = np.zeros(wall.shape, np.int32)
     far = round(SIGHT_RANGE / edge)
     for angle in np.arange(SIGHT_DIRECTIONS) * 2 * np.pi / SIGHT_DIRECTIONS:
@@ -125,7 +150,7 @@ def enclosed_columns(wall: Array, edge: float) -> Array:
             seen |= _shifted(seen, int(dx), int(dy))
             step *= 2
         hits += seen
-    return np.asarray(hits >= ENCLOSED_SHARE * SIGHT_DIRECTIONS)
+    return hits
 
 
 def _shifted(mask: Array, dx: int, dy: int) -> Array:

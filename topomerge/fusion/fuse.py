@@ -34,7 +34,7 @@ from topomerge.fusion.storey_levels import extruded
 from topomerge.kernels.voxelise import OFFSET_STEPS
 from topomerge.matching.consistency import matches_under
 from topomerge.matching.room_plans import room_plans
-from topomerge.types import JOINED, Array, Sim3, TopometricMap, VoxelGrid
+from topomerge.types import JOINED, LEVELLED, Array, Sim3, TopometricMap, VoxelGrid, is_level
 
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
 PROVENANCE_BITS = 32  # maps that one bit set tells apart
@@ -82,6 +82,9 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     rooms = [part.rooms for part in laid]
     joined = _extracted(cells, min(part.neighbours for part in parts), name, rooms)
     joined = with_joined_windows(with_doors(with_part_odds(joined, rooms), laid), windows)
+    first = maps[poses[0][0]].levelling
+    if not is_level(first):  # the frame of the joined map is that of the first one
+        joined = replace(joined, parameters={**joined.parameters, LEVELLED: first.tolist()})
     return with_joined_fixtures(joined, fixtures)
 
 

@@ -7,12 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.bend.placement import Placement, bend_to_json, placements, with_bends
 from topomerge.fusion.evidence.places import Places
 from topomerge.fusion.registration import Registration
 from topomerge.io.listing import plain
-from topomerge.types import Sim3, TopometricMap
+from topomerge.matching.listing import map_to_entry
+from topomerge.types import Array, Sim3, TopometricMap, between_files
 from topomerge.writers import WRITERS
 
 if TYPE_CHECKING:
@@ -45,7 +48,8 @@ class MergeResult:
         status: "merged" or "abstained".
         probability: that the best transform is right, calibrated on simulated pairs.
         reason: in words.
-        transforms: k -> T_0k, which maps points of map k into the frame of map 0; empty where nothing is believed.
+        transforms: k -> T_0k, which maps points of map k into the frame of map 0; empty where nothing is believed. Of files that
+            were tilted see `file_transforms`.
         matches: rooms that are one under the transforms.
         seconds: of ``embed``, ``match`` and ``fuse`` (registration, fusing, extracting rooms again); ``read`` and ``extract``
             are 0 where the maps were made before.
@@ -90,6 +94,13 @@ class MergeResult:
         """k -> where the points of map k lie in the joined frame, of every map that is part of it; none where nothing is."""
         return {p.map: p for p in placements(self.maps, self.transforms, self.bends)} if self.transforms else {}
 
+    @property
+    def file_transforms(self) -> dict[int, Array]:
+        """k -> (4, 4) float64 that takes points of the file of map k into the frame of that of map 0: as `transforms` do, unless
+        a cloud was tilted and has been levelled."""
+        into = self.maps[0].levelling if self.transforms else np.eye(4)
+        return {k: between_files(pose, self.maps[k].levelling, into) for k, pose in self.transforms.items()}
+
     def save(self, folder: str | Path) -> None:
         """Write merge.json and report.html, and where there is a joined map merged.ply and map.tmap; all of them or none.
 
@@ -106,14 +117,15 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
     registration = result.registration
     rmse = registration.features.get("rmse", float("nan")) if registration else float("nan")
     residuals = result.atlas.residuals if result.atlas else {1: rmse}
-    transforms = {str(k): transform_to_json(pose, residuals[k]) for k, pose in result.transforms.items()}
+    matrices = result.file_transforms
+    transforms = {str(k): transform_to_json(pose, residuals[k], matrices[k]) for k, pose in result.transforms.items()}
     listing = {
         "format": MERGE_FORMAT,
         "status": result.status,
         "probability": min(max(float(result.probability), 0.0), 1.0),
         "reason": result.reason,
         "descriptor": result.descriptor,
-        "maps": [{"source": m.source, "rooms": len(m.rooms), "storeys": len(m.storeys)} for m in result.maps],
+        "maps": [map_to_entry(m) for m in result.maps],
         "transforms": transforms,
         "bend": {str(k): bend_to_json(result.maps[k], p) for k, p in result.placements.items() if p.bend is not None},
         "matches": [{"maps": m.maps, "rooms": m.rooms, "probability": round(m.probability, 4)} for m in result.matches],
@@ -134,16 +146,17 @@ def places_to_json(places: Places) -> list[dict[str, Any]]:
     return [{"at": [round(v, 2) for v in at], "m2": round(m2, 1), "log_odds": round(odds, 2)} for at, m2, odds in each]
 
 
-def transform_to_json(pose: Sim3, rmse: float, into: int = 0) -> dict[str, Any]:
+def transform_to_json(pose: Sim3, rmse: float, matrix: Array, into: int = 0) -> dict[str, Any]:
     """A pose in the frame of another map as plain values.
 
     Args:
         rmse: of its surfaces, or of its measurements, m; nan where there are none.
+        matrix: (4, 4), the pose between the files of both maps (`between_files`).
         into: the other map.
     """
     return {
         "into": into,
-        "matrix": pose.matrix.tolist(),
+        "matrix": matrix.tolist(),
         "scale": pose.scale,
         "yaw_deg": pose.yaw * 57.29577951308232,
         "rmse_m": rmse if rmse == rmse else None,  # nan: slices have no planes to measure it by

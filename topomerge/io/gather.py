@@ -129,7 +129,7 @@ class Gatherer:
         cloud = PointCloud(
             part.points, self.shift, part.colors, part.labels, self.poses, part.pose_of, self.free, self.rooms, self.source
         )
-        cloud = replace(cloud, intensities=part.intensities)
+        cloud = replace(cloud, intensities=part.intensities, upright=self.up is None)
         self.free, self.rooms = None, ()
         if self.pending is not None:
             yield self.pending

@@ -45,6 +45,7 @@ from topomerge.types import (
     Array,
     TopometricMap,
     VoxelGrid,
+    levelling_of,
     with_outline_odds,
 )
 
@@ -257,6 +258,7 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
     navigable, navigable_room = _unpack(arrays, "navigable"), _typed(arrays, "navigable_room", "i", 1).astype(np.int32)
     if len(navigable) == len(navigable_room):  # else the map itself refuses them
         require_compact_rooms(navigable, navigable_room, arrays["rooms"].size)
+    levelling_of(about["parameters"])  # fails here, not where points are moved by it
     return TopometricMap(
         grid=_unpack(arrays, "grid"),
         room=_typed(arrays, "room", "i", 1).astype(np.int32),

@@ -8,30 +8,37 @@ from typing import Any
 from topomerge.io.listing import plain
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.result import Matching
-from topomerge.types import TopometricMap
+from topomerge.types import LEVELLED, Array, TopometricMap, between_files, is_level
 
 MATCHING_FORMAT = 1
 
 
 def matching_to_json(matching: Matching, a: TopometricMap, b: TopometricMap) -> dict[str, Any]:
-    """Rooms with their probabilities and all hypotheses; matrices are row-major and map points of b into the frame of a."""
+    """Rooms with their probabilities and all hypotheses; matrices are row-major and map points of the file of b into
+    the frame of that of a."""
     rows = zip(matching.rooms.tolist(), matching.probability.tolist(), strict=True)
     listing = {
         "format": MATCHING_FORMAT,
-        "maps": [{"source": m.source, "rooms": len(m.rooms), "storeys": len(m.storeys)} for m in (a, b)],
+        "maps": [map_to_entry(m) for m in (a, b)],
         "matches": [{"rooms": rooms, "probability": round(p, 4)} for rooms, p in rows],
-        "hypotheses": [_hypothesis(h) for h in matching.alternatives],
+        "hypotheses": [_hypothesis(h, between_files(h.transform, b.levelling, a.levelling)) for h in matching.alternatives],
         "statistics": dict(matching.statistics),
     }
     out: dict[str, Any] = plain(listing)
     return out
 
 
-def _hypothesis(h: PoseHypothesis) -> dict[str, Any]:
+def map_to_entry(map: TopometricMap) -> dict[str, Any]:
+    """What a listing of several maps says of each: its file, how many rooms and storeys it has, and how it was levelled."""
+    levelled = {} if is_level(map.levelling) else {LEVELLED: map.levelling.tolist()}
+    return {"source": map.source, "rooms": len(map.rooms), "storeys": len(map.storeys), **levelled}
+
+
+def _hypothesis(h: PoseHypothesis, matrix: Array) -> dict[str, Any]:
     return {
         "probability": round(h.probability, 4),
         "score": round(h.score, 3),
-        "transform": {"matrix": h.transform.matrix.tolist(), "scale": h.transform.scale, "yaw": h.transform.yaw},
+        "transform": {"matrix": matrix.tolist(), "scale": h.transform.scale, "yaw": h.transform.yaw},
         "rooms": h.rooms.tolist(),
         "evidence": dict(h.features),
     }

@@ -7,6 +7,15 @@ points of map b into the frame of map a. A room label of -1 means "no room".
 from topomerge.types.arrays import Array
 from topomerge.types.cloud import PointCloud, TrueRoom
 from topomerge.types.grid import VoxelGrid
+from topomerge.types.levelling import (
+    LEVELLED,
+    between_files,
+    between_maps,
+    checked_levelling,
+    is_level,
+    levelling_of,
+    transformed,
+)
 from topomerge.types.similarity import Sim3
 from topomerge.types.some_rooms import confident, of_rooms
 from topomerge.types.topometric_map import (
@@ -32,6 +41,7 @@ __all__ = [
     "FIXTURE_DTYPE",
     "FIXTURE_KINDS",
     "JOINED",
+    "LEVELLED",
     "OLDER_EDGE_DTYPE",
     "ROOM_DTYPE",
     "ROOM_ODDS",
@@ -43,9 +53,15 @@ __all__ = [
     "TopometricMap",
     "TrueRoom",
     "VoxelGrid",
+    "between_files",
+    "between_maps",
+    "checked_levelling",
     "confident",
     "door_state",
+    "is_level",
+    "levelling_of",
     "mostly_unseen",
     "of_rooms",
+    "transformed",
     "with_outline_odds",
 ]

@@ -39,6 +39,7 @@ class PointCloud:
         source: file that the points come from.
         warnings: what looked wrong while it was read.
         intensities: (N,) float32, how much of its light came back, in whatever the file counts in.
+        upright: z is known to be up, so that nobody needs to level it: of a plan, a building model, a simulated scan.
 
     Raises:
         ValueError: arrays of other shapes, or points that are no array of numbers.
@@ -55,6 +56,7 @@ class PointCloud:
     source: str = ""
     warnings: tuple[str, ...] = ()
     intensities: Array | None = None
+    upright: bool = False
 
     def __post_init__(self) -> None:
         numbers = isinstance(self.points, np.ndarray) and self.points.dtype.kind in "biuf"

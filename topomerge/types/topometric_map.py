@@ -11,6 +11,7 @@ import numpy as np
 
 from topomerge.types.arrays import Array, require
 from topomerge.types.grid import VoxelGrid
+from topomerge.types.levelling import levelling_of
 
 JOINED = " + "  # between the sources of a joined map
 ROOM_DTYPE = np.dtype(
@@ -195,6 +196,11 @@ class TopometricMap:
     def title(self) -> str:
         """Names of the files that it was made from, without their folders."""
         return JOINED.join(Path(source).name or "map" for source in self.source.split(JOINED))
+
+    @property
+    def levelling(self) -> Array:
+        """(4, 4) float64 that takes points of its file into the frame of the map: the identity unless the cloud was tilted."""
+        return levelling_of(self.parameters)
 
     @property
     def open_edges(self) -> Array:

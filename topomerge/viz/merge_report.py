@@ -290,7 +290,7 @@ def _made(result: MergeResult) -> Markup:
     matching = {"descriptor of rooms": result.descriptor or "–"}
     tables = [facts(sources, "Maps"), facts(matching, "Matching"), facts(seconds, "Seconds")]
     if result.transforms:
-        matrix = result.transforms[1].matrix
+        matrix = result.file_transforms[1]
         rows = {f"row {k}": "  ".join(f"{v:.6g}" for v in row) for k, row in enumerate(matrix.tolist())}
         tables.append(facts(rows, "T_ab: points of b into the frame of a"))
     return section("How it was made", element("div", *tables, class_="facts-row"), "made")

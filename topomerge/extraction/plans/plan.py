@@ -29,6 +29,9 @@ from topomerge.types import Array, VoxelGrid
 
 ROOM_WALLS = WallRule(lacking=2, neighbours=8, least_bands=3)  # fewer bands show the upper side of a ceiling, beside higher ones
 THIN = 0.4  # share of the usual wall's levels: what has fewer is no wall
+UPRIGHT_BANDS = 3  # of the bands in which walls are looked for: a table's top fills one, or two where noise spreads it
+ROOFLESS_SHARE = 0.1  # of the floor that was seen, over which something is: less, and the scan has no ceiling
+FURNITURE_HEIGHTS = 0.25, 1.9  # m above the floor
 OVER_FURNITURE = 2.05  # m: cupboards end below
 BLOCK = 0.5  # m: ceilings are measured on tiles of this size
 CLUTTER = 0.9  # m: free-standing pieces of wall shorter than this are pillars and the like
@@ -90,6 +93,8 @@ def storey_plan(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, k: int, cr
     on_floor = (profile & np.uint64(bands.mask(-0.3, 0.3))) != 0
     reach = np.where(_open_below(grid, cells[storey[floor] == k - 1], low, base), FLOOR_REACH, COVERED_REACH)
     covered = ~np.isnan(clear)
+    if covered[seen].sum() < ROOFLESS_SHARE * seen.sum():  # the scan ends below the ceiling, but furniture stands on floor
+        covered |= ((profile & np.uint64(bands.mask(*FURNITURE_HEIGHTS))) != 0) & enclosed_columns(wall, e)
     if crossed is not None:
         covered |= _looked_through(crossed, grid, low, base) & enclosed_columns(wall, e)  # what lies before windows is no room
     inside = seen | (on_floor & (far * e <= FLOOR_REACH)) | (covered & (far * e <= reach))
@@ -168,9 +173,11 @@ def profile_bands(edge: float) -> HeightBands:
 
 
 def _filled_like_walls(profile: Array, bands: HeightBands) -> Array:
-    """Is the column filled like a wall, at the heights at which the sensor looked?"""
+    """Is the column filled like a wall, at the heights at which the sensor looked? Worktops and tables fill whole areas at their
+    height: beside what stands upright they would make the heights above them seem unseen, and themselves walls."""
     filled = band_stack(profile, bands)
-    filled = filled[observed_bands(filled)]
+    upright = filled.sum(axis=0) >= UPRIGHT_BANDS
+    filled = filled[observed_bands(filled) | observed_bands(filled & upright)]
     like = wall_columns(filled, ROOM_WALLS)
     if len(filled) < ROOM_WALLS.least_bands:
         return like

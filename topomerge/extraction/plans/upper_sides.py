@@ -8,17 +8,22 @@ from scipy import ndimage
 from topomerge.extraction.ceilings import CARRIED, NOWHERE
 from topomerge.extraction.plans.plan import columns_of
 from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.slices import SIGHT_DIRECTIONS, walled_directions
 from topomerge.kernels.columns import hollow_below
 from topomerge.types import Array, VoxelGrid
 
 SHEET_THICKNESS = 0.2  # m: thinner than a floor that carries somebody
 STOREY_BELOW = 1.2, 8.0  # m of empty space under a ceiling: at least, at most
+ONE_SIDED_SHARE = 0.6  # of the directions in which a place sees a wall, on average: beside one long wall half of them
+FLOOR_HEIGHTS = -0.3, 0.3  # m about the level of a storey, between which its floor lies
+LEAST_FLOOR_SHARE = 0.1  # of a region in which a floor was seen
 OPEN_SHARE = 0.25  # of the outline with walls, and of the floor with a ceiling: less, and a floor may be a ceiling
 
 
 def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places: Array = NOWHERE) -> Array:
     """The regions of an upper storey less those that are the upper side of a ceiling: nothing above, and either no walls around
-    or so thin that nobody is carried, with a storey right below.
+    or so thin that nobody is carried, with a storey right below. The flat roof of low rooms beside a hall has walls on one side:
+    those of the hall, which so becomes no storey of its own.
 
     Args:
         grid: occupied cells.
@@ -47,5 +52,10 @@ def without_upper_sides(grid: VoxelGrid, plan: StoreyPlan, region: Array, places
     heights = (round(height / grid.edge) for height in (SHEET_THICKNESS, *STOREY_BELOW))
     hollow = hollow_below(*grid._bricks, cells, 1, *heights)
     thin = np.bincount(region[tuple(at.T)], hollow, minlength=count) > 0.5 * size
-    ceiling = suspect & (thin | (beside_walls < OPEN_SHARE))
+    directions = walled_directions(plan.wall, plan.edge) / SIGHT_DIRECTIONS
+    walls_around = np.bincount(region[in_region], directions[in_region], minlength=count) / size
+    ceiling = suspect & (thin | (beside_walls < OPEN_SHARE) | (walls_around < ONE_SIDED_SHARE))
+    if ceiling.any():  # what the hall beside a roof adds to that has no floor
+        on_floor = (plan.profile & plan.profile.dtype.type(plan.bands.mask(*FLOOR_HEIGHTS))) != 0
+        ceiling |= np.bincount(region[in_region], on_floor[in_region], minlength=count) < LEAST_FLOOR_SHARE * size
     return np.where(in_region & ceiling[np.where(in_region, region, 0)], -1, region)

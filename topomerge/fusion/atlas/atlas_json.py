@@ -13,7 +13,7 @@ from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.stored import ATLAS_FORMAT, Stored
 from topomerge.fusion.result import transform_to_json
 from topomerge.io.listing import plain
-from topomerge.types import Sim3
+from topomerge.types import LEVELLED, Sim3, between_files, is_level
 
 
 def component_to_json(atlas: AtlasResult, stored: Stored, n: int) -> dict[str, Any]:
@@ -34,10 +34,12 @@ def atlas_to_json(atlas: AtlasResult, stored: Stored, components: Sequence[Mappi
     """atlas.json, see docs/outputs.md."""
     into = {k: members[0] for members in atlas.components for k in members}
     moved = sorted(k for k, first in into.items() if k != first or atlas.transforms[k] != Sim3())
-    poses = {str(k): transform_to_json(atlas.transforms[k], atlas.residuals[k], into[k]) for k in moved}
+    lying = {k: between_files(atlas.transforms[k], stored.entries[k].levelling, stored.entries[into[k]].levelling) for k in moved}
+    poses = {str(k): transform_to_json(atlas.transforms[k], atlas.residuals[k], lying[k], into[k]) for k in moved}
     maps = [
         {"name": e.name, "file": e.file, "key": e.key, "source": e.source, "rooms": e.rooms, "storeys": e.storeys}
         | ({} if e.frame == Sim3() else {"frame": e.frame.matrix.tolist()})
+        | ({} if is_level(e.levelling) else {LEVELLED: e.levelling.tolist()})
         for e in stored.entries
     ]
     listing = {

@@ -132,7 +132,8 @@ def remove(folder: str | Path, names: Sequence[str], report: Report) -> AtlasRes
 
 def entry_of(name: str, map: TopometricMap, stored: Stored) -> Entry:
     """The entry of a map that an atlas does not hold yet, under its name or, where that is taken, under another one."""
-    return Entry(_free_name(name, stored.entries), map_key(map), map.source or name, len(map.rooms), len(map.storeys))
+    free_name, source, counts = _free_name(name, stored.entries), map.source or name, (len(map.rooms), len(map.storeys))
+    return Entry(free_name, map_key(map), source, *counts, levelling=map.levelling)
 
 
 def _free_name(name: str, entries: Iterable[Entry]) -> str:

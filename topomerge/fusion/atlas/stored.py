@@ -14,7 +14,7 @@ from topomerge.errors import InputError
 from topomerge.fusion.atlas.folder import finished
 from topomerge.fusion.atlas.solve import AtlasSettings
 from topomerge.fusion.bend.placement import similarity
-from topomerge.types import Sim3
+from topomerge.types import Array, Sim3, between_maps, levelling_of
 
 ATLAS_FORMAT = 1
 
@@ -27,6 +27,7 @@ class Entry:
         key: hash of its content (`map_key`).
         source: the file that it came from.
         frame: its pose in the frame of the map that it replaced, for good.
+        levelling: (4, 4) that takes points of its file into its frame (`levelling_of`).
     """
 
     name: str
@@ -35,6 +36,7 @@ class Entry:
     rooms: int
     storeys: int
     frame: Sim3 = field(default_factory=Sim3)
+    levelling: Array = field(default_factory=lambda: np.eye(4), compare=False)
 
     @property
     def file(self) -> str:
@@ -109,8 +111,11 @@ class Stored:
             matrices = {int(k): np.array(t["matrix"], np.float64) for k, t in listing.get("transforms", {}).items()}
             out = {}
             for n, component in enumerate(listing.get("components", [])):
+                into = self.entries[component["maps"][0]].levelling
                 for k in component["maps"]:
-                    out[self.entries[k].name] = (n, similarity(matrices[k]) if k in matrices else Sim3())
+                    entry = self.entries[k]
+                    lying = between_maps(matrices[k], entry.levelling, into) if k in matrices else None
+                    out[entry.name] = (n, Sim3() if lying is None else similarity(lying))
         except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
             raise self._damaged() from error
         return out
@@ -160,7 +165,8 @@ def read_finished(folder: Path) -> Stored:
 
 def _entry(listed: Mapping[str, Any]) -> Entry:
     frame = similarity(np.array(listed["frame"], np.float64)) if "frame" in listed else Sim3()
-    return Entry(listed["name"], listed["key"], listed["source"], int(listed["rooms"]), int(listed["storeys"]), frame)
+    levelling = levelling_of(listed)
+    return Entry(listed["name"], listed["key"], listed["source"], int(listed["rooms"]), int(listed["storeys"]), frame, levelling)
 
 
 def files_of(component: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:

@@ -15,9 +15,12 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
-from topomerge.types import Sim3, TopometricMap
+from topomerge.types import Array, Sim3, TopometricMap, is_level, levelling_of
 
 LISTINGS = ("merge.json", "atlas.json")
 SAME_SCALE = 1e-6
@@ -25,11 +28,16 @@ SAME_SCALE = 1e-6
 
 @dataclass(frozen=True)
 class FramePose:
-    """The pose of a map's frame in that of another one: it takes points of the child into the parent."""
+    """The pose of a map's frame in that of another one: it takes points of the child into the parent.
+
+    Args:
+        tilted: (4, 4) float64, the pose, where either file was tilted, so that it is more than a turn about the vertical.
+    """
 
     parent: str
     child: str
     pose: Sim3
+    tilted: Array | None = None
 
 
 def save(map: TopometricMap, path: Path, transforms: Sequence[FramePose] = ()) -> None:
@@ -50,8 +58,13 @@ def _node(number: int, transform: FramePose) -> str:
     if abs(pose.scale - 1) > SAME_SCALE:
         at = f"{transform.child} is {pose.scale:.4g} times as large in the frame of {transform.parent}"
         raise InputError(f"tf2: {at}, and transforms of ROS can't scale; read it again with --scale {pose.scale:.6g}")
-    place = dict(zip(("x", "y", "z"), pose.translation, strict=True))
-    turn = {"qx": 0.0, "qy": 0.0, "qz": math.sin(pose.yaw / 2), "qw": math.cos(pose.yaw / 2)}
+    if transform.tilted is None:
+        translation, quaternion = pose.translation, (0.0, 0.0, math.sin(pose.yaw / 2), math.cos(pose.yaw / 2))
+    else:
+        translation = tuple(transform.tilted[:3, 3])
+        quaternion = tuple(Rotation.from_matrix(transform.tilted[:3, :3] / pose.scale).as_quat())
+    place = dict(zip(("x", "y", "z"), translation, strict=True))
+    turn = dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True))
     words = [f"--{name} {float(value)!r}" for name, value in {**place, **turn}.items()]
     words += [f"--frame-id {transform.parent}", f"--child-frame-id {transform.child}"]
     node = f'pkg="tf2_ros" exec="static_transform_publisher" name="map_frame_{number}"'
@@ -75,18 +88,21 @@ def frame_poses(folder: Path, names: Sequence[str] = ()) -> list[FramePose]:
         listing: Any = json.loads(file.read_text(encoding="utf-8"))
         sources = [str(m.get("name") or m["source"]) for m in listing["maps"]]
         frames = _frames(sources, names)
-        poses = sorted((int(k), int(t["into"]), _pose(t)) for k, t in listing["transforms"].items())
-        return [FramePose(frames[into], frames[k], pose) for k, into, pose in poses]
+        levelled = [levelling_of(m) for m in listing["maps"]]
+        entries = sorted((int(k), int(t["into"]), t) for k, t in listing["transforms"].items())
+        return [_frame_pose((frames[into], frames[k]), t, (levelled[into], levelled[k])) for k, into, t in entries]
     except InputError:
         raise
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{file}: damaged ({' '.join(str(error).split())[:100]}); merge the maps again") from error
 
 
-def _pose(entry: Mapping[str, Any]) -> Sim3:
-    """Of an entry of `transforms` (docs/outputs.md)."""
+def _frame_pose(frames: tuple[str, str], entry: Mapping[str, Any], levelled: tuple[Array, Array]) -> FramePose:
+    """The pose of the second frame in the first one, of an entry of `transforms` (docs/outputs.md)."""
     x, y, z = (float(row[3]) for row in entry["matrix"][:3])
-    return Sim3(math.radians(float(entry["yaw_deg"])), (x, y, z), float(entry["scale"]))
+    pose = Sim3(math.radians(float(entry["yaw_deg"])), (x, y, z), float(entry["scale"]))
+    matrix = None if all(map(is_level, levelled)) else np.array(entry["matrix"], np.float64)
+    return FramePose(*frames, pose, matrix)
 
 
 def _frames(sources: Sequence[str], names: Sequence[str]) -> list[str]:
