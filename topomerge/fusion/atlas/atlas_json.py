@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from topomerge import __version__
-from topomerge.fusion.atlas.assembly import Link
+from topomerge.fusion.atlas.link_evidence import Link
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.stored import ATLAS_FORMAT, Stored
 from topomerge.fusion.result import transform_to_json

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from topomerge.fusion.atlas.contradictions import LEAST_CONFLICT, Conflict, find_conflicts
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.judge import Judge
 from topomerge.fusion.pose_difference import pose_difference
@@ -24,9 +25,10 @@ LEAST_PROBABILITY = 0.01  # hypotheses below are left out, but for the best
 DRIFT_LIMITS = (1.0, np.radians(4.0), 0.05)  # m, rad, log scale: poses of a pair that are as near are one; drift bends maps
 CHECKED_ONCE = (0.08, np.radians(0.4), 0.005)  # m, rad, log scale: poses that are as near are judged once
 OVERLAP_FLOOR, OVERLAP_WALLS = 2.0, 0.3  # m2 in common, below both of which two maps do not overlap
-NOISE_CONFLICT = 0.3  # m2 of walls on free floor, below which it may be noise
 POSE_USUAL_CONFLICT = 0.12  # share of the walls on free floor that true poses seldom exceed
 CONFLICT_ODDS = 30.0  # log odds against a pose, of each share of 1 above that
+PLACE_ODDS = 0.6  # log odds against a pose, at most, of each place: one room may have been altered
+MOST_AGAINST = 6.0  # log odds
 PLACE_HALF_WIDTH = 1.0  # m, of the place by which a pose is measured
 SAMPLED_COLUMNS = 4000
 T = TypeVar("T")
@@ -41,12 +43,14 @@ class Check:
         log_odds: what speaks for it (above 0) or against it; 0 where the maps hardly overlap.
         overlap: do they?
         features: of `verify.Judge`.
+        conflicts: places at which they contradict each other.
     """
 
     pose: Sim3
     log_odds: float
     overlap: bool
     features: Mapping[str, float]
+    conflicts: tuple[Conflict, ...] = ()
 
 
 def hypotheses(
@@ -118,7 +122,9 @@ class Checks:
         """What maps i and j say to T_ij."""
         if j < i:
             turned = self(j, i, pose.inverse())
-            return Check(turned.pose.inverse(), turned.log_odds, turned.overlap, turned.features)
+            back = turned.pose.inverse()
+            conflicts = tuple(c.moved(back) for c in turned.conflicts)
+            return Check(back, turned.log_odds, turned.overlap, turned.features, conflicts)
 
         def make() -> Check:
             return self.maps.answer(("check", pose, self.scaled), (i, j), lambda: self._judged(i, j, pose))
@@ -133,10 +139,12 @@ class Checks:
         moved, features = pose, judge(pose)
         for candidate in refine(a, b, [PoseHypothesis(pose, from_rooms=True)], self.scaled):
             again = judge(candidate.transform)
-            if alike(candidate.transform, pose, place(a, b, pose).mean(axis=0)) and speaks(again) > speaks(features):
+            if alike(candidate.transform, pose, place(a, b, pose).mean(axis=0)) and score_pose(again) > score_pose(features):
                 moved, features = candidate.transform, again
-        overlap = features["free"] >= OVERLAP_FLOOR or features["walls"] >= OVERLAP_WALLS
-        return Check(moved, speaks(features) if overlap else 0.0, overlap, features)
+        if features["free"] < OVERLAP_FLOOR and features["walls"] < OVERLAP_WALLS:
+            return Check(moved, 0.0, False, features)
+        conflicts = find_conflicts(a, b, moved) if features["conflict"] > LEAST_CONFLICT else ()
+        return Check(moved, score_pose(features, len(conflicts)), True, features, conflicts)
 
 
 def _once(
@@ -151,15 +159,21 @@ def _once(
     return entries[-1][1]
 
 
-def speaks(f: Mapping[str, float]) -> float:
+def score_pose(f: Mapping[str, float], places: float = np.inf) -> float:
     """Log odds for a pose that other maps propose. Little in common says little: only walls on free floor speak against it.
 
     Of hypotheses of simulated training pairs, nine in ten of the right ones have a plausibility above -4, one in twenty of the
     wrong ones; walls on free floor are more than `POSE_USUAL_CONFLICT` of the walls in one of twenty right ones, in three of four
     wrong ones.
+
+    Args:
+        f: features of `verify.Judge`.
+        places: at which the maps contradict each other. Each speaks by itself, and as one of them may be a room that was
+            altered, none says more than `PLACE_ODDS`.
     """
-    excess = max(f["conflict_share"] - POSE_USUAL_CONFLICT, 0.0) if f["conflict"] > NOISE_CONFLICT else 0.0
-    return float(np.clip(plausibility(f) + 3.0, 0.0, 3.0)) - min(CONFLICT_ODDS * excess, 6.0)
+    excess = max(f["conflict_share"] - POSE_USUAL_CONFLICT, 0.0) if f["conflict"] > LEAST_CONFLICT else 0.0
+    against = min(CONFLICT_ODDS * excess, PLACE_ODDS * places, MOST_AGAINST) if excess else 0.0
+    return float(np.clip(plausibility(f) + 3.0, 0.0, 3.0)) - against
 
 
 def alike(p: Sim3, q: Sim3, at: Array, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:

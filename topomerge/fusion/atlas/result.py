@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.assembly import Link
+from topomerge.fusion.atlas.link_evidence import Link
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.fuse import fuse

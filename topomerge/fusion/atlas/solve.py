@@ -16,7 +16,8 @@ import numpy as np
 
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.assembly import Assembler, Assembly, Link
+from topomerge.fusion.atlas.assembly import Assembler, Assembly
+from topomerge.fusion.atlas.link_evidence import Link
 from topomerge.fusion.atlas.maps import Maps, bent_together
 from topomerge.fusion.atlas.memory import Facts, Memory
 from topomerge.fusion.atlas.pairs import Checks, hypotheses
@@ -255,7 +256,7 @@ def _result(
     bends: dict[int, Deformation] = {}
     warnings: list[str] = []
     for component in assembly.components:
-        poses, edges = explorer.assembler.settled(component, assembly.links, fine)
+        poses, edges = explorer.assembler.settle(component, assembly.links, fine)
         if not rigid and len(component) > 1:
             pairs = sorted({link.maps for link in assembly.links if link.maps[0] in component})
             poses, deformations, reason = bent_together(explorer.maps, poses, pairs, explorer.scale == "free")
