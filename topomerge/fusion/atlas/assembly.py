@@ -114,7 +114,7 @@ class Assembler:
                 a, b = assembly.of(pair[0]), assembly.of(pair[1])
                 if a is b or (n in refused and refused[n][0] is a and refused[n][1] is b):
                     continue
-                link = self.evidence.score_link(a, b, pair, h)
+                link = self.evidence.score_link(a, b, pair, h, least=self.limit)
                 if link.log_odds >= self.limit:
                     self._join(assembly, a, b, link)
                     again = True
@@ -167,8 +167,10 @@ class Assembler:
                 first, second = (a, b) if pair[0] in a else (b, a)
                 if pair[0] not in first or pair[1] not in second:
                     continue
+                then = self.evidence.score_link(first, second, pair, h, least=self.limit)
+                if then.log_odds < self.limit:
+                    continue
                 now = self._rescore(assembly, link)
-                then = self.evidence.score_link(first, second, pair, h)
                 if then.log_odds >= max(now.log_odds + EXCHANGE_GAIN, self.limit):
                     yield link, then, (a, b)
 

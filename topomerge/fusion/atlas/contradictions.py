@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from topomerge.kernels import align
 from topomerge.matching.plan_fields import FREE_MARGIN, PlanFields
@@ -104,13 +106,32 @@ def sum_places(costs: Iterable[tuple[Array, float]]) -> float:
     return sum(cost for _, cost in distinct)
 
 
-def rooms_near(map: TopometricMap, at: Array) -> tuple[int, ...]:
-    """Rooms in whose floor places (n, 3), m, lie, by the nearest floor; those that hold a tenth of the places at least."""
-    if map.navigable is None or not len(at) or not len(map.navigable.cells):
-        return ()
-    from scipy.spatial import cKDTree
+def locate_contradiction(
+    pair: tuple[int, int], conflict: Conflict, maps: tuple[TopometricMap, TopometricMap], pose: Sim3, columns: Array, frame: Sim3
+) -> Contradiction:
+    """A conflict of two joined maps with the rooms in which it lies.
 
+    Args:
+        maps: i and j.
+        pose: T_ij.
+        columns: of `conflict_columns`.
+        frame: of map i in its component.
+    """
+    near = columns[np.linalg.norm(columns[:, :2] - conflict.middle[:2], axis=1) <= PLACE_REACH, :3]
+    rooms = rooms_near(maps[0], near), rooms_near(maps[1], pose.inverse().apply(near))
+    return Contradiction(pair, rooms, conflict.moved(frame).middle, conflict.area)
+
+
+def rooms_near(map: TopometricMap, at: Array) -> tuple[int, ...]:
+    """Rooms on whose floor places (n, 3), m, lie, or the nearest floor; those that hold a tenth of the places at least."""
+    if not len(at) or not len(map.navigable):
+        return ()
     distance, nearest = cKDTree(map.navigable.centroids()).query(at, distance_upper_bound=PLACE_REACH)
     rooms = map.navigable_room[nearest[np.isfinite(distance)]]
     counts = np.bincount(rooms[rooms >= 0], minlength=1)
     return tuple(int(room) for room in np.flatnonzero(counts >= max(ROOM_SHARE * len(at), 1)))
+
+
+def contradiction_to_json(c: Contradiction) -> dict[str, Any]:
+    """A contradiction as plain values: numbers of both maps, rooms of each, its middle, m, and the area of the walls, m2."""
+    return {"maps": c.maps, "rooms": c.rooms, "at": [round(v, 2) for v in c.middle], "m2": round(c.area, 2)}

@@ -33,7 +33,8 @@ NOT_NAMED = 0.1  # least share of what a pair's best pose leaves that belongs to
 LEAST_SHARE = 1e-6
 WEIGHED_ALREADY = -2.0  # log odds: what a registration that names a placement has weighed itself, unless it is more
 LOOK_ALIKE_LIMITS = (1.5, np.radians(10.0), 0.1)  # m, rad, log scale: as near to a rival a poor fit is the same look-alike
-MOST_RIVALS = 8  # placements that a link is weighed against
+LEAST_RIVAL = 0.01  # of a source's share of the link: rivals with less change nothing
+MOST_RIVALS = 5  # placements that a link is weighed against
 Hypotheses = Mapping[tuple[int, int], tuple[PoseHypothesis, ...]]
 Poses = Mapping[int, Sim3]
 
@@ -82,7 +83,7 @@ def across(a: Poses, b: Poses, pair: tuple[int, int], pose: Sim3) -> Sim3:
     return a[i] @ pose @ b[j].inverse()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Source:
     """What names placements of two maps (i < j).
 
@@ -108,16 +109,26 @@ class LinkEvidence:
 
     def __init__(self, maps: Sequence[int], hypotheses: Hypotheses, checks: Checks) -> None:
         self.maps, self.hypotheses, self.checks = maps, hypotheses, checks
+        self._ways: dict[tuple[int, int, int], tuple[tuple[object, object], Source | None]] = {}
 
-    def score_link(self, a: Poses, b: Poses, pair: tuple[int, int], h: PoseHypothesis, move: Sim3 | None = None) -> Link:
+    def score_link(
+        self,
+        a: Poses,
+        b: Poses,
+        pair: tuple[int, int],
+        h: PoseHypothesis,
+        move: Sim3 | None = None,
+        least: float = -np.inf,
+    ) -> Link:
         """A link between two components, with what all their maps show of it.
 
         Args:
             pair: i and j of the link, one in each component.
             h: a hypothesis of that pair.
             move: where component b lies in a; by the hypothesis if None.
+            least: log odds below which it does not matter how low they are.
         """
-        return _Weighing(self, a, b, pair, h, across(a, b, pair, h.transform) if move is None else move).link()
+        return _Weighing(self, a, b, pair, h, across(a, b, pair, h.transform) if move is None else move).link(least)
 
     def greatest_log_odds(self, pair: tuple[int, int], h: PoseHypothesis) -> float:
         """Log odds of a hypothesis of a pair where everything else speaks for it and all its rivals are ruled out."""
@@ -125,9 +136,7 @@ class LinkEvidence:
         named = next((s for s, other in zip(shares, self.hypotheses[pair], strict=True) if other is h), LEAST_SHARE)
         return float(np.log(named / none)) + CLOSING_GAIN
 
-    def agrees(
-        self, i: int, j: int, p: Sim3, q: Sim3, limits: tuple[float, float, float] = DRIFT_LIMITS
-    ) -> bool:
+    def agrees(self, i: int, j: int, p: Sim3, q: Sim3, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:
         """Are two poses T_ij one, where the maps overlap?"""
         return alike(p, q, self.checks.place(i, j, p).mean(axis=0), limits)
 
@@ -141,6 +150,12 @@ class LinkEvidence:
 
     def source_by_way_of(self, i: int, j: int, k: int) -> Source | None:
         """Placements of maps i < j by the registrations of both with map k: each pose of the one with each of the other."""
+        of = tuple(self.hypotheses.get((min(m, k), max(m, k))) for m in (i, j))
+        if (i, j, k) not in self._ways or any(p is not q for p, q in zip(self._ways[i, j, k][0], of, strict=True)):
+            self._ways[i, j, k] = (of[0], of[1]), self._composed(i, j, k)
+        return self._ways[i, j, k][1]
+
+    def _composed(self, i: int, j: int, k: int) -> Source | None:
         first, second = self._poses(i, k), self._poses(k, j)
         if not first or not second:
             return None
@@ -165,17 +180,23 @@ class _Weighing:
 
     def __init__(self, evidence: LinkEvidence, a: Poses, b: Poses, pair: tuple[int, int], h: PoseHypothesis, move: Sim3) -> None:
         self.evidence, self.a, self.b, self.pair, self.h, self.move = evidence, a, b, pair, h, move
+        self._into = {k: pose.inverse() for k, pose in (*a.items(), *b.items())}
+        self._poses: dict[tuple[tuple[int, int], Sim3], Sim3] = {}
+        self._checks: dict[tuple[tuple[int, int], Sim3], Check] = {}
+        self._shares: dict[Source, float | None] = {}  # of the placement of the link
         self.sources = [evidence.source(min(i, j), max(i, j)) for i in a for j in b]
         i, j = min(pair), max(pair)
         ways = (evidence.source_by_way_of(i, j, k) for k in evidence.maps if k not in a and k not in b)
         self.ways = [way for way in ways if way is not None]
 
-    def link(self) -> Link:
-        """The link with its log odds, and the pair that spoke most against it."""
+    def link(self, least: float) -> Link:
+        """The link with its log odds, or some below the least ones, and the pair that spoke most against it."""
         costs = self._contradictions(self.move)
         against = min(((-cost, pair) for pair, cost in costs[1].items()), default=(0.0, None), key=lambda entry: entry[0])
         log_odds = [self._odds_of_any() - costs[0]]
-        for rival in self._rivals():
+        for rival in self._rivals() if log_odds[0] >= least else ():
+            if log_odds[-1] < least:
+                break
             ahead, loudest = self._ahead_of(rival)
             log_odds.append(ahead - costs[0] + self._contradictions(rival)[0])
             against = min(against, loudest, key=lambda entry: entry[0])
@@ -184,15 +205,22 @@ class _Weighing:
 
     def _pose(self, pair: tuple[int, int], move: Sim3) -> Sim3:
         """T_ij of a pair (i < j) across, if component b lies so in a."""
-        i, j = pair
-        return self.a[i].inverse() @ move @ self.b[j] if i in self.a else (self.a[j].inverse() @ move @ self.b[i]).inverse()
+        if (pair, move) not in self._poses:
+            i, j = pair
+            one, two = (i, j) if i in self.a else (j, i)
+            pose = self._into[one] @ move @ self.b[two]
+            self._poses[pair, move] = pose if one == i else pose.inverse()
+        return self._poses[pair, move]
 
-    def _share(self, source: Source, move: Sim3) -> float | None:
-        """What a source gives to a placement; None where it does not name it."""
-        if move is self.move and source.direct and source.pair == self.pair:  # the link itself, even if others moved it a little
-            pose = self.h.transform
-            return next((share for p, share in source.named if p is pose), None) or self._nearest(source, pose)
-        return self._nearest(source, self._pose(source.pair, move))
+    def _share(self, source: Source) -> float | None:
+        """What a source gives to the placement of the link; None where it does not name it."""
+        if source not in self._shares:
+            pose, named = self._pose(source.pair, self.move), None
+            if source.direct and source.pair == self.pair:  # the link itself, even if others moved it a little
+                pose = self.h.transform
+                named = next((share for p, share in source.named if p is pose), None)
+            self._shares[source] = self._nearest(source, pose) if named is None else named
+        return self._shares[source]
 
     def _nearest(self, source: Source, pose: Sim3, limits: tuple[float, float, float] = DRIFT_LIMITS) -> float | None:
         return next((share for p, share in source.named if self.evidence.agrees(*source.pair, p, pose, limits)), None)
@@ -205,13 +233,15 @@ class _Weighing:
         return max(near, default=None)
 
     def _check(self, pair: tuple[int, int], move: Sim3) -> Check:
-        return self.evidence.checks(*pair, self._pose(pair, move))
+        if (pair, move) not in self._checks:
+            self._checks[pair, move] = self.evidence.checks(*pair, self._pose(pair, move))
+        return self._checks[pair, move]
 
     def _odds_of_any(self) -> float:
         """Log odds of the placement against none at all: of the surest registration that names it, and what others add."""
         odds, supports = [], []
         for source in (*self.sources, *self.ways):
-            share = self._share(source, self.move)
+            share = self._share(source)
             support = 0.0 if share is None else support_of(float(np.log(share / max(1 - share, LEAST_SHARE))))
             if source.direct and source.pair != self.pair:
                 support = max(support, self._check(source.pair, self.move).log_odds)
@@ -225,7 +255,8 @@ class _Weighing:
         places: list[tuple[Array, float]] = []
         for source in self.sources:
             check = self._check(source.pair, move)
-            if check.log_odds >= (WEIGHED_ALREADY if self._share(source, move) is not None else 0.0):
+            named = self._share(source) if move is self.move else self._nearest(source, self._pose(source.pair, move))
+            if check.log_odds >= (WEIGHED_ALREADY if named is not None else 0.0):
                 continue
             costs[source.pair] = -check.log_odds
             first = source.pair[0]
@@ -236,7 +267,12 @@ class _Weighing:
 
     def _rivals(self) -> list[Sim3]:
         """Other placements that sources name, those with the largest shares."""
-        named = [(share, source, pose) for source in (*self.sources, *self.ways) for pose, share in source.named]
+        named = [
+            (share, source, pose)
+            for source in (*self.sources, *self.ways)
+            for pose, share in source.named
+            if share >= (self._share(source) or source.none) * LEAST_RIVAL
+        ]
         rivals: list[Sim3] = []
         for _, source, pose in sorted(named, key=lambda entry: (-entry[0], entry[1].pair)):
             i, j = source.pair
@@ -252,7 +288,7 @@ class _Weighing:
         named: list[tuple[float, bool, bool]] = []  # log odds, is the placement that loses named, too, is it seen
         loudest: tuple[float, tuple[int, int] | None] = (0.0, None)
         for source in (*self.sources, *self.ways):
-            shares = self._share(source, self.move), self._rival_share(source, rival)
+            shares = self._share(source), self._rival_share(source, rival)
             seen = [not source.direct or self._check(source.pair, move).overlap for move in (self.move, rival)]
             if source.named:
                 odds = float(np.log((shares[0] or source.none) / (shares[1] or source.none)))
