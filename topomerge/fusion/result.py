@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from topomerge.fusion.atlas.contradictions import contradiction_to_json
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.bend.placement import Placement, bend_to_json, placements, with_bends
 from topomerge.fusion.evidence.places import Places
@@ -133,6 +134,7 @@ def merge_to_json(result: MergeResult) -> dict[str, Any]:
         "points": {str(k): name for k, name in sorted(result.points.items())},
         "alternatives": {name: round(p, 6) for name, p in registration.posterior.items()} if registration else {},
         "places": places_to_json(registration.places) if registration and registration.places else [],
+        "contradictions": [contradiction_to_json(c) for c in result.atlas.contradictions] if result.atlas else [],
     }
     plain_listing: dict[str, Any] = plain(listing)
     return plain_listing

@@ -10,8 +10,9 @@ import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map, truth
 from topomerge.fusion.atlas import pairs
+from topomerge.fusion.atlas.contradictions import Conflict
 from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.pairs import Checks, alike, hypotheses, place, speaks
+from topomerge.fusion.atlas.pairs import Checks, alike, hypotheses, place, score_pose
 from topomerge.fusion.registration import Registration
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
@@ -75,9 +76,19 @@ def test_what_walls_on_free_floor_say(monkeypatch):
     """The plausibility speaks for a pose up to 3; each share of the walls on free floor above 0.12 costs 30, at most 6."""
     monkeypatch.setattr(pairs, "plausibility", lambda f: f["said"])
     f = {"said": -1.0, "conflict": 2.0, "conflict_share": 0.12}
-    assert speaks(f) == 2.0 and speaks({**f, "said": 9.0}) == 3.0 and speaks({**f, "said": -9.0}) == 0.0
-    assert speaks({**f, "conflict_share": 0.22}) == pytest.approx(-1.0) and speaks({**f, "conflict_share": 0.9}) == -4.0
-    assert speaks({**f, "conflict_share": 0.9, "conflict": 0.3}) == 2.0  # so little may be noise
+    assert score_pose(f) == 2.0 and score_pose({**f, "said": 9.0}) == 3.0 and score_pose({**f, "said": -9.0}) == 0.0
+    assert score_pose({**f, "conflict_share": 0.22}) == pytest.approx(-1.0) and score_pose({**f, "conflict_share": 0.9}) == -4.0
+    assert score_pose({**f, "conflict_share": 0.9, "conflict": 0.3}) == 2.0  # so little may be noise
+
+
+@pytest.mark.parametrize(("areas", "against"), [((2.0,), 0.6), ((1.0, 1.0), 2.1), ((0.5, 0.5, 0.5, 0.5), 5.1), ((0.4,) * 5, 6.0),
+    ((1.4,), 0.6 + 1.5 * 2), ((), 6.0)])  # fmt: skip
+def test_one_altered_room_says_little_and_many_places_say_much(monkeypatch, areas, against):
+    """Each place says so much at most; what is scattered counts as further places, one for each 0.3 m2."""
+    monkeypatch.setattr(pairs, "plausibility", lambda f: -3.0)
+    f = {"conflict": 2.0, "conflict_share": 0.9}
+    assert score_pose(f, [Conflict((0.0, 0.0, 0.0), area) for area in areas]) == pytest.approx(-against)
+    assert score_pose({**f, "conflict_share": 0.13}, [Conflict((0.0, 0.0, 0.0), 2.0)]) == pytest.approx(-0.3)  # little by share
 
 
 def test_hypotheses_share_the_probability_that_one_of_them_is_right(monkeypatch):

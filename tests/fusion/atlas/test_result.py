@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.assembly import Link
+from topomerge.fusion.atlas.link_evidence import Link
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3

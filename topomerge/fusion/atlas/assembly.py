@@ -1,53 +1,28 @@
-"""Hypotheses of pairs -> sets of maps that lie in one frame without contradiction (method 4: agreement around cycles).
+"""Hypotheses of pairs -> sets of maps that lie in one frame (method 4: agreement around cycles).
 
-Links are taken in the order of their probability, as in a maximum spanning tree, but each is heard before: every two maps that it
-would bring over each other say what they think of that, its own two if they contradict it; and a third map that lies with neither
-yet, if by way of it they lie as the link says. What contradicts better evidence is rejected, and named. Maps that no hypothesis
-joins, by others or directly, say nothing to each other: each set of maps that may come together is assembled by itself, and only
-anew when more of its pairs were registered.
+Links are taken in the order of their probability, as in a maximum spanning tree, but each is weighed before by all that the maps
+show which it would bring over each other (`link_evidence`). What contradicts better evidence is rejected, and named. Maps that no
+hypothesis joins, by others or directly, show nothing of each other: each set of maps that may come together is assembled by
+itself, and only anew when more of its pairs were registered.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from topomerge.fusion.atlas.cycles import Hypotheses, Poses, across, same_place_odds, ways_round
+from topomerge.fusion.atlas.link_evidence import Hypotheses, Link, LinkEvidence, Poses, across, parted, support_of
 from topomerge.fusion.atlas.map_sets import sets_of_maps
-from topomerge.fusion.atlas.pairs import Check, Checks, alike
+from topomerge.fusion.atlas.pairs import Check, Checks
 from topomerge.fusion.atlas.pose_graph import Measured, optimise
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 
-BACKING = 1.5  # log odds that other maps may add: look-alikes of a place are alike to all maps of it
-VOICE_VETO = -2.0  # log odds of one of them, below which nothing makes up for it
-DOUBT = 0.3  # probability: a hypothesis above it contradicts another place
 BELIEVED = 0.5  # probability
 EXCHANGE_GAIN = 0.5  # log odds by which another link must be better to take a link's place
 HEAVIEST_WALLS = 20.0  # m2 of walls in common, above which a measurement counts no more
-
-
-@dataclass(frozen=True)
-class Link:
-    """A hypothesis that was taken, or rejected.
-
-    Args:
-        maps: i and j; `hypothesis` is the pose T_ij.
-        log_odds: that it is right, with what all maps say that it brings over each other.
-        against: the pair that spoke loudest against it, if any did.
-    """
-
-    maps: tuple[int, int]
-    hypothesis: PoseHypothesis
-    log_odds: float
-    against: tuple[int, int] | None = None
-
-    @property
-    def probability(self) -> float:
-        """Of `log_odds`."""
-        return float(1 / (1 + np.exp(-np.clip(self.log_odds, -30, 30))))
 
 
 @dataclass(eq=False)
@@ -70,11 +45,21 @@ class Assembler:
         hypotheses: by pair, most probable first; pairs may be added between two assemblies.
         limit: log odds from which a link is believed.
         scaled: are the scales free, too?
+        maps: their numbers, if they are others than those from 0 on.
     """
 
-    def __init__(self, count: int, hypotheses: Hypotheses, checks: Checks, limit: float, scaled: bool = False) -> None:
-        self.maps: Sequence[int] = range(count)
+    def __init__(
+        self,
+        count: int,
+        hypotheses: Hypotheses,
+        checks: Checks,
+        limit: float,
+        scaled: bool = False,
+        maps: Sequence[int] | None = None,
+    ) -> None:
+        self.maps: Sequence[int] = range(count) if maps is None else maps
         self.hypotheses, self.checks, self.limit, self.scaled = hypotheses, checks, limit, scaled
+        self.evidence = LinkEvidence(self.maps, hypotheses, checks)
         self._settled: dict[tuple[Hashable, ...], tuple[dict[int, Sim3], list[Measured]]] = {}
         self._built: dict[tuple[int, ...], tuple[set[tuple[int, int]], Assembly]] = {}  # of sets of maps, with their pairs
 
@@ -85,8 +70,8 @@ class Assembler:
         for maps, within in sets_of_maps(len(self.maps), candidates, self.hypotheses):
             pairs, assembly = self._built.get(maps, (set(), None))
             if assembly is None or pairs != set(within):
-                part = Assembler(0, within, self.checks, self.limit, self.scaled)
-                part.maps, part._settled = maps, self._settled
+                part = Assembler(0, within, self.checks, self.limit, self.scaled, maps)
+                part._settled = self._settled
                 assembly = part._assembled()
             built[maps] = set(within), assembly
         self._built = built
@@ -103,7 +88,7 @@ class Assembler:
         while True:  # ends: each time one more pair is banned
             assembly = self._grown(banned)
             self._exchange(assembly)
-            links = self._heard(assembly)
+            links = self._rescored(assembly)
             weak = [link for link in links if link.log_odds < self.limit]
             if not weak:
                 break
@@ -113,15 +98,10 @@ class Assembler:
         return assembly
 
     def _candidates(self, banned: set[tuple[int, int]]) -> list[tuple[tuple[int, int], PoseHypothesis]]:
-        """Hypotheses that could be believed with all backing, most probable first."""
+        """Hypotheses that could be believed if everything else spoke for them, most probable first."""
         candidates = [(pair, h) for pair, hs in self.hypotheses.items() if pair not in banned for h in hs]
-        candidates = [(pair, h) for pair, h in candidates if h.log_odds + self._backing(pair, h) >= self.limit]
+        candidates = [(pair, h) for pair, h in candidates if self.evidence.greatest_log_odds(pair, h) >= self.limit]
         return sorted(candidates, key=lambda e: (-e[1].log_odds, e[0]))
-
-    def _backing(self, pair: tuple[int, int], h: PoseHypothesis) -> float:
-        """Log odds that backing may add: it may tell a hypothesis from its rivals, and speak for it."""
-        any_of_them = min(sum(other.probability for other in self.hypotheses[pair]), 0.999)
-        return max(PoseHypothesis(h.transform, probability=any_of_them).log_odds - h.log_odds, 0.0) + BACKING
 
     def _grown(self, banned: set[tuple[int, int]]) -> Assembly:
         assembly = Assembly([{k: Sim3()} for k in self.maps])
@@ -134,7 +114,7 @@ class Assembler:
                 a, b = assembly.of(pair[0]), assembly.of(pair[1])
                 if a is b or (n in refused and refused[n][0] is a and refused[n][1] is b):
                     continue
-                link = self.heard(a, b, pair, h)
+                link = self.evidence.score_link(a, b, pair, h, least=self.limit)
                 if link.log_odds >= self.limit:
                     self._join(assembly, a, b, link)
                     again = True
@@ -148,73 +128,15 @@ class Assembler:
         joined = {**a, **{k: move @ pose for k, pose in b.items()}}
         assembly.components = [c for c in assembly.components if c is not a and c is not b]
         assembly.links.append(link)
-        assembly.components.append(self.settled(joined, assembly.links)[0])
+        assembly.components.append(self.settle(joined, assembly.links)[0])
 
-    def heard(
-        self, a: Poses, b: Poses, pair: tuple[int, int], h: PoseHypothesis, rival_of: tuple[int, int] | None = None
-    ) -> Link:
-        """A link between two components with what all their maps say to it.
-
-        Args:
-            rival_of: the pair whose claim this one contradicts; it is not asked, and contradictions are not looked into.
-        """
-        move = across(a, b, pair, h.transform)
-        place = {**a, **{j: move @ pose for j, pose in b.items()}}
-        pair_check = self.checks(*pair, place[pair[0]].inverse() @ place[pair[1]])
-        backing, against, loudest, worst = 0.0, pair_check.log_odds if pair_check.log_odds < VOICE_VETO else 0.0, None, 0.0
-        for one, two in ((min(i, j), max(i, j)) for i in a for j in b):
-            if (one, two) in (pair, rival_of):
-                continue
-            said, other = self._voice(one, two, place[one].inverse() @ place[two])
-            if other is not None and rival_of is None:  # a claim weighs as much as the rest leaves of it
-                other_odds = self.heard(a, b, (one, two), other, pair).log_odds
-                said = min(said, -max(other_odds + 1.0, 0.0))
-            elif other is not None:
-                said = min(said, -other.log_odds - 1.0)
-            if said > VOICE_VETO:
-                backing += said
-            else:
-                against += said
-            if said < worst:
-                loudest, worst = (one, two), said
-        for way, odds in ways_round(self.hypotheses, pair, (k for k in self.maps if k not in place)):
-            backing += same_place_odds(odds) if self.agrees(*pair, way, h.transform) else 0.0
-        return Link(pair, h, h.log_odds + min(backing, self._backing(pair, h)) + against, loudest)
-
-    def _voice(self, i: int, j: int, pose: Sim3) -> tuple[float, PoseHypothesis | None]:
-        """What maps i < j say to a pose T_ij that other maps propose, log odds; and their own claim, if it is another one."""
-        check = self.checks(i, j, pose)
-        best = next(iter(self.hypotheses.get((i, j), ())), None)
-        if best is None:
-            return check.log_odds, None
-        if self.agrees(i, j, best.transform, pose):
-            return max(check.log_odds, same_place_odds(best.log_odds)), None
-        return check.log_odds, best if best.probability > DOUBT else None
-
-    def agrees(self, i: int, j: int, p: Sim3, q: Sim3) -> bool:
-        """Are two poses T_ij one, where the maps overlap?"""
-        return alike(p, q, self.checks.place(i, j, p).mean(axis=0))
-
-    def _heard(self, assembly: Assembly) -> list[Link]:
+    def _rescored(self, assembly: Assembly) -> list[Link]:
         """The links as they are seen now that everything is in its place."""
-        links = []
-        for link in assembly.links:
-            a, b = self._parted(assembly, link)
-            i, j = link.maps
-            seen = self.heard(a, b, link.maps, replace(link.hypothesis, transform=a[i].inverse() @ b[j]))
-            links.append(replace(seen, hypothesis=link.hypothesis))
-        return links
+        return [self._rescore(assembly, link) for link in assembly.links]
 
-    def _parted(self, assembly: Assembly, link: Link) -> tuple[dict[int, Sim3], dict[int, Sim3]]:
-        """The two components that a link holds together: that of its first map, and the other one."""
-        component = assembly.of(link.maps[0])
-        side, left = {link.maps[0]}, [other.maps for other in assembly.links if other is not link]
-        grown = True
-        while grown:
-            new = {k for pair in left if side & set(pair) for k in pair} - side
-            side |= new
-            grown = bool(new)
-        return {k: p for k, p in component.items() if k in side}, {k: p for k, p in component.items() if k not in side}
+    def _rescore(self, assembly: Assembly, link: Link) -> Link:
+        a, b = parted(assembly.of(link.maps[0]), assembly.links, link)
+        return self.evidence.score_link(a, b, link.maps, link.hypothesis, Sim3())
 
     def _contradicted(self, assembly: Assembly) -> Iterator[tuple[tuple[int, int], PoseHypothesis]]:
         """Best hypotheses of pairs that lie elsewhere in their component."""
@@ -222,7 +144,7 @@ class Assembler:
             poses = assembly.of(i)
             if not hypotheses or j not in poses or hypotheses[0].probability < BELIEVED:
                 continue
-            if not self.agrees(i, j, hypotheses[0].transform, poses[i].inverse() @ poses[j]):
+            if not self.evidence.agrees(i, j, hypotheses[0].transform, poses[i].inverse() @ poses[j]):
                 yield (i, j), hypotheses[0]
 
     def _exchange(self, assembly: Assembly) -> None:
@@ -240,13 +162,15 @@ class Assembler:
     def _better(self, assembly: Assembly) -> Iterator[tuple[Link, Link, tuple[dict[int, Sim3], dict[int, Sim3]]]]:
         for pair, h in self._contradicted(assembly):
             for link in assembly.links:
-                a, b = self._parted(assembly, link) if link.maps[0] in assembly.of(pair[0]) else ({}, {})
+                component = assembly.of(link.maps[0])
+                a, b = parted(component, assembly.links, link) if pair[0] in component else ({}, {})
                 first, second = (a, b) if pair[0] in a else (b, a)
                 if pair[0] not in first or pair[1] not in second:
                     continue
-                i, j = link.maps
-                now = self.heard(a, b, link.maps, replace(link.hypothesis, transform=a[i].inverse() @ b[j]))
-                then = self.heard(first, second, pair, h)
+                then = self.evidence.score_link(first, second, pair, h, least=self.limit)
+                if then.log_odds < self.limit:
+                    continue
+                now = self._rescore(assembly, link)
                 if then.log_odds >= max(now.log_odds + EXCHANGE_GAIN, self.limit):
                     yield link, then, (a, b)
 
@@ -256,16 +180,17 @@ class Assembler:
         for (i, j), hypotheses in sorted(self.hypotheses.items()):
             a, b = assembly.of(i), assembly.of(j)
             if a is not b and hypotheses and hypotheses[0].log_odds >= self.limit:
-                rejected.append(self.heard(a, b, (i, j), hypotheses[0]))
+                rejected.append(self.evidence.score_link(a, b, (i, j), hypotheses[0]))
         return rejected
 
     def _weakest(self, assembly: Assembly, pair: tuple[int, int]) -> tuple[int, int] | None:
         """The link on the way between two maps that says most against their hypothesis."""
-        links = [link for link in assembly.links if link.maps[0] in assembly.of(pair[0])]
-        between = [link for link in links if len(set(pair) & set(self._parted(assembly, link)[0])) == 1]
+        component = assembly.of(pair[0])
+        links = [link for link in assembly.links if link.maps[0] in component]
+        between = [link for link in links if len(set(pair) & set(parted(component, assembly.links, link)[0])) == 1]
         return min(between, key=lambda link: link.log_odds).maps if between else None
 
-    def settled(self, poses: Poses, links: Sequence[Link], fine: bool = False) -> tuple[dict[int, Sim3], list[Measured]]:
+    def settle(self, poses: Poses, links: Sequence[Link], fine: bool = False) -> tuple[dict[int, Sim3], list[Measured]]:
         """Poses of a component that agree best with all that is measured between its maps, and that."""
         within = tuple((link.maps, link.hypothesis.transform) for link in links if link.maps[0] in poses)
         best = ((p, h) for p, of in self.hypotheses.items() for h in of[:1] if p[0] in poses and p[1] in poses)
@@ -285,7 +210,13 @@ class Assembler:
                 check = self.checks(i, j, poses[i].inverse() @ poses[j])
                 if (i, j) in link_poses and not check.overlap:
                     check = Check(link_poses[i, j], 0.0, True, {"walls": 1.0})
-                if check.overlap and ((i, j) in link_poses or self._voice(i, j, poses[i].inverse() @ poses[j])[0] > 0):
+                if check.overlap and ((i, j) in link_poses or self._supports(i, j, poses[i].inverse() @ poses[j], check)):
                     pose = self.checks.fine(i, j, check.pose) if fine else check.pose
                     weight = float(np.clip(check.features["walls"], 0.5, HEAVIEST_WALLS))
                     yield Measured((i, j), pose, self.checks.place(i, j, pose), weight)
+
+    def _supports(self, i: int, j: int, pose: Sim3, check: Check) -> bool:
+        """Does a pair (i < j) speak for T_ij, by its walls or by its own registration?"""
+        best = next(iter(self.hypotheses.get((i, j), ())), None)
+        same = best is not None and self.evidence.agrees(i, j, best.transform, pose)
+        return check.log_odds > 0 or (same and best is not None and support_of(best.log_odds) > 0)

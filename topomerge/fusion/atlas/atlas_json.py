@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from topomerge import __version__
-from topomerge.fusion.atlas.assembly import Link
+from topomerge.fusion.atlas.contradictions import contradiction_to_json
+from topomerge.fusion.atlas.link_evidence import Link
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.stored import ATLAS_FORMAT, Stored
 from topomerge.fusion.result import transform_to_json
@@ -52,6 +53,7 @@ def atlas_to_json(atlas: AtlasResult, stored: Stored, components: Sequence[Mappi
         "transforms": poses,
         "links": [_link(link) | {"probability": round(link.probability, 4)} for link in atlas.links],
         "thrown_out": [_link(link) | {"against": link.against} for link in atlas.rejected],
+        "contradictions": [contradiction_to_json(c) for c in atlas.contradictions],
         "registered": {"pairs": atlas.registered[0], "of": atlas.registered[1], "complete": atlas.complete},
         "seconds": round(atlas.seconds, 3),
     }
@@ -70,5 +72,6 @@ def shown_of(atlas: AtlasResult, n: int, component: Mapping[str, Any], title: st
     named = [[atlas.names[k] for k in (*x.maps, *(x.against or ()))] for x in links]
     odds = [[repr(x.hypothesis.probability), repr(x.log_odds)] for x in links]
     missed = [repr(atlas.residuals.get(k)) for k in sorted(members)]
-    content = [title, n, component["maps"], component["names"], component["made_of"], missed, named, odds]
+    differing = [contradiction_to_json(c) for c in atlas.contradictions if members & {*c.maps}]
+    content = [title, n, component["maps"], component["names"], component["made_of"], missed, named, odds, differing]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from topomerge.fusion.atlas.contradictions import LEAST_CONFLICT, Conflict, find_conflicts
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.judge import Judge
 from topomerge.fusion.pose_difference import pose_difference
@@ -24,9 +25,13 @@ LEAST_PROBABILITY = 0.01  # hypotheses below are left out, but for the best
 DRIFT_LIMITS = (1.0, np.radians(4.0), 0.05)  # m, rad, log scale: poses of a pair that are as near are one; drift bends maps
 CHECKED_ONCE = (0.08, np.radians(0.4), 0.005)  # m, rad, log scale: poses that are as near are judged once
 OVERLAP_FLOOR, OVERLAP_WALLS = 2.0, 0.3  # m2 in common, below both of which two maps do not overlap
-NOISE_CONFLICT = 0.3  # m2 of walls on free floor, below which it may be noise
 POSE_USUAL_CONFLICT = 0.12  # share of the walls on free floor that true poses seldom exceed
 CONFLICT_ODDS = 30.0  # log odds against a pose, of each share of 1 above that
+# Log odds against a pose, at most, of one place at which the maps contradict each other, and of each further one: a room may have
+# been altered. Of 66 right poses of simulated training pairs, 16 have such a place or two; of 81 wrong ones with more than the
+# usual share, 2 have one, 13 have two, and half of them six or more.
+ONE_PLACE_ODDS, FURTHER_PLACE_ODDS = 0.6, 1.5
+MOST_AGAINST = 6.0  # log odds
 PLACE_HALF_WIDTH = 1.0  # m, of the place by which a pose is measured
 SAMPLED_COLUMNS = 4000
 T = TypeVar("T")
@@ -41,12 +46,14 @@ class Check:
         log_odds: what speaks for it (above 0) or against it; 0 where the maps hardly overlap.
         overlap: do they?
         features: of `verify.Judge`.
+        conflicts: places at which they contradict each other more than true poses do.
     """
 
     pose: Sim3
     log_odds: float
     overlap: bool
     features: Mapping[str, float]
+    conflicts: tuple[Conflict, ...] = ()
 
 
 def hypotheses(
@@ -118,7 +125,9 @@ class Checks:
         """What maps i and j say to T_ij."""
         if j < i:
             turned = self(j, i, pose.inverse())
-            return Check(turned.pose.inverse(), turned.log_odds, turned.overlap, turned.features)
+            back = turned.pose.inverse()
+            conflicts = tuple(c.moved(back) for c in turned.conflicts)
+            return Check(back, turned.log_odds, turned.overlap, turned.features, conflicts)
 
         def make() -> Check:
             return self.maps.answer(("check", pose, self.scaled), (i, j), lambda: self._judged(i, j, pose))
@@ -133,10 +142,12 @@ class Checks:
         moved, features = pose, judge(pose)
         for candidate in refine(a, b, [PoseHypothesis(pose, from_rooms=True)], self.scaled):
             again = judge(candidate.transform)
-            if alike(candidate.transform, pose, place(a, b, pose).mean(axis=0)) and speaks(again) > speaks(features):
+            if alike(candidate.transform, pose, place(a, b, pose).mean(axis=0)) and score_pose(again) > score_pose(features):
                 moved, features = candidate.transform, again
-        overlap = features["free"] >= OVERLAP_FLOOR or features["walls"] >= OVERLAP_WALLS
-        return Check(moved, speaks(features) if overlap else 0.0, overlap, features)
+        if features["free"] < OVERLAP_FLOOR and features["walls"] < OVERLAP_WALLS:
+            return Check(moved, 0.0, False, features)
+        conflicts = find_conflicts(a, b, moved) if excess_conflict(features) else ()
+        return Check(moved, score_pose(features, conflicts), True, features, conflicts)
 
 
 def _once(
@@ -151,15 +162,31 @@ def _once(
     return entries[-1][1]
 
 
-def speaks(f: Mapping[str, float]) -> float:
+def excess_conflict(f: Mapping[str, float]) -> float:
+    """Share of the walls that stand on free floor of the other map, above what true poses have; 0 where it is so little that it
+    may be noise."""
+    return max(f["conflict_share"] - POSE_USUAL_CONFLICT, 0.0) if f["conflict"] > LEAST_CONFLICT else 0.0
+
+
+def score_pose(f: Mapping[str, float], conflicts: Sequence[Conflict] | None = None) -> float:
     """Log odds for a pose that other maps propose. Little in common says little: only walls on free floor speak against it.
 
     Of hypotheses of simulated training pairs, nine in ten of the right ones have a plausibility above -4, one in twenty of the
     wrong ones; walls on free floor are more than `POSE_USUAL_CONFLICT` of the walls in one of twenty right ones, in three of four
     wrong ones.
+
+    Args:
+        f: features of `verify.Judge`.
+        conflicts: places at which the maps contradict each other; what is scattered beside them counts as further places. If
+            None, it may be everywhere.
     """
-    excess = max(f["conflict_share"] - POSE_USUAL_CONFLICT, 0.0) if f["conflict"] > NOISE_CONFLICT else 0.0
-    return float(np.clip(plausibility(f) + 3.0, 0.0, 3.0)) - min(CONFLICT_ODDS * excess, 6.0)
+    support = float(np.clip(plausibility(f) + 3.0, 0.0, 3.0))
+    excess = excess_conflict(f)
+    most = MOST_AGAINST
+    if conflicts is not None:
+        scattered = max(f["conflict"] - sum(c.area for c in conflicts), 0.0) / LEAST_CONFLICT
+        most = min(ONE_PLACE_ODDS + FURTHER_PLACE_ODDS * max(len(conflicts) + scattered - 1, 0.0), MOST_AGAINST)
+    return support - min(CONFLICT_ODDS * excess, most)
 
 
 def alike(p: Sim3, q: Sim3, at: Array, limits: tuple[float, float, float] = DRIFT_LIMITS) -> bool:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.assembly import Link
+from topomerge.fusion.atlas.contradictions import Contradiction
+from topomerge.fusion.atlas.link_evidence import Link
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.fuse import fuse
@@ -32,6 +33,7 @@ class AtlasResult:
         seconds: of the whole.
         warnings: what the user should know.
         complete: was everything registered that could change it?
+        contradictions: places at which maps of one component contradict each other; both versions are kept.
     """
 
     maps: Maps
@@ -46,6 +48,7 @@ class AtlasResult:
     seconds: float = 0.0
     warnings: tuple[str, ...] = ()
     complete: bool = True
+    contradictions: tuple[Contradiction, ...] = ()
 
     @property
     def alone(self) -> tuple[int, ...]:
@@ -113,3 +116,18 @@ def _words(atlas: AtlasResult) -> Iterator[str]:
         who = "other maps contradict" if link.against is None else f"{names(link.against)} contradict"
         match = f"{names(link.maps)}: a match of probability {link.hypothesis.probability:.2f} by itself"
         yield f"{match} was thrown out, {who} it"
+    for pair in sorted({c.maps for c in atlas.contradictions}):
+        places = [c for c in atlas.contradictions if c.maps == pair]
+        rooms = [_rooms(sorted({room for c in places for room in c.rooms[k]}), names((pair[k],))) for k in (0, 1)]
+        area = sum(c.area for c in places)
+        yield (
+            f"{names(pair)} contradict each other in {' and '.join(rooms)}: {area:.1f} m2 of walls of the one stand on free "
+            "floor of the other; both versions are kept, with their source"
+        )
+
+
+def _rooms(rooms: Sequence[int], name: str) -> str:
+    """Rooms of a map in words."""
+    if not rooms:
+        return f"no room of {name}"
+    return f"room{'s' * (len(rooms) > 1)} {', '.join(map(str, rooms))} of {name}"

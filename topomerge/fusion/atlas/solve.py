@@ -16,7 +16,9 @@ import numpy as np
 
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.assembly import Assembler, Assembly, Link
+from topomerge.fusion.atlas.assembly import Assembler, Assembly
+from topomerge.fusion.atlas.contradictions import Contradiction, conflict_columns, locate_contradiction
+from topomerge.fusion.atlas.link_evidence import Link
 from topomerge.fusion.atlas.maps import Maps, bent_together
 from topomerge.fusion.atlas.memory import Facts, Memory
 from topomerge.fusion.atlas.pairs import Checks, hypotheses
@@ -254,8 +256,10 @@ def _result(
     residuals: dict[int, float] = {}
     bends: dict[int, Deformation] = {}
     warnings: list[str] = []
+    contradictions: list[Contradiction] = []
     for component in assembly.components:
-        poses, edges = explorer.assembler.settled(component, assembly.links, fine)
+        poses, edges = explorer.assembler.settle(component, assembly.links, fine)
+        rigid_poses = poses
         if not rigid and len(component) > 1:
             pairs = sorted({link.maps for link in assembly.links if link.maps[0] in component})
             poses, deformations, reason = bent_together(explorer.maps, poses, pairs, explorer.scale == "free")
@@ -264,6 +268,8 @@ def _result(
             bends |= {order[k]: d for k, d in deformations.items()}
         first = min(component, key=lambda k: order[k])
         back = poses[first].inverse()
+        if fine:
+            contradictions += _contradictions(explorer, rigid_poses, order, rigid_poses[first].inverse())
         for k in component:
             transforms[order[k]] = Sim3() if k == first else back @ poses[k]
             gaps = [residual(e, poses) for e in edges if k in e.maps]
@@ -282,7 +288,26 @@ def _result(
         (len(explorer.tried), len(names) * (len(names) - 1) // 2),
         warnings=tuple(warnings),
         complete=explorer.complete,
+        contradictions=tuple(sorted(contradictions, key=lambda c: (c.maps, c.middle))),
     )
+
+
+def _contradictions(explorer: _Explorer, poses: Mapping[int, Sim3], order: Sequence[int], back: Sim3) -> Iterator[Contradiction]:
+    """Where maps of a component contradict each other, by the places of the maps as they were given.
+
+    Args:
+        poses: of the maps, in a frame that `back` takes to that of the component.
+    """
+    names = sorted(poses, key=lambda k: order[k])
+    for n, i in enumerate(names):
+        for j in names[n + 1 :]:
+            check = explorer.checks(i, j, poses[i].inverse() @ poses[j])
+            if check.conflicts:
+                a, b = explorer.maps.prepared(i), explorer.maps.prepared(j)
+                columns = conflict_columns(a.storeys, b.storeys, check.pose)
+                pair, maps = (order[i], order[j]), (explorer.maps[i], explorer.maps[j])
+                for conflict in check.conflicts:
+                    yield locate_contradiction(pair, conflict, maps, check.pose, columns, back @ poses[i])
 
 
 def _reordered(links: Iterable[Link], order: Sequence[int]) -> tuple[Link, ...]:
