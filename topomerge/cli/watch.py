@@ -107,7 +107,7 @@ def _reader(args: argparse.Namespace) -> Reader:
     def failure(error: Exception, path: Path) -> str | None:
         return None if signal_behind(error) is not None else f"{failure_line(error, [str(path)])}; it is skipped until it changes"
 
-    names = ("voxel_size", "up", "unit", "sensor")
+    names = ("voxel_size", "up", "unit", "one_frame", "sensor")
     return Reader(read, json.dumps(given(args, *names), sort_keys=True), failure)
 
 

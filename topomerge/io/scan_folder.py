@@ -25,6 +25,7 @@ from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
 from topomerge.types import Array
 
 SCAN_SUFFIXES = (".ply", ".pcd", ".bin")
+OTHER_CLOUDS = (".las", ".laz", ".e57", ".npy", ".npz", ".xyz", ".pts", ".asc")  # which know nothing of sensors, or all
 BIN_ROW = 16  # bytes: x, y, z and intensity
 # What GLIM, loop-closing systems, KISS-ICP and KISS-SLAM, FAST-LIO's followers and the KITTI benchmark call their trajectories;
 # the better one first: after loop closure, and with times.
@@ -64,13 +65,20 @@ def scans_of(path: Path) -> list[Path]:
             raise InputError(f"{path}: holds several folders of scans ({', '.join(below)[:200]}); give one of them and --poses")
         scans = next(iter(below.values()), [])
     if not scans:
+        others = Counter(p.suffix.lower() for p in path.iterdir() if p.suffix.lower() in OTHER_CLOUDS and p.is_file())
+        if others:
+            counts = ", ".join(f"{count} {kind[1:]}" for kind, count in others.most_common())
+            raise InputError(f"{path}: holds no scans with poses but {counts}; give --one-frame, if they are parts of one cloud")
         raise InputError(
             f"{path}: is a folder without scans (ply, pcd, bin), a ROS bag or RGB-D images; give one of these, or a file"
         )
     kinds = Counter(scan.suffix.lower() for scan in scans)
     if len(kinds) > 1:
         counts = ", ".join(f"{count} {kind[1:]}" for kind, count in kinds.most_common())
-        raise InputError(f"{path}: holds scans of several kinds ({counts}); give a folder with those of one sensor")
+        raise InputError(
+            f"{path}: holds scans of several kinds ({counts}); give a folder with those of one sensor, or --one-frame, if "
+            "they are parts of one cloud in one frame"
+        )
     return scans
 
 
@@ -169,7 +177,8 @@ def _with_viewpoints(path: Path, scans: list[Path], options: ReadOptions) -> Ite
             if pose is None:
                 raise InputError(
                     f"{path}: has no trajectory (such as poses.txt or traj_lidar.txt); give one with --poses, in the format of "
-                    f"KITTI or TUM; or name the files, if each is a map of its own"
+                    f"KITTI or TUM; or --one-frame, if the files are parts of one cloud in one frame; or name the files, if each "
+                    f"is a map of its own"
                 )
             yield PosedScan(piece.points, pose, piece.colors, True, number / len(scans))
 
