@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from topomerge.errors import InputError, printable
+from topomerge.errors import InputError, is_memory_short, printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -124,10 +124,20 @@ def warn(messages: Iterable[str]) -> None:
         say(f"topomerge: warning: {' '.join(message.split())}", sys.stderr)
 
 
+def _memory_limit() -> str:
+    """How much of it this process may take, if that is limited."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return ""
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return "" if most == resource.RLIM_INFINITY else f" (ulimit -v allows {most / 2**30:.2g} GB)"
+
+
 def failure_line(error: BaseException, paths: Sequence[str], outputs: Sequence[str] = ()) -> str:
     """One line about an error that names the file it is about, of those that were read the first."""
-    if isinstance(error, MemoryError):
-        text = "not enough memory; take larger voxels or a part of the input"
+    if is_memory_short(error) and not isinstance(error, InputError):
+        text = f"not enough memory{_memory_limit()}; take larger voxels or a part of the input"
     elif isinstance(error, OSError) and error.strerror:
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     elif isinstance(error, ImportError):

@@ -15,7 +15,7 @@ from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from topomerge.errors import InputError
+from topomerge.errors import InputError, is_memory_short
 from topomerge.io.atomic import replacing
 from topomerge.types import Array
 
@@ -115,6 +115,8 @@ def _archive_of(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int
     except PermissionError as error:
         raise InputError(f"{path}: can't be read (permission denied); check its permissions") from error
     except Exception as error:  # damage can surface anywhere in zipfile, zlib and NumPy, as nearly any exception
+        if is_memory_short(error):
+            raise MemoryError(str(error)) from error
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{path}: damaged or cut off ({reason}); copy or make the {kind} again") from error
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from topomerge.errors import InputError
+from topomerge.errors import InputError, is_memory_short
 from topomerge.io.gather import Gatherer
 from topomerge.io.options import ReadOptions, read_options
 from topomerge.io.piece import Piece, damaged
@@ -199,14 +199,20 @@ def guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterator[Bl
     except (GeneratorExit, KeyboardInterrupt, SystemExit):
         raise
     except ImportError as error:
+        if is_memory_short(error):
+            raise MemoryError(str(error)) from error
         package = f"topomerge[{file_format.extra}]" if file_format.extra else "topomerge"
         raise InputError(f"{path}: reading {file_format.name} needs {error.name}: pip install {package}") from error
     except MemoryError as error:
         raise InputError(f"{path}: does not fit into memory; use a machine with more, or thin the file") from error
     except OSError as error:
+        if is_memory_short(error):
+            raise InputError(f"{path}: does not fit into memory; use a machine with more, or thin the file") from error
         raise InputError(f"{path}: can't be read ({error.strerror or error}); copy it again") from error
     except BaseException as error:  # native readers raise their own kinds, panics of lazrs not even an Exception
         log.debug("reading %s failed", path, exc_info=True)
+        if is_memory_short(error):
+            raise InputError(f"{path}: does not fit into memory; use a machine with more, or thin the file") from error
         raise damaged(path, file_format.name, error) from error
 
 
