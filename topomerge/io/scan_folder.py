@@ -37,6 +37,7 @@ TRAJECTORY_NAMES = (
 # Seconds of the epoch and their fraction, or the last number of a name with the fraction that follows a point.
 NAME_TIME = re.compile(r"(?<!\d)(\d{9,10})[._](\d{1,9})\D*$|(\d+(?:\.\d+)?)\D*$")
 EPOCH_UNITS = {19: 1e-9, 16: 1e-6, 13: 1e-3}  # s, by how many digits a time of our decades has
+LAST_SCAN = 1_000_000  # number of a scan; lines for later ones are not looked for
 INDEX_DIGITS = 8  # at most, of the number of a scan
 
 
@@ -47,7 +48,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     if trajectory_file is None:
         yield from pieces(_with_viewpoints(path, scans, options))
         return
-    trajectory = read_trajectory(trajectory_file)
+    numbers = [int(t) for scan in scans if _counted(scan) and (t := name_time(scan.stem)) is not None]
+    trajectory = read_trajectory(trajectory_file, len(scans), min(max(numbers, default=0), LAST_SCAN))
     poses, said = match_poses(path, scans, trajectory, trajectory_file)
     yield from pieces(_posed(scans, poses, options), said)
 
