@@ -42,7 +42,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     size = bag_size(bag_files(path))
     seconds = LEAST_SECONDS + size // BYTES_A_SECOND
     room = min(LEAST_MEMORY + MEMORY_RATIO * size, LARGEST_MEMORY)
-    yield from read_in_subprocess("bag", BAG_KIND, path, options, seconds, room)
+    yield from read_in_subprocess("bag", BAG_KIND, path, options, seconds=seconds, room=room)
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:

@@ -76,7 +76,8 @@ def limit_unpacking(size: int) -> Unpacking:
     from rosbags.rosbag2 import reader as second
     from rosbags.rosbag2 import storage_mcap
 
-    budget, zstd = Unpacking(size), storage_mcap.zstd
+    budget = Unpacking(size)
+    zstd: Any = storage_mcap.zstd
 
     def zstd_unpack(data: bytes) -> bytes:
         return budget.unpack(zstd.ZstdDecompressor, data)
@@ -87,15 +88,15 @@ def limit_unpacking(size: int) -> Unpacking:
     def bz2_unpack(data: bytes) -> bytes:
         return budget.unpack(bz2.BZ2Decompressor, data)
 
-    def zstd_file(stream: IO[bytes], mode: str = "rb") -> IO[bytes]:
-        return _LimitedFile(zstd.open(stream, mode), MODEST_BAG + BAG_RATIO * size)  # type: ignore[return-value]
+    def zstd_file(stream: IO[bytes], mode: str = "rb") -> _LimitedFile:
+        return _LimitedFile(zstd.open(stream, mode), MODEST_BAG + BAG_RATIO * size)
 
     storage_mcap.DECOMPRESSORS.update(
         lz4=lambda data, promised: lz4_unpack(_promised(data, promised)),
         zstd=lambda data, promised: zstd_unpack(_promised(data, promised)),
     )
     first.decompressors.update(bz2=bz2_unpack, lz4=lz4_unpack)
-    second.zstd = SimpleNamespace(decompress=zstd_unpack, open=zstd_file)  # type: ignore[attr-defined]
+    vars(second)["zstd"] = SimpleNamespace(decompress=zstd_unpack, open=zstd_file)
     return budget
 
 

@@ -78,8 +78,8 @@ def read_trajectory(path: Path, scans: int | None = None, last: int = 0) -> Traj
         last: the largest number of a scan, which counts lines of KITTI's from 0.
 
     Raises:
-        InputError: it is neither, a number is missing or not finite, or time runs backwards; with the number of the line; or there
-            are far more poses than scans.
+        InputError: it is neither, a number is missing or not finite, or time runs backwards; with the number of the line. Or far
+            more poses than scans.
     """
     try:
         lines = _wanted_rows(path, scans, last)

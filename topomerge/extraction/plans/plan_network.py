@@ -62,7 +62,7 @@ def column_probabilities(plan: StoreyPlan, network: dict[str, Array] | None = No
     nx, ny = plan.wall.shape
     x = np.pad(x, ((0, 0), (margin, -nx % margin + margin), (margin, -ny % margin + margin)))
     w = weights() if network is None else network
-    parts = _separate_parts(x[:SIZE_CHANNEL].any(axis=0))
+    parts = _separate_parts(np.asarray(x[:SIZE_CHANNEL].any(axis=0)))
     if parts is None:
         mean = _mean_of_turns(x, w)
     else:
