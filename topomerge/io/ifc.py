@@ -106,7 +106,7 @@ def _shapes(model: Any, products: list[Any]) -> Iterator[tuple[int, Array, Array
             yield element, vertices, faces
 
 
-def _shapes_by(model: Any, products: list[Any], kernel: str) -> Iterator[tuple[int, Array, Array]]:
+def _shapes_by(model: Any, products: list[Any], kernel: Any) -> Iterator[tuple[int, Array, Array]]:
     """The same by one kernel; what it cannot make is left out."""
     import ifcopenshell.geom
 

@@ -110,7 +110,7 @@ def load_map(path: str | Path) -> TopometricMap:
     heads = archive.heads(path, KIND)
     if "format" not in heads or "about" not in heads:
         raise InputError(f"{path}: is not a {KIND}: make one with `topomerge extract SCAN -o A.tmap`")
-    number = archive.read(path, KIND, ["format"])["format"] if heads["format"].shape == () else heads["format"]
+    number: Any = archive.read(path, KIND, ["format"])["format"] if heads["format"].shape == () else heads["format"]
     if number.shape != () or number.dtype.kind not in "iu" or int(number) != TMAP_FORMAT:
         older = number.shape == () and number.dtype.kind in "iu" and int(number) < TMAP_FORMAT
         advice = "make it again with `topomerge extract`" if older else "update topomerge"
