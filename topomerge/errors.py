@@ -2,9 +2,31 @@
 
 from __future__ import annotations
 
+import errno
+
 
 class InputError(ValueError):
     """A file or a value from the user that can't be used. The command line prints it as one line and exits with status 1."""
+
+
+# What libraries say where memory is short, in their own kinds of errors.
+MEMORY_WORDS = (
+    *("allocate memory", "bad_alloc", "out of memory", "unable to allocate", "failed to map segment", "start new thread"),
+)
+
+
+def is_memory_short(error: BaseException | None) -> bool:
+    """Does an error, or one that it comes from, say that there is not enough memory?"""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        said = str(error).lower()
+        if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+            return True
+        if not isinstance(error, InputError) and any(words in said for words in MEMORY_WORDS):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def printable(text: str) -> str:

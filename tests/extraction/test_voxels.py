@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from topomerge.errors import InputError
 from topomerge.extraction.cell_means import cell_middles, with_means
@@ -13,9 +16,17 @@ from topomerge.extraction.lattice_cells import LatticeCells
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import with_raised_slice
 from topomerge.extraction.sparsity import without_gaps
+from topomerge.extraction.strays import grouped
 from topomerge.extraction.voxels import voxelise
 from topomerge.kernels import voxelise as kernel
 from topomerge.types import PointCloud, VoxelGrid
+
+RNG = np.random.default_rng(5)
+
+
+def _block(corner, count: int, side: float) -> np.ndarray:
+    """Points in a block 2.4 m high."""
+    return np.asarray(corner, np.float64) + RNG.random((count, 3)) * (side, side, 2.4)
 
 
 def twin(points: np.ndarray, edge: float) -> tuple[set[tuple[int, ...]], dict[tuple[int, ...], int]]:
@@ -186,3 +197,42 @@ def test_table_and_sorting_agree(monkeypatch):
     order, other = np.lexsort((cells + base).T), np.lexsort((other_cells + other_base).T)
     assert ((cells + base)[order] == (other_cells + other_base)[other]).all()
     assert (counts[order] == other_counts[other]).all() and (sums[order] == other_sums[other]).all()
+
+
+def test_dust_between_strays_joins_nothing():
+    warnings: list[str] = []
+    points = np.concatenate([_block((0, 0, 0), 40_000, 10.0), RNG.uniform(-150, 150, (1500, 3)) * (1, 1, 0.2)])
+    grid = voxelise(points.astype(np.float32), 0.1, warnings)
+    assert max(grid.shape) < 400
+    assert len(warnings) == 1 and "stray points lie more than 10 m" in warnings[0]
+
+
+@pytest.mark.parametrize(("count", "step"), [(2, (0, 1, 0)), (3, (1, -1, 0))])
+def test_large_places_far_apart_are_refused_with_where_they_lie(count, step):
+    places = [_block(np.array(step) * 4000.0 * k, 20_000, 6.0) for k in range(count)]
+    with pytest.raises(InputError, match=rf"{count} places more than 100 m apart .* crop the file"):
+        voxelise(np.concatenate(places), 0.1)
+
+
+def test_a_small_place_far_off_is_left_out_and_named():
+    warnings: list[str] = []
+    points = np.concatenate([_block((0, 0, 0), 40_000, 12.0), _block((6000, 0, 0), 500, 3.0)])
+    grid = voxelise(points, 0.1, warnings)
+    assert max(grid.shape) <= 121
+    assert len(warnings) == 1 and re.search(r"500 points lie more than 100 m .* around 600[12], [12], 1 m", warnings[0])
+
+
+def test_two_buildings_of_one_campus_stay_together():
+    warnings: list[str] = []
+    grid = voxelise(np.concatenate([_block((0, 0, 0), 9000, 9.0), _block((150, 40, 0), 9000, 9.0)]), 0.1, warnings)
+    assert grid.shape[0] > 1500 and not warnings
+
+
+@pytest.mark.parametrize("density", [0.02, 0.1, 0.4])
+def test_groups_are_those_of_a_dense_raster(density: float):
+    dense = RNG.random((14, 9, 11)) < density
+    cells = np.argwhere(dense)
+    labels, count = ndimage.label(dense, np.ones((3, 3, 3)))
+    group = grouped(cells * 7 + RNG.integers(0, 7, cells.shape) - 30 * 7, 7)
+    assert group.max() + 1 == count
+    assert len(set(zip(group.tolist(), labels[dense].tolist(), strict=True))) == count

@@ -10,11 +10,12 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from topomerge.errors import InputError, printable
+from topomerge.errors import InputError, is_memory_short, printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+NEAR_LIMIT = 0.8  # of the memory that a process may take
 PAGE_SUFFIXES = (".html", ".htm")
 Report = Callable[[float, str], None]  # fraction done in 0..1, what is being done
 
@@ -55,7 +56,7 @@ class Bars:
 
         def report(fraction: float, text: str = "") -> None:
             with self._lock:
-                self._state[title] = (min(max(float(fraction), 0.0), 1.0), text)
+                self._state[title] = (min(max(float(fraction), 0.0), 1.0), printable(text))
                 self._draw()
 
         return report
@@ -124,10 +125,33 @@ def warn(messages: Iterable[str]) -> None:
         say(f"topomerge: warning: {' '.join(message.split())}", sys.stderr)
 
 
+def _is_at_memory_limit() -> bool:
+    """Has this process taken nearly as much memory as it may? Then an odd error is most likely a failed allocation."""
+    try:
+        import resource
+
+        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+        peak = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmPeak:")), 0)
+    except (ImportError, OSError, MemoryError):
+        return False
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return most != resource.RLIM_INFINITY and peak * 1024 > NEAR_LIMIT * most
+
+
+def _memory_limit() -> str:
+    """How much of it this process may take, if that is limited."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return ""
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return "" if most == resource.RLIM_INFINITY else f" (ulimit -v allows {most / 2**30:.2g} GB)"
+
+
 def failure_line(error: BaseException, paths: Sequence[str], outputs: Sequence[str] = ()) -> str:
     """One line about an error that names the file it is about, of those that were read the first."""
-    if isinstance(error, MemoryError):
-        text = "not enough memory; take larger voxels or a part of the input"
+    if not isinstance(error, InputError) and (is_memory_short(error) or _is_at_memory_limit()):
+        text = f"not enough memory{_memory_limit()}; take larger voxels or a part of the input"
     elif isinstance(error, OSError) and error.strerror:
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     elif isinstance(error, ImportError):
@@ -145,7 +169,11 @@ def failure_line(error: BaseException, paths: Sequence[str], outputs: Sequence[s
 
 def signal_behind(error: BaseException | None) -> BaseException | None:
     """The Ctrl-C or SIGTERM that an error comes from, if any: one during compiled code comes out as a SystemError."""
+    seen: set[int] = set()
     while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
+        if id(error) in seen:  # errors can come from each other
+            return None
+        seen.add(id(error))
         error = error.__cause__ or error.__context__
     return error
 

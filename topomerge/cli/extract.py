@@ -9,7 +9,7 @@ from pathlib import Path
 import topomerge
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import PAGE_SUFFIXES, Bars, check_outputs, check_suffix, say, warn, write_all
-from topomerge.cli.options import UNIT, UP, above_zero, given, output, quiet
+from topomerge.cli.options import ONE_FRAME, UNIT, UP, above_zero, given, output, quiet
 from topomerge.errors import InputError
 
 OTHER_OUTPUTS = "--json, --ply, --figure, --report"
@@ -26,7 +26,9 @@ def extract_command(args: argparse.Namespace) -> int:
         from topomerge.extraction.extract import extract
         from topomerge.io.points import read_chunks
 
-        reading = given(args, "up", "unit", "scale", "resolution", "extrude", "ceiling", "spacing", "doors", "poses", "topic")
+        reading = given(
+            args, "up", "unit", "scale", "resolution", "extrude", "ceiling", "spacing", "doors", "poses", "topic", "one_frame"
+        )
         chunks = read_chunks(args.input, **reading, progress=bars.task("read"))
         choices = given(args, "voxel_size", "preset")
         topomap = extract(chunks, **choices, name=args.input, progress=bars.task("extract"))
@@ -67,6 +69,7 @@ EXTRACT = Command(
         option("--preset", choices=("default", "thesis"), help="default, or the parameters of the thesis"),
         UP,
         UNIT,
+        ONE_FRAME,
         option("--scale", type=above_zero, metavar="S", help="multiply coordinates by this (default 1)"),
         option("--resolution", type=above_zero, metavar="R", help="m per pixel of a plain image of a floor plan"),
         option("--extrude", type=above_zero, metavar="H", help="m of wall height for 2D maps (default 2.5)"),

@@ -52,7 +52,7 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, with status 1: 2 is reserved for "no trustworthy merge"."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(1, f"{self.prog}: {message} (see {self.prog} --help)\n")
+        self.exit(1, printable(f"{self.prog}: {message} (see {self.prog} --help)\n"))
 
 
 def build_parser() -> argparse.ArgumentParser:

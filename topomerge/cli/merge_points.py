@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from topomerge.cli.console import Bars, say_line, warn
-from topomerge.cli.options import given
+from topomerge.cli.options import reading_choices
 
 if TYPE_CHECKING:
     import numpy as np
@@ -78,7 +78,8 @@ def _write(result: MergeResult, k: int, path: Path, args: argparse.Namespace) ->
     from topomerge.io.moved_points import save_moved
     from topomerge.types import Sim3, is_level, transformed
 
-    place, options, levelling = result.placements[k], given(args, "up", "unit"), result.maps[k].levelling
+    place, levelling = result.placements[k], result.maps[k].levelling
+    options = reading_choices(args.inputs[k], args)
     with Bars(enabled=not args.quiet) as bars:
         own_frame, progress = place.pose == Sim3() and is_level(levelling), bars.task("points")
 

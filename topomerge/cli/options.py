@@ -132,6 +132,11 @@ UP = option(
     help="axis of the input that points up (default z, for glTF y); with a minus sign: down",
 )
 UNIT = option("--unit", choices=("m", "cm", "mm", "ft", "in"), help="unit of the input (default m)")
+ONE_FRAME = option(
+    "--one-frame",
+    action="store_true",
+    help="read all files of a folder as one cloud: tiles, or registered stations, of one frame",
+)
 DESCRIPTOR = option(
     "--descriptor",
     default="learned",
@@ -169,6 +174,7 @@ CLOUD_OPTIONS = (
     option("--voxel-size", type=above_zero, metavar="E", help="edge length of the cells of a cloud, m (default 0.1)"),
     UP,
     UNIT,
+    ONE_FRAME,
     option(
         "--sensor",
         choices=SENSORS,
@@ -185,12 +191,19 @@ def check_cloud_options(paths: Sequence[str], args: argparse.Namespace) -> None:
     """Refuse `CLOUD_OPTIONS` where no input is a cloud.
 
     Raises:
-        InputError: names the first of them.
+        InputError: names the first of them; or the files of one frame, where no input is a folder.
     """
     useless = given(args, "voxel_size", "up", "unit", "sensor")
     if useless and all(Path(path).suffix.lower() == ".tmap" for path in paths):
         name = next(iter(useless)).replace("_", "-")
         raise InputError(f"--{name}: is for clouds, of no use to a .tmap; give the scan that it was made of, or leave it out")
+    if given(args, "one_frame") and not any(Path(path).is_dir() for path in paths):
+        raise InputError("--one-frame: is for folders of files; give such a folder, or leave it out")
+
+
+def reading_choices(path: str, args: argparse.Namespace) -> dict[str, Any]:
+    """How to read one input: `CLOUD_OPTIONS` of reading, of which some are for folders only."""
+    return given(args, "up", "unit", *(["one_frame"] if Path(path).is_dir() else []))
 
 
 def map_from(path: str, args: argparse.Namespace) -> TopometricMap:
@@ -209,7 +222,7 @@ def map_from(path: str, args: argparse.Namespace) -> TopometricMap:
             from topomerge.io.points import read_chunks
 
             with Bars(enabled=not getattr(args, "quiet", False)) as bars:
-                chunks = read_chunks(path, **given(args, "up", "unit"), progress=bars.task("read"))
+                chunks = read_chunks(path, **reading_choices(path, args), progress=bars.task("read"))
                 topomap = extract(chunks, **given(args, "voxel_size"), name=path, progress=bars.task("extract"))
             topomap = replace(topomap, parameters={**topomap.parameters, **given(args, "sensor")})
     except InputError as error:

@@ -35,6 +35,28 @@ EVERY, SETTLE = 2.0, 2.0  # s
 
 def watch_command(args: argparse.Namespace) -> int:
     """`topomerge watch`: until Ctrl-C, or with --once until all that is there is in the atlas."""
+    began = time.monotonic()
+    watch: Watch | None = None
+    try:
+        watch = _watch(args)
+        busy = True
+        while busy or not args.once:
+            busy = watch.look()
+            if busy or not args.once:
+                time.sleep(args.every)
+    except (KeyboardInterrupt, Exception) as stop:
+        if not isinstance(signal_behind(stop), KeyboardInterrupt):
+            raise
+        done = "nothing was read yet" if watch is None else _summary(watch)
+        say(f"stopped after {time.monotonic() - began:.0f} s: {done}")
+        return 130 if args.once else 0
+    if not args.quiet:
+        say_line(_summary(watch))
+    return 0
+
+
+def _watch(args: argparse.Namespace) -> Watch:
+    """What looks into the folder, and tells what it does."""
     from topomerge.fusion.atlas.watch import Watch
     from topomerge.viz.atlas_report import atlas_html
 
@@ -53,7 +75,7 @@ def watch_command(args: argparse.Namespace) -> int:
             log.log(result, joined)
         return atlas_html(result, joined, title, **words)
 
-    watch = Watch(
+    return Watch(
         Path(args.folder),
         Path(args.output),
         _reader(args),
@@ -64,20 +86,6 @@ def watch_command(args: argparse.Namespace) -> int:
         settings=atlas_choices(args),
         warm=not args.once,
     )
-    began = time.monotonic()
-    try:
-        busy = True
-        while busy or not args.once:
-            busy = watch.look()
-            if busy or not args.once:
-                time.sleep(args.every)
-    except (KeyboardInterrupt, SystemError) as stop:
-        if not isinstance(signal_behind(stop), KeyboardInterrupt):
-            raise
-        say(f"stopped after {time.monotonic() - began:.0f} s: {_summary(watch)}")
-        return 130 if args.once else 0
-    tell(_summary(watch), False)
-    return 0
 
 
 def _rerun_log(args: argparse.Namespace) -> RerunLog | None:
@@ -107,7 +115,7 @@ def _reader(args: argparse.Namespace) -> Reader:
     def failure(error: Exception, path: Path) -> str | None:
         return None if signal_behind(error) is not None else f"{failure_line(error, [str(path)])}; it is skipped until it changes"
 
-    names = ("voxel_size", "up", "unit", "sensor")
+    names = ("voxel_size", "up", "unit", "one_frame", "sensor")
     return Reader(read, json.dumps(given(args, *names), sort_keys=True), failure)
 
 

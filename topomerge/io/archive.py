@@ -11,11 +11,11 @@ import math
 import zipfile
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from topomerge.errors import InputError
+from topomerge.errors import InputError, is_memory_short
 from topomerge.io.atomic import replacing
 from topomerge.io.piece import refuse_pointer
 from topomerge.types import Array
@@ -24,6 +24,7 @@ DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can tell
 ARCHIVE_LIMIT = 4 << 30  # of all arrays together; a map of 100 million cells needs 2 GB
 MAX_RATIO = 1100  # deflate can't shrink by more than 1032; a file that claims more is damaged or hostile
 USUAL_RATIO, MODEST = 100, 1 << 28  # of a whole file: maps shrink by 12 to 17; small ones may claim more
+PART = 1 << 20  # bytes that are unpacked at a time
 LONGEST_ARRAY_HEADER = 4096  # longest header of an array, bytes
 R = TypeVar("R")
 
@@ -71,6 +72,27 @@ def names(path: str | Path, kind: str = "archive") -> list[str]:
     return _archive_of(path, kind, lambda archive, size: [name for name, _ in _entries(archive, size)])
 
 
+class Head(NamedTuple):
+    """What an array of an archive declares of itself."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @property
+    def size(self) -> int:
+        """Numbers or rows in it."""
+        return math.prod(self.shape)
+
+
+def heads(path: str | Path, kind: str = "archive") -> dict[str, Head]:
+    """What the arrays of such a file declare, checked as by `read`, without unpacking more than their headers.
+
+    Raises:
+        InputError: as `read`.
+    """
+    return _archive_of(path, kind, lambda archive, size: {name: _declared(archive, e) for name, e in _entries(archive, size)})
+
+
 def _archive_of(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int], R]) -> R:
     """What `use` makes of an archive and the size of its file; whatever goes wrong is told of the file."""
     path = Path(path)
@@ -95,6 +117,8 @@ def _archive_of(path: str | Path, kind: str, use: Callable[[zipfile.ZipFile, int
     except PermissionError as error:
         raise InputError(f"{path}: can't be read (permission denied); check its permissions") from error
     except Exception as error:  # damage can surface anywhere in zipfile, zlib and NumPy, as nearly any exception
+        if is_memory_short(error):
+            raise MemoryError(str(error)) from error
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{path}: damaged or cut off ({reason}); copy or make the {kind} again") from error
 
@@ -114,19 +138,40 @@ def _entries(archive: zipfile.ZipFile, size: int, only: Collection[str] | None =
     return [(name, entry) for name, entry in named if only is None or name in only]
 
 
-def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
-    """One array; its declared shape must fill the entry to the byte before the rest of it is read."""
+def _declared(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Head:
     with archive.open(entry) as stream:
-        head = io.BytesIO(stream.read(LONGEST_ARRAY_HEADER))
-        version = np.lib.format.read_magic(head)
-        if version != (1, 0):
-            raise ValueError(f"{entry.filename} has an array format {version} that maps don't use")
-        shape, by_columns, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=LONGEST_ARRAY_HEADER)
-        if dtype.hasobject:
-            raise ValueError(f"{entry.filename} holds pickled objects, which are not read for safety")
-        if by_columns or any(s < 0 for s in shape):
-            raise ValueError(f"{entry.filename} has a layout that maps don't use")
-        if head.tell() + math.prod(shape) * dtype.itemsize != entry.file_size:
-            raise ValueError(f"{entry.filename} claims shape {shape}, which is not its size")
-        body = head.read() + stream.read()  # reading to the end also checks the CRC
-    return np.frombuffer(body, dtype, count=math.prod(shape)).reshape(shape).copy()  # a copy can be written to
+        return _head(entry, stream)[0]
+
+
+def _head(entry: zipfile.ZipInfo, stream: IO[bytes]) -> tuple[Head, bytes]:
+    """The declared shape and type of one array, which must fill the entry to the byte; and what was read behind its header."""
+    head = io.BytesIO(stream.read(LONGEST_ARRAY_HEADER))
+    version = np.lib.format.read_magic(head)
+    if version != (1, 0):
+        raise ValueError(f"{entry.filename} has an array format {version} that maps don't use")
+    shape, by_columns, dtype = np.lib.format.read_array_header_1_0(head, max_header_size=LONGEST_ARRAY_HEADER)
+    if dtype.hasobject:
+        raise ValueError(f"{entry.filename} holds pickled objects, which are not read for safety")
+    if by_columns or any(s < 0 for s in shape):
+        raise ValueError(f"{entry.filename} has a layout that maps don't use")
+    if head.tell() + math.prod(shape) * dtype.itemsize != entry.file_size:
+        raise ValueError(f"{entry.filename} claims shape {shape}, which is not its size")
+    return Head(shape, dtype), head.read()
+
+
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
+    """One array, unpacked into the memory that it stays in."""
+    with archive.open(entry) as stream:
+        head, start = _head(entry, stream)
+        body = bytearray(head.size * head.dtype.itemsize)
+        view = memoryview(body)
+        view[: len(start)] = start
+        at = len(start)
+        while at < len(body):
+            part = stream.read(min(PART, len(body) - at))
+            if not part:
+                raise EOFError(f"{entry.filename} is cut short")
+            view[at : at + len(part)] = part
+            at += len(part)
+        stream.read(1)  # reading to the end also checks the CRC
+    return np.frombuffer(body, head.dtype, count=head.size).reshape(head.shape)

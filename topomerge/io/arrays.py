@@ -79,6 +79,9 @@ def _read_npz(path: Path) -> Piece:
             wanted = {"shift", "poses", "pose_of", *POINT_NAMES, *COLOR_NAMES, *LABEL_NAMES} & members.keys()
             if not wanted & set(POINT_NAMES) and len(members) == 1:
                 wanted = set(members)
+            total = sum(members[name].file_size for name in wanted)
+            if total > max(MODEST, RATIO * path.stat().st_size):
+                raise InputError(f"{path}: its arrays would unpack to {total:,} bytes together; refused, save them unpacked")
             arrays = {name: _member(path, archive, members[name]) for name in sorted(wanted)}
     except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
         raise damaged(path, "an npz archive", error) from error

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import platform
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from topomerge.errors import InputError
+
+PART_SUFFIX = ".part"  # of the folders in which files are written
+PART_NAME = re.compile(r"\.([0-9a-f]{8})-(\d+)\.[^.]*\.part$")  # machine and process of the one that writes
 
 
 @contextmanager
@@ -27,8 +34,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is no file that could be replaced; give the name of a file")
     try:
+        _clear_stale(path.parent)
         # A folder of its own, so that what a kill leaves behind is nowhere found under the file's suffix.
-        folder = Path(tempfile.mkdtemp(prefix=f".{path.stem[:40]}.", suffix=".part", dir=path.parent))
+        prefix = f".{path.stem[:40]}.{_machine()}-{os.getpid()}."
+        folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=PART_SUFFIX, dir=path.parent))
     except OSError as error:
         reason = error.strerror or str(error)
         raise InputError(f"{path}: can't be written ({reason}); give a folder that exists and is yours") from error
@@ -45,3 +54,32 @@ def replacing(path: str | Path) -> Iterator[Path]:
             raise InputError(f"{path}: can't be written ({error.strerror or error})") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@cache
+def _machine() -> str:
+    """A short name of the machine, or the container, whose numbers of processes those of this process are."""
+    space = Path("/proc/self/ns/pid")
+    numbers = os.readlink(space) if os.path.lexists(space) else ""
+    return hashlib.sha256(f"{platform.node()} {numbers}".encode()).hexdigest()[:8]
+
+
+@cache
+def _clear_stale(folder: Path) -> None:
+    """Delete, once a process, what killed processes of this machine left in a folder."""
+    if os.name != "posix":  # elsewhere a signal can't ask for a process
+        return
+    for left in folder.glob(f".*{PART_SUFFIX}"):
+        owner = PART_NAME.search(left.name)
+        if owner is not None and owner[1] == _machine() and not _is_running(int(owner[2])):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True

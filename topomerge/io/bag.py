@@ -16,9 +16,10 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.io.bag_depth import COMPRESSED_IMAGE, IMAGE, Decoder, depth_decoder, depth_topics
-from topomerge.io.bag_file import BAG_KIND, Bag, Message, Topic
+from topomerge.io.bag_file import BAG_KIND, Bag, Message, Topic, bag_files
 from topomerge.io.bag_messages import LASER_SCAN, OCCUPANCY_GRID, POINT_CLOUD, cloud_points, laser_points, occupancy_plan, stamp
 from topomerge.io.bag_poses import SensorPoses, sensor_poses
+from topomerge.io.bag_unpacking import bag_size, limit_unpacking
 from topomerge.io.grid import classify, extrude
 from topomerge.io.grid_doubts import doubt_outside
 from topomerge.io.options import ReadOptions
@@ -27,7 +28,9 @@ from topomerge.io.posed import PosedScan, pieces
 from topomerge.io.subprocess_reader import read_in_subprocess
 from topomerge.io.trajectory import BACKWARD
 
-BAG_MEMORY = 4 << 30  # bytes beside what the process starts with: the largest messages, and all poses
+# Of a bag of any size, and bytes of memory for each of its own: the largest messages, and all poses. At most LARGEST_MEMORY.
+LEAST_MEMORY, MEMORY_RATIO, LARGEST_MEMORY = 1 << 30, 16, 4 << 30
+LEAST_SECONDS, BYTES_A_SECOND = 30, 250_000  # of the processor for one piece; an old one goes through ten times as many bytes
 DECODERS: dict[str, Decoder] = {POINT_CLOUD: cloud_points, LASER_SCAN: laser_points}
 READ_TYPES = (*DECODERS, IMAGE, COMPRESSED_IMAGE, OCCUPANCY_GRID)
 READ_NAMES = "PointCloud2, depth images, LaserScan or OccupancyGrid"
@@ -37,7 +40,10 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     """Points in the topmost frame, scan by scan, or the walls and floor of a map."""
     if find_spec("rosbags") is None:
         raise ImportError("no rosbags", name="rosbags")
-    yield from read_in_subprocess("bag", BAG_KIND, path, options, room=BAG_MEMORY)
+    size = bag_size(bag_files(path))
+    seconds = LEAST_SECONDS + size // BYTES_A_SECOND
+    room = min(LEAST_MEMORY + MEMORY_RATIO * size, LARGEST_MEMORY)
+    yield from read_in_subprocess("bag", BAG_KIND, path, options, seconds=seconds, room=room)
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -49,7 +55,7 @@ def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
 
 
 def _read(path: Path, options: ReadOptions) -> Iterator[Piece]:
-    with Bag(path) as bag:
+    with Bag(path, limit_unpacking(bag_size(bag_files(path)))) as bag:
         topic = _topic(bag, options.topic)
         if topic.type == OCCUPANCY_GRID:
             yield from _map(bag, topic, options)

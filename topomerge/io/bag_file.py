@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from topomerge.errors import InputError
+from topomerge.io.bag_unpacking import Unpacking
 from topomerge.io.piece import damaged, leads_outside
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
@@ -54,10 +55,16 @@ class Message:
 
 
 class Bag:
-    """One recording: a file, the folder of a ROS 2 bag, or a folder with the parts of a recording. To be used in a `with`."""
+    """One recording: a file, the folder of a ROS 2 bag, or a folder with the parts of a recording. To be used in a `with`.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        path: of the file or folder.
+        unpacking: counts what is unpacked each time that the messages are gone through.
+    """
+
+    def __init__(self, path: Path, unpacking: Unpacking) -> None:
         self.path = path
+        self.unpacking = unpacking
         self._stack = ExitStack()
         self.topics: dict[str, Topic] = {}
 
@@ -102,6 +109,7 @@ class Bag:
             InputError: one can't be decoded.
         """
         numbers = {t.name: 0 for t in topics}
+        self.unpacking.restart()
         streams = []
         for reader in self.readers:
             chosen = [c for c in reader.connections if c.topic in numbers]

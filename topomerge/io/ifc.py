@@ -25,6 +25,9 @@ from topomerge.types import Array, TrueRoom
 # What has a shape but is not built, or is cut out of something else.
 NOT_BUILT = ("IfcSpace", "IfcFeatureElement", "IfcSite", "IfcAnnotation", "IfcGrid", "IfcVirtualElement", "IfcSpatialZone")
 STEP_END = b"END-ISO-10303-21"
+GEOMETRY_KERNELS = ("hybrid-cgal-simple-opencascade", "opencascade")  # the first is three to six times as fast
+IFC_SECONDS = 600  # of the processor for one piece: 50 elements, which take a second
+IFC_MEMORY = 8 << 30  # bytes that the library may take
 WELD = 1e-3  # m, corners closer than this are one
 
 
@@ -37,7 +40,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
         raise ImportError("no ifcopenshell", name="ifcopenshell")
     _check_ends(path)
     check_references(path)
-    yield from read_in_subprocess("ifc", "an IFC model", path, options)
+    yield from read_in_subprocess("ifc", "an IFC model", path, options, IFC_SECONDS, IFC_MEMORY)
 
 
 def read_in_process(path: Path, options: ReadOptions) -> Iterator[Piece]:
@@ -92,14 +95,29 @@ def _is_built(product: Any, doors: bool) -> bool:
 
 
 def _shapes(model: Any, products: list[Any]) -> Iterator[tuple[int, Array, Array]]:
-    """(id, vertices (n, 3), faces (m, 3)) of products, in metres in the model's frame."""
+    """(id, vertices (n, 3), faces (m, 3)) of products, in metres in the model's frame.
+
+    Flat bodies are made by the fast one of the library's two kernels, all others, and those in which it fails, by the slow one.
+    """
+    left = {p.id() for p in products}
+    for kernel in GEOMETRY_KERNELS:
+        for element, vertices, faces in _shapes_by(model, [p for p in products if p.id() in left], kernel):
+            left.discard(element)
+            yield element, vertices, faces
+
+
+def _shapes_by(model: Any, products: list[Any], kernel: Any) -> Iterator[tuple[int, Array, Array]]:
+    """The same by one kernel; what it cannot make is left out."""
     import ifcopenshell.geom
 
     settings = ifcopenshell.geom.settings()
     settings.set("use-world-coords", True)
     threads = min(4, os.cpu_count() or 1)
-    iterator = ifcopenshell.geom.iterator(settings, model, threads, include=products)
-    if not products or not iterator.initialize():
+    try:
+        iterator = ifcopenshell.geom.iterator(settings, model, threads, include=products, geometry_library=kernel)
+        if not products or not iterator.initialize():
+            return
+    except (RuntimeError, TypeError):  # this build of the library lacks the kernel
         return
     while True:
         shape = iterator.get()

@@ -21,6 +21,7 @@ from topomerge.types import Array
 
 LASZIP = b"laszip encoded"
 LARGEST_HEAD = 64 << 20  # bytes searched for the record of the compression
+MOST_POINTS_A_BYTE = 200  # of a packed file: equal points pack that well, and no scan does
 SMALLEST_CHUNK = 20  # bytes: a compressed chunk starts with one point as it is
 
 
@@ -70,6 +71,8 @@ def records(path: Path) -> Iterator[tuple[Any, Any, float]]:
         room = path.stat().st_size - header.offset_to_point_data
         if not header.are_points_compressed and promised * size > room:
             raise cut_short(path, max(room, 0) // size, promised)
+        if promised > MOST_POINTS_A_BYTE * max(room, 0):
+            raise damaged(path, "a LAZ file", f"it promises {promised:,} points in {max(room, 0):,} bytes")
         for rows in reader.chunk_iterator(BLOCK_POINTS):
             if not len(rows):
                 break

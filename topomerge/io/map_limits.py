@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from topomerge.io.archive import Head
 from topomerge.types import Array, VoxelGrid
 
 # The largest buildings have about 1,000 rooms, the tallest 163 storeys.
@@ -11,16 +14,22 @@ ROOM_LIMIT, STOREY_LIMIT = 5_000, 200
 ROOM_COLUMNS, TOTAL_COLUMNS = 50_000_000, 100_000_000  # of the grid, in the rectangle around a room's floor, and around each
 CONNECTION_LIMIT = 30_000  # of edges, areas, narrows, windows and fixtures each, however many rooms there are
 EDGES_PER_ROOM, AREAS_PER_ROOM, WINDOWS_PER_ROOM, FIXTURES_PER_ROOM = 20, 20, 100, 100  # on average
+ABOUT_LIMIT = 1 << 24  # bytes of what a map says about itself
+PROPERTY_WIDTH = 64  # numbers of one property in a cell
+CELL_ARRAYS = {"grid": ("room", "provenance"), "navigable": ("navigable_room", "navigable_area"), "free": ()}  # a row for each
 
 
-def require_sane_counts(arrays: dict[str, Array]) -> None:
-    """Refuses tables longer than the cells of the map can fill, before anything is done for each of their rows.
+def require_sane_counts(heads: Mapping[str, Head]) -> None:
+    """Refuses what the arrays of a map declare, before any of them is unpacked: tables longer than the cells can fill, and rows
+    of cells that there are not.
 
     Raises:
-        ValueError: more rooms, edges, storeys, areas, narrows, windows or fixtures than a building has.
+        KeyError: an array is missing.
+        ValueError: more rooms, edges, storeys, areas, narrows, windows or fixtures than a building has; more or fewer rows of a
+            property than cells; words that no map says.
     """
-    rooms, areas = arrays["rooms"].size, arrays["areas"].size
-    cells = arrays["room"].size + arrays["navigable_room"].size
+    rooms, areas = heads["rooms"].size, heads["areas"].size
+    cells = heads["room"].size + heads["navigable_room"].size
     limits = {
         "rooms": (ROOM_LIMIT, ""),
         "storeys": (STOREY_LIMIT, ""),
@@ -32,10 +41,28 @@ def require_sane_counts(arrays: dict[str, Array]) -> None:
     }
     for name, (limit, share) in limits.items():
         words = share if limit < CONNECTION_LIMIT else ""
-        if name in arrays and arrays[name].size > limit:
-            raise ValueError(f"declares {arrays[name].size:,} {name}, more than {limit:,}{words}")
+        if name in heads and heads[name].size > limit:
+            raise ValueError(f"declares {heads[name].size:,} {name}, more than {limit:,}{words}")
     if rooms > cells:
         raise ValueError(f"declares {rooms:,} rooms and has only {cells:,} cells")
+    if heads["about"].size * heads["about"].dtype.itemsize > ABOUT_LIMIT:
+        raise ValueError(f"says more than {ABOUT_LIMIT >> 20} MB about itself")
+    _require_rows(heads)
+
+
+def _require_rows(heads: Mapping[str, Head]) -> None:
+    """Refuses arrays that have not one row for each cell, or more numbers in one than any property has."""
+    for grid, of_cells in CELL_ARRAYS.items():
+        if f"{grid}_cells" not in heads:
+            continue
+        count = heads[f"{grid}_cells"].size
+        named = [name for name in heads if name in of_cells or name.startswith(f"{grid}_property.")]
+        for name in named:
+            shape = heads[name].shape
+            if shape[:1] != (count,):
+                raise ValueError(f"{name} has the shape {shape} for {count:,} cells")
+            if heads[name].size > PROPERTY_WIDTH * count:
+                raise ValueError(f"{name} has {heads[name].size // max(count, 1):,} numbers a cell, more than {PROPERTY_WIDTH}")
 
 
 def require_compact_rooms(navigable: VoxelGrid, room: Array, rooms: int) -> None:

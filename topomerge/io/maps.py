@@ -21,6 +21,8 @@ A `.tmap` is one compressed NumPy archive without pickled objects. Format 2 hold
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -106,16 +108,26 @@ def load_map(path: str | Path) -> TopometricMap:
         InputError: no such file, not a map, of a newer format, damaged or cut off; more rooms or edges than a building has, a
             number in a table that is none, a frame that no building has.
     """
-    arrays = archive.read(path, KIND)
-    if "format" not in arrays or "about" not in arrays:
+    heads = archive.heads(path, KIND)
+    if "format" not in heads or "about" not in heads:
         raise InputError(f"{path}: is not a {KIND}: make one with `topomerge extract SCAN -o A.tmap`")
-    number = arrays["format"]
+    number: Any = archive.read(path, KIND, ["format"])["format"] if heads["format"].shape == () else heads["format"]
     if number.shape != () or number.dtype.kind not in "iu" or int(number) != TMAP_FORMAT:
         older = number.shape == () and number.dtype.kind in "iu" and int(number) < TMAP_FORMAT
         advice = "make it again with `topomerge extract`" if older else "update topomerge"
         raise InputError(f"{path}: is of format {number}, and this topomerge reads format {TMAP_FORMAT}; {advice}")
-    try:
+    with _told_of(path):
+        require_sane_counts(heads)  # before anything is unpacked
+    arrays = archive.read(path, KIND)
+    with _told_of(path):
         return _map(arrays)
+
+
+@contextmanager
+def _told_of(path: str | Path) -> Iterator[None]:
+    """Within, whatever is wrong with the arrays of a map becomes one line about its file."""
+    try:
+        yield
     except KeyError as error:
         raise InputError(f"{path}: damaged ({error} is missing); make it again") from error
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
@@ -251,7 +263,6 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
     if missing := set(about["arrays"]) - set(arrays):
         raise KeyError(min(missing))
     provenance = _typed(arrays, "provenance", "u", 1).astype(np.uint32) if "provenance" in arrays else None
-    require_sane_counts(arrays)
     edges, narrows = _edges(arrays, "edges"), _edges(arrays, "narrows")
     for table in (edges, narrows):
         table["kind"].tolist()  # fails here, not later, where the text is none

@@ -30,6 +30,7 @@ class ReadOptions:
         doors: keep the door leaves of a building model; by default its doors stand open.
         poses: file with the trajectory of a folder of scans, RGB-D images or a bag (KITTI or TUM format); of a bag also the name
             of a topic with poses. None: what lies beside the scans, or what the bag holds.
+        one_frame: read all files of a folder as parts of one cloud, whose points lie in one frame.
         topic: of a bag, where it has several with points or maps.
     """
 
@@ -43,6 +44,7 @@ class ReadOptions:
     doors: bool = False
     poses: str | None = None
     topic: str | None = None
+    one_frame: bool = False
 
     @property
     def factor(self) -> float:

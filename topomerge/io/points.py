@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from topomerge.errors import InputError
+from topomerge.errors import InputError, is_memory_short
 from topomerge.io.gather import Gatherer
 from topomerge.io.options import ReadOptions, read_options
 from topomerge.io.piece import Piece, damaged, refuse_pointer
@@ -64,6 +64,7 @@ FORMATS = (
     Format("a floor plan", "grid", (".yaml", ".yml", *PICTURES), fixed=True, takes=DRAWN),
 )
 SCAN_FOLDER = Format("a folder of scans", "scan_folder", (), takes=("poses",))
+TILES_FOLDER = Format("a folder of files of one frame", "tiles", (), takes=("one_frame",))
 RGBD_FOLDER = Format("a folder of RGB-D images", "rgbd", (), takes=("poses",))
 OCTREES = {  # by the file that names all others
     "ept.json": Format("an EPT point cloud", "ept", (), extra="las"),
@@ -85,7 +86,7 @@ def read_points(path: str | Path, *, progress: Progress | None = None, **options
         progress: called now and then with the share done and a text.
         options: those of `topomerge.io.options.ReadOptions`: ``up``, ``unit``, ``scale`` of the coordinates; ``resolution``,
             ``extrude``, ``ceiling`` of floor plans; ``spacing`` of points on surfaces; ``doors`` of building models; ``poses``
-            and ``topic`` of scans.
+            and ``topic`` of scans; ``one_frame`` of a folder whose files are parts of one cloud.
 
     Raises:
         InputError: anything that keeps the file from being read, or a wrong option, in one line.
@@ -110,12 +111,16 @@ def read_chunks(
     path = Path(path)
     file_format = format_of(path)
     reading = read_options(path, options)
+    if reading.one_frame and file_format is SCAN_FOLDER:
+        file_format = TILES_FOLDER
     if chunk < 1:
         raise InputError(f"{path}: a chunk of {chunk} points can't be read; give 1 or more")
-    for name in ("poses", "topic", "doors", *DRAWN):
+    for name in ("poses", "topic", "doors", "one_frame", *DRAWN):
         if options.get(name) not in (None, False) and name not in file_format.takes:
-            able = ", ".join(f.name for f in (*FORMATS, SCAN_FOLDER, RGBD_FOLDER) if name in f.takes)
-            raise InputError(f"{path}: --{name} is of no use to {file_format.name}, only to {able}; leave it out")
+            able = ", ".join(f.name for f in (*FORMATS, SCAN_FOLDER, TILES_FOLDER, RGBD_FOLDER) if name in f.takes)
+            raise InputError(
+                f"{path}: --{name.replace('_', '-')} is of no use to {file_format.name}, only to {able}; leave it out"
+            )
     warnings: list[str] = []
     if file_format.fixed and (reading.unit not in (None, "m") or reading.up not in (None, "z")):
         warnings.append(f"{file_format.name} states its own unit and up axis: --unit and --up are not applied")
@@ -198,15 +203,21 @@ def guarded(path: Path, file_format: Format, blocks: Callable[[Any], Iterator[Bl
     except (GeneratorExit, KeyboardInterrupt, SystemExit):
         raise
     except ImportError as error:
+        if is_memory_short(error):
+            raise MemoryError(str(error)) from error
         package = f"topomerge[{file_format.extra}]" if file_format.extra else "topomerge"
         raise InputError(f"{path}: reading {file_format.name} needs {error.name}: pip install {package}") from error
     except MemoryError as error:
         raise InputError(f"{path}: does not fit into memory; use a machine with more, or thin the file") from error
     except OSError as error:
+        if is_memory_short(error):
+            raise InputError(f"{path}: does not fit into memory; use a machine with more, or thin the file") from error
         raise InputError(f"{path}: can't be read ({error.strerror or error}); copy it again") from error
     except BaseException as error:  # native readers raise their own kinds, panics of lazrs not even an Exception
         log.debug("reading %s failed", path, exc_info=True)
         _refuse_pointers_in(path)
+        if is_memory_short(error):
+            raise InputError(f"{path}: does not fit into memory; use a machine with more, or thin the file") from error
         raise damaged(path, file_format.name, error) from error
 
 

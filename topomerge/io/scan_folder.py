@@ -25,6 +25,7 @@ from topomerge.io.trajectory import LONGEST_GAP, Trajectory, read_trajectory
 from topomerge.types import Array
 
 SCAN_SUFFIXES = (".ply", ".pcd", ".bin")
+OTHER_CLOUDS = (".las", ".laz", ".e57", ".npy", ".npz", ".xyz", ".pts", ".asc")  # which know nothing of sensors, or all
 BIN_ROW = 16  # bytes: x, y, z and intensity
 # What GLIM, loop-closing systems, KISS-ICP and KISS-SLAM, FAST-LIO's followers and the KITTI benchmark call their trajectories;
 # the better one first: after loop closure, and with times.
@@ -36,6 +37,7 @@ TRAJECTORY_NAMES = (
 # Seconds of the epoch and their fraction, or the last number of a name with the fraction that follows a point.
 NAME_TIME = re.compile(r"(?<!\d)(\d{9,10})[._](\d{1,9})\D*$|(\d+(?:\.\d+)?)\D*$")
 EPOCH_UNITS = {19: 1e-9, 16: 1e-6, 13: 1e-3}  # s, by how many digits a time of our decades has
+LAST_SCAN = 1_000_000  # number of a scan; lines for later ones are not looked for
 INDEX_DIGITS = 8  # at most, of the number of a scan
 
 
@@ -46,7 +48,8 @@ def read(path: Path, options: ReadOptions) -> Iterator[Piece]:
     if trajectory_file is None:
         yield from pieces(_with_viewpoints(path, scans, options))
         return
-    trajectory = read_trajectory(trajectory_file)
+    numbers = [int(t) for scan in scans if _counted(scan) and (t := name_time(scan.stem)) is not None]
+    trajectory = read_trajectory(trajectory_file, len(scans), min(max(numbers, default=0), LAST_SCAN))
     poses, said = match_poses(path, scans, trajectory, trajectory_file)
     yield from pieces(_posed(scans, poses, options), said)
 
@@ -64,13 +67,20 @@ def scans_of(path: Path) -> list[Path]:
             raise InputError(f"{path}: holds several folders of scans ({', '.join(below)[:200]}); give one of them and --poses")
         scans = next(iter(below.values()), [])
     if not scans:
+        others = Counter(p.suffix.lower() for p in path.iterdir() if p.suffix.lower() in OTHER_CLOUDS and p.is_file())
+        if others:
+            counts = ", ".join(f"{count} {kind[1:]}" for kind, count in others.most_common())
+            raise InputError(f"{path}: holds no scans with poses but {counts}; give --one-frame, if they are parts of one cloud")
         raise InputError(
             f"{path}: is a folder without scans (ply, pcd, bin), a ROS bag or RGB-D images; give one of these, or a file"
         )
     kinds = Counter(scan.suffix.lower() for scan in scans)
     if len(kinds) > 1:
         counts = ", ".join(f"{count} {kind[1:]}" for kind, count in kinds.most_common())
-        raise InputError(f"{path}: holds scans of several kinds ({counts}); give a folder with those of one sensor")
+        raise InputError(
+            f"{path}: holds scans of several kinds ({counts}); give a folder with those of one sensor, or --one-frame, if "
+            "they are parts of one cloud in one frame"
+        )
     return scans
 
 
@@ -169,7 +179,8 @@ def _with_viewpoints(path: Path, scans: list[Path], options: ReadOptions) -> Ite
             if pose is None:
                 raise InputError(
                     f"{path}: has no trajectory (such as poses.txt or traj_lidar.txt); give one with --poses, in the format of "
-                    f"KITTI or TUM; or name the files, if each is a map of its own"
+                    f"KITTI or TUM; or --one-frame, if the files are parts of one cloud in one frame; or name the files, if each "
+                    f"is a map of its own"
                 )
             yield PosedScan(piece.points, pose, piece.colors, True, number / len(scans))
 

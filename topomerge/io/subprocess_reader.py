@@ -18,7 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from topomerge.errors import InputError
+from topomerge.errors import InputError, is_memory_short
 from topomerge.io.options import ReadOptions
 from topomerge.io.piece import Piece, damaged
 from topomerge.types import Array, TrueRoom
@@ -112,6 +112,9 @@ def _messages(reader: Any, path: Path, options: ReadOptions, seconds: int | None
     except MemoryError:
         yield {"refused": f"{path}: does not fit into memory; use a machine with more, or thin the file"}, []
     except Exception as error:
+        if is_memory_short(error):
+            yield {"refused": f"{path}: does not fit into memory; use a machine with more, or thin the file"}, []
+            return
         yield {"fault": f"{error}" or type(error).__name__}, []
     else:
         yield {"end": True}, []

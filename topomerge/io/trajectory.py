@@ -22,6 +22,8 @@ from topomerge.types import Array
 
 KITTI_NUMBERS, TUM_NUMBERS = 12, 8  # a line
 POSE_NUMBERS = {KITTI_NUMBERS: "KITTI", TUM_NUMBERS: "TUM"}
+SPARE_POSES = 1000  # lines beyond those that numbered scans can need, so that a message can count them
+SPARE_TIMES, POSES_PER_SCAN = 200_000, 10_000  # lines with times: 20 minutes at 200 Hz, and of 50 s more for each scan
 LONGEST_GAP = 0.2  # s between a scan and the nearest pose
 BEYOND = 1e30  # of any number: larger ones are as good as infinite
 BACKWARD = 1.0  # s: by less, messages may be out of order; by more the clock was set back
@@ -69,15 +71,21 @@ class Trajectory:
         return poses
 
 
-def read_trajectory(path: Path) -> Trajectory:
+def read_trajectory(path: Path, scans: int | None = None, last: int = 0) -> Trajectory:
     """A trajectory in the format of KITTI or TUM, by how many numbers stand in a line.
 
+    Args:
+        path: of the file.
+        scans: how many scans it is for, where that is known. Then no more lines are read than can be of use.
+        last: the largest number of a scan, which counts lines of KITTI's from 0.
+
     Raises:
-        InputError: it is neither, a number is missing or not finite, or time runs backwards; with the number of the line.
+        InputError: it is neither, a number is missing or not finite, or time runs backwards; with the number of the line. Or far
+            more poses than scans.
     """
     try:
         refuse_pointer(path)
-        lines = list(number_rows(path, POSE_NUMBERS))
+        lines = _wanted_rows(path, scans, last)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; --poses names a trajectory (KITTI or TUM)") from None
     except IsADirectoryError:
@@ -89,6 +97,19 @@ def read_trajectory(path: Path) -> Trajectory:
     numbers = np.array([number for number, _ in lines])
     rows = np.array([row for _, row in lines])
     return _kitti(path, numbers, rows) if rows.shape[1] == KITTI_NUMBERS else _tum(path, numbers, rows)
+
+
+def _wanted_rows(path: Path, scans: int | None, last: int) -> list[tuple[int, Array]]:
+    lines: list[tuple[int, Array]] = []
+    for number, row in number_rows(path, POSE_NUMBERS):
+        if scans is not None:
+            if len(row) == KITTI_NUMBERS and len(lines) >= max(scans, last + 1) + SPARE_POSES:
+                break
+            if len(row) == TUM_NUMBERS and len(lines) >= SPARE_TIMES + POSES_PER_SCAN * scans:
+                many = f"more than {len(lines):,} poses for {scans:,} scans"
+                raise InputError(f"{path}: has {many}; give the trajectory of these scans, or keep fewer poses a second")
+        lines.append((number, np.array(row)))
+    return lines
 
 
 def number_rows(path: Path, widths: Mapping[int, str]) -> Iterator[tuple[int, list[float]]]:

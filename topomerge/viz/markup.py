@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import html
 import json
+import re
 from collections.abc import Iterable
 from typing import Any
 
+CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # no text on a page needs them, and names of files may hold them
 VOID = frozenset(("br", "input", "meta", "col"))
 
 
@@ -14,6 +16,10 @@ class Markup(str):
     """Text that is markup already; any other string is escaped where it is put into an element."""
 
     __slots__ = ()
+
+
+def _escaped(text: str) -> str:
+    return html.escape(CONTROL.sub("\N{REPLACEMENT CHARACTER}", text))
 
 
 def element(name: str, *content: str, **attributes: Any) -> Markup:
@@ -30,8 +36,8 @@ def element(name: str, *content: str, **attributes: Any) -> Markup:
         if value is None or value is False:
             continue
         key = key.rstrip("_").replace("_", "-")
-        words.append(key if value is True else f'{key}="{html.escape(str(value))}"')
-    inside = "".join(part if isinstance(part, Markup) else html.escape(part) for part in content)
+        words.append(key if value is True else f'{key}="{_escaped(str(value))}"')
+    inside = "".join(part if isinstance(part, Markup) else _escaped(part) for part in content)
     if name in VOID:
         return Markup(f"<{' '.join(words)}>")
     return Markup(f"<{' '.join(words)}>{inside}</{name}>")
@@ -39,7 +45,7 @@ def element(name: str, *content: str, **attributes: Any) -> Markup:
 
 def join(parts: Iterable[str], between: str = "") -> Markup:
     """Parts one after another; those that are no markup are escaped."""
-    safe = [part if isinstance(part, Markup) else html.escape(part) for part in parts]
+    safe = [part if isinstance(part, Markup) else _escaped(part) for part in parts]
     return Markup(between.join(safe))
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from topomerge.errors import InputError
 from topomerge.extraction.classified_storey import COLUMN_CLASSES, ClassifiedStorey, leads_through_wall
+from topomerge.extraction.plans import plan_network
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.plan_network import (
     EVIDENCE_CHANNELS,
@@ -130,3 +131,23 @@ def test_damaged_weights(tmp_path: Path) -> None:
     np.savez(path, **{**shipped, "a1.w": np.array([{"no": 1}], object)})
     with pytest.raises(InputError):
         read_weights(path)
+
+
+@pytest.mark.parametrize("step", [(1500, 0), (-30, 1400), (500, 500)])
+def test_far_parts_of_a_plan_are_looked_at_one_by_one_and_alike(two_rooms, step, monkeypatch) -> None:
+    wall = np.zeros((106 + abs(step[0]), 46 + abs(step[1])), bool)
+    profile, inside = np.zeros(wall.shape, np.uint64), wall.copy()
+    for x, y in ((max(-step[0], 0), 0), (max(step[0], 0), step[1])):
+        at = slice(x, x + 106), slice(y, y + 46)
+        wall[at], inside[at], profile[at] = two_rooms.wall, two_rooms.inside, two_rooms.profile
+    none = np.full(wall.shape, np.nan)
+    plan = StoreyPlan(np.zeros(2), 0.1, wall, inside, profile, profile_bands(0.1), np.zeros(wall.shape), none)
+    sizes = []
+    whole = plan_network.forward
+    monkeypatch.setattr(plan_network, "forward", lambda x, w: sizes.append(x[0].size) or whole(x, w))
+    by_parts = column_probabilities(plan)
+    looked_at = sum(sizes)
+    monkeypatch.setattr(plan_network, "_separate_parts", lambda known: None)
+    at_once = column_probabilities(plan)
+    assert np.array_equal(by_parts[plan.explored], at_once[plan.explored])
+    assert looked_at < 0.9 * (sum(sizes) - looked_at)

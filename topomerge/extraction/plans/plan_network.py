@@ -29,6 +29,9 @@ EVIDENCE_CHANNELS = 11
 COARSEST_STRIDE = 16  # columns a side, of an element of the coarsest level
 DOWN_LEVELS = ("a", "b", "c", "d")  # levels of 1/2, 1/4, 1/8, 1/16: each halves and goes on
 UP_LEVELS = ("e", "f", "g", "h")  # and back, each beside what went down
+SIZE_CHANNEL = EVIDENCE_CHANNELS - 1  # the last one, which is the same everywhere
+NETWORK_REACH = 4  # strides: the network sees 60 columns to each side
+WORTH_PARTING = 0.8  # of a plan's area: its parts are looked at one by one where their boxes have less
 FURNITURE_CHANCE = 0.6, 0.95  # of the inside of a room, from which on what looked like wall is none: without and with a ceiling
 
 
@@ -59,9 +62,51 @@ def column_probabilities(plan: StoreyPlan, network: dict[str, Array] | None = No
     nx, ny = plan.wall.shape
     x = np.pad(x, ((0, 0), (margin, -nx % margin + margin), (margin, -ny % margin + margin)))
     w = weights() if network is None else network
+    parts = _separate_parts(np.asarray(x[:SIZE_CHANNEL].any(axis=0)))
+    if parts is None:
+        mean = _mean_of_turns(x, w)
+    else:
+        side = (2 * NETWORK_REACH + 1) * COARSEST_STRIDE
+        nothing = np.zeros((EVIDENCE_CHANNELS, side, side), np.float32)
+        nothing[SIZE_CHANNEL] = 5 * plan.edge
+        mean = np.empty((*x.shape[1:], len(COLUMN_CLASSES)), np.float32)
+        mean[:] = _mean_of_turns(nothing, w)[side // 2, side // 2]
+        for box, mask in parts:
+            mean[box][mask] = _mean_of_turns(x[:, *box], w)[mask]
+    return np.ascontiguousarray(mean[margin : margin + nx, margin : margin + ny])
+
+
+def _mean_of_turns(x: Array, w: dict[str, Array]) -> Array:
+    """(nx, ny, 5) mean probability over (11, nx, ny) evidence turned by quarters."""
     turned = (softmax(np.moveaxis(forward(np.rot90(x, k, (1, 2)), w), 0, -1)) for k in range(4))
     mean: Array = np.mean([np.rot90(probability, -k) for k, probability in enumerate(turned)], axis=0)
-    return np.ascontiguousarray(mean[margin : margin + nx, margin : margin + ny])
+    return mean
+
+
+def _separate_parts(known: Array) -> list[tuple[tuple[slice, slice], Array]] | None:
+    """Parts of a plan between which the network sees nothing: a box, and which of its columns the network sees anything from.
+
+    A plan of buildings far apart, or of a long bent corridor, so costs what is in it, not the rectangle around it.
+
+    Args:
+        known: (nx, ny) bool, whether anything is known of a column; both sides are multiples of `COARSEST_STRIDE`.
+
+    Returns:
+        None where the boxes are nearly as large as the plan.
+    """
+    step = COARSEST_STRIDE
+    blocks = known.reshape(known.shape[0] // step, step, known.shape[1] // step, step).any(axis=(1, 3))
+    seen = ndimage.binary_dilation(blocks, np.ones((3, 3)), NETWORK_REACH)
+    label, _ = ndimage.label(seen, np.ones((3, 3)))
+    parts, size = [], 0
+    for number, box in enumerate(ndimage.find_objects(label), 1):
+        ends = zip(box, seen.shape, strict=True)
+        wide = [slice(max(side.start - NETWORK_REACH, 0), min(side.stop + NETWORK_REACH, end)) for side, end in ends]
+        mask = label[tuple(wide)] == number
+        columns = slice(wide[0].start * step, wide[0].stop * step), slice(wide[1].start * step, wide[1].stop * step)
+        parts.append((columns, mask.repeat(step, 0).repeat(step, 1)))
+        size += mask.size
+    return parts if size < WORTH_PARTING * seen.size else None
 
 
 def without_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:

@@ -12,7 +12,7 @@ import logging
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -51,13 +51,22 @@ def changing(folder: Path, gone: list[str], patience: float | None = None) -> It
                 (folder / NEW).replace(folder / NEXT)
             except BaseException:
                 shutil.rmtree(folder / NEW, ignore_errors=True)
-                if created and {p.name for p in folder.iterdir()} <= {LOCK}:
-                    shutil.rmtree(folder, ignore_errors=True)
+                _leave_as_found(folder, created)
                 raise
             _finish(folder)
     except OSError as error:
+        _leave_as_found(folder, created)
         reason = error.strerror or error
         raise InputError(f"{folder}: can't be written ({reason}); make room there, or give another folder") from error
+
+
+def _leave_as_found(folder: Path, created: bool) -> None:
+    """Take away the lock of a folder that did not become an atlas, and the folder if it is new."""
+    with suppress(OSError):  # what stays is in nobody's way
+        if {p.name for p in folder.iterdir()} <= {LOCK}:
+            (folder / LOCK).unlink(missing_ok=True)
+            if created:
+                folder.rmdir()
 
 
 def finished(folder: Path) -> None:

@@ -1,0 +1,140 @@
+"""What stands far from the rest of a cloud: stray points, and places that are no part of one building.
+
+Rasters cover the rectangle around all cells. What costs so much more than the cells themselves is told apart here, before any is
+made: few cells far off are left out, and several large places far apart are refused.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from topomerge.errors import InputError
+from topomerge.types import Array
+
+# A group of points is a stray when it lies this far (m) from every larger group and holds less than this share of the cells.
+STRAY_DISTANCE = 10.0
+STRAY_SHARE = 0.01
+STRAY_TOTAL_SHARE = 0.05  # of all cells may be strays
+LARGE_VOLUME = 2e8  # cells: 200 x 200 x 5 m at 0.1 m; smaller grids cost little whatever is in them
+STRAY_CELLS = 16  # cells in a block as wide as STRAY_DISTANCE; fewer join nothing: dust would else join all that it lies between
+
+PLACE_DISTANCE = 100.0  # m of nothing that part places of which each may be a building
+PLACE_MARGIN = 48  # columns around a plan, in which nothing is
+LARGE_AREA = 4e6  # columns of the rectangle around all places; smaller ones cost a few seconds
+AREA_RATIO = 4.0  # times the rectangles around each
+MOST_NAMED = 3  # places in a message
+AROUND = np.argwhere(np.ones((3, 3, 3), bool))[14:] - 1  # half of the 26 neighbours
+
+
+def without_strays(cells: Array, counts: Array, edge: float) -> tuple[Array, str]:
+    """Which cells to keep, and a warning if some go: strays, where they make the grid much larger.
+
+    A wing that was scanned thinly is no stray. Where much would go, the points are not strays: the unit is wrong.
+
+    Args:
+        cells: (n, 3) int64.
+        counts: (n,) points in each.
+        edge: m.
+    """
+    volume = box_volume(cells)
+    if volume <= LARGE_VOLUME:
+        return np.ones(len(cells), bool), ""
+    keep = _not_stray(cells, edge)
+    if box_volume(cells[keep]) >= volume / 4 or keep.mean() <= 1 - STRAY_TOTAL_SHARE:
+        return np.ones(len(cells), bool), ""
+    dropped = int(counts[~keep].sum())
+    subject = "1 stray point lies" if dropped == 1 else f"{dropped} stray points lie"
+    return keep, f"{subject} more than {STRAY_DISTANCE:g} m from the rest: left out"
+
+
+def largest_place(cells: Array, counts: Array, edge: float) -> tuple[Array, str]:
+    """The cells of the largest place, and a warning if there are others, where the rectangle around all is absurdly large.
+
+    Args:
+        cells: (n, 3) int64.
+        counts: (n,) points in each.
+        edge: m.
+
+    Raises:
+        InputError: a second place is too large to be left out.
+    """
+    everything = np.ones(len(cells), bool)
+    total = _columns(cells)
+    if total <= LARGE_AREA:
+        return everything, ""
+    place = grouped(cells, max(int(PLACE_DISTANCE / edge), 1))
+    size = np.bincount(place)
+    order = np.argsort(-size, kind="stable")
+    if total <= AREA_RATIO * sum(_columns(cells[place == k]) for k in order[: int(1 / STRAY_SHARE)]):
+        return everything, ""
+    main = place == order[0]
+    dropped = int(counts[~main].sum())
+    where = [_where(cells[place == k], int(size[k]) / len(cells), edge) for k in order[:MOST_NAMED]]
+    more = f" and {len(size) - MOST_NAMED} more" if len(size) > MOST_NAMED else ""
+    if main.mean() <= 1 - STRAY_TOTAL_SHARE:
+        raise InputError(
+            f"the points lie in {len(size):,} places more than {PLACE_DISTANCE:g} m apart with nothing between them "
+            f"({', '.join(where)}{more}): crop the file to one of them, or check --unit"
+        )
+    others = f"{', '.join(where[1:])}{more}"
+    return main, f"{dropped:,} points lie more than {PLACE_DISTANCE:g} m from the rest with nothing between ({others}): left out"
+
+
+def box_volume(cells: Array) -> float:
+    """Cells of a box of whole bricks: what the lookup table has to cover."""
+    shape = np.ptp(cells, axis=0) + 1
+    return float(np.prod(((shape + 7) // 8 * 8).astype(np.float64)))
+
+
+def grouped(cells: Array, block: int, least: int = 1) -> Array:
+    """(n,) int64 group of each cell, numbered from 0: those in blocks that touch each other.
+
+    Args:
+        cells: (n, 3) int64.
+        block: cells a side of a block.
+        least: cells in a block that joins its neighbours; of two blocks that touch, one must have as many.
+    """
+    keys, of_block, size = np.unique(cells // block, axis=0, return_inverse=True, return_counts=True)
+    keys = np.column_stack([_squeezed(keys[:, axis]) for axis in range(3)])
+    span = [int(s) for s in keys.max(axis=0) + 2]
+    if span[0] * span[1] * span[2] >= 1 << 62:
+        raise InputError("the points are scattered over an extent that no building has: check --unit, or crop the file")
+    step = np.array([span[1] * span[2], span[2], 1])
+    codes = keys @ step  # ascending, as the keys are
+    pairs = []
+    for other in codes + (AROUND @ step)[:, None]:
+        at = np.minimum(np.searchsorted(codes, other), len(codes) - 1)
+        joined = (codes[at] == other) & ((size >= least) | (size[at] >= least))
+        pairs.append(np.stack([np.flatnonzero(joined), at[joined]]))
+    rows, columns = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(len(rows), bool), (rows, columns)), (len(codes), len(codes)))
+    _, group = connected_components(graph, directed=False)
+    return np.asarray(group, np.int64)[of_block.ravel()]
+
+
+def _squeezed(keys: Array) -> Array:
+    """Numbers from 1, in the same order, of which those stay neighbours that were: gaps take no more than one."""
+    values, inverse = np.unique(keys, return_inverse=True)
+    steps = np.minimum(np.diff(values, prepend=values[0] - 1), 2)
+    return np.asarray(np.cumsum(steps)[inverse.ravel()])
+
+
+def _not_stray(cells: Array, edge: float) -> Array:
+    """(n,) bool: not in a small group of cells far from the rest. One stray return must not decide the size of the grid."""
+    group = grouped(cells, max(int(STRAY_DISTANCE / edge), 1), STRAY_CELLS)
+    size = np.bincount(group)
+    keep = (size >= STRAY_SHARE * len(cells))[group]
+    return keep if keep.any() else group == size.argmax()
+
+
+def _columns(cells: Array) -> float:
+    """Columns of the rectangle around cells, with the margin that a plan has."""
+    size = np.ptp(cells[:, :2], axis=0) + 1 + 2 * PLACE_MARGIN
+    return float(size[0]) * float(size[1])
+
+
+def _where(cells: Array, share: float, edge: float) -> str:
+    middle = ", ".join(f"{v:.0f}" for v in (np.median(cells, axis=0) + 0.5) * edge)
+    return f"{100 * share:.2g} % around {middle} m"
