@@ -39,6 +39,7 @@ class Scan:
         source: where it comes from.
         warnings: what the user should know.
         crossed: cells that its rays crossed (`free_space.with_crossed_cells`); None where that is unknown.
+        raised: is it a robot's grid or a drawing, whose walls were all raised alike (`slices.is_raised`)?
     """
 
     grid: VoxelGrid
@@ -49,6 +50,7 @@ class Scan:
     source: str = ""
     warnings: tuple[str, ...] = ()
     crossed: VoxelGrid | None = None
+    raised: bool = False
 
     @property
     def places(self) -> Array:

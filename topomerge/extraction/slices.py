@@ -15,6 +15,7 @@ from topomerge.types import Array, VoxelGrid
 SLICE_HEIGHT = 0.6  # m: what is flatter is a slice
 EXTRUDED_HEIGHT = 2.4  # m, of the walls that a slice becomes
 RAISED_SHARE = 0.999  # of the columns of a raised plan are filled alike; of scans at most 0.6 were, usually a tenth
+RAISED_LEVELS = 0.5  # of the levels of a raised wall are filled at least, whatever the size of the pixels
 RAISED_FROM, BELOW_TOP = 0.5, 0.3  # m above the floor, and m below the top of the walls, between which these are looked at
 ENCLOSED_SHARE = 0.75  # of the directions in which a place inside sees a wall
 SIGHT_DIRECTIONS = 24
@@ -28,7 +29,7 @@ def with_raised_slice(scan: Scan) -> Scan:
     """A scan that is a slice gets walls over its columns, and a floor; any other stays as it is, but for the walls of a raised
     plan, at which nobody needs to look closely."""
     if not is_slice(scan.grid):
-        return replace(scan, fine=None) if is_raised(scan.grid) else scan
+        return replace(scan, fine=None, raised=True) if is_raised(scan.grid) else scan
     warning = f"the scan is a slice: walls of {EXTRUDED_HEIGHT:g} m and a floor were assumed"
     return replace(scan.with_grid(_extruded(scan.grid, scan.rays), warning), fine=None)
 
@@ -51,7 +52,8 @@ def is_raised(grid: VoxelGrid) -> bool:
     standing = (z >= bottom) & (z < top)
     filled = np.bincount(x[standing].astype(np.int64) * grid.shape[1] + y[standing])
     filled = filled[filled > 0]
-    return bool(len(filled) and (filled == top - bottom).mean() >= RAISED_SHARE)
+    most = filled.max(initial=0)  # not all levels where the picture's pixels are as large as the cells
+    return bool(most >= RAISED_LEVELS * (top - bottom) > 0 and (filled == most).mean() >= RAISED_SHARE)
 
 
 def _extent(grid: VoxelGrid) -> tuple[int, int]:
