@@ -58,9 +58,8 @@ def cloud(millions: int = 20) -> None:
     before, began = peak(), time.process_time()
     map = tm.extract(points)
     spent = time.process_time() - began
-    print(
-        f"{len(points):,} points, {floors * 20} rooms: found {len(map.rooms)}; {spent:.1f} s; {before} MB before, {peak()} MB at most"
-    )
+    found = f"{len(points):,} points, {floors * 20} rooms: found {len(map.rooms)}"
+    print(f"{found}; {spent:.1f} s; {before} MB before, {peak()} MB at most", flush=True)
 
 
 def moved(number: int, beside: int) -> Array:
@@ -111,9 +110,8 @@ def maps(count: int = 30) -> None:
     result = tm.merge(parts)
     spent = time.process_time() - began
     joined = sum(t is not None for t in result.transforms)
-    print(
-        f"{count} maps: {result.status}, {joined} joined; {spent:.0f} s of the processor, {time.perf_counter() - start:.0f} s; {peak()} MB"
-    )
+    times = f"{spent:.0f} s of the processor, {time.perf_counter() - start:.0f} s"
+    print(f"{count} maps: {result.status}, {joined} joined; {times}; {peak()} MB")
 
 
 def merges(count: int = 300) -> None:
@@ -197,9 +195,8 @@ def kills(count: int = 8) -> None:
                 errors.append(error.decode()[-300:])
         whole, cut = (Path(folder, "runs", name, "last", "network.safetensors").read_bytes() for name in ("whole", "cut"))
         left = [str(path) for path in Path(folder).rglob(".*") if path.is_file()]
-        print(
-            f"{killed} kills in runs of {long:.0f} s: weights {'equal' if whole == cut else 'DIFFER'}; errors {errors}; left over: {left}"
-        )
+        same = "equal" if whole == cut else "DIFFER"
+        print(f"{killed} kills in runs of {long:.0f} s: weights {same}; errors {errors}; left over: {left}")
 
 
 CASES: dict[str, Callable[..., None]] = {c.__name__: c for c in (cloud, rooms, maps, merges, threads, kills)}

@@ -238,3 +238,29 @@ def test_grids_and_scans_are_weighed_by_models_of_their_own(points: Array) -> No
     map = extract(points, carve=False)
     scan, grid = with_room_odds(map).rooms, with_room_odds(map, None, raised=True).rooms
     assert not np.array_equal(scan["entered"], grid["entered"]) and ((grid["entered"] >= 0) & (grid["entered"] <= 1)).all()
+
+
+def house_and_garden(rough: float, plants: int) -> Array:
+    """Points of two rooms with ceilings, and of 8 m x 8 m of uneven ground before an open door of 1.6 m, with bushes on it."""
+    rng = np.random.default_rng(3)
+    rooms = scenes.two_rooms().points(0.03)
+    low, high = rooms.min(axis=0), rooms.max(axis=0)
+    middle = (low[1] + high[1]) / 2
+    door = (rooms[:, 0] > high[0] - 0.3) & (abs(rooms[:, 1] - middle) < 0.8) & (rooms[:, 2] > 0.1) & (rooms[:, 2] < 2.1)
+    x, y = np.meshgrid(np.arange(high[0] - 0.3, high[0] + 8, 0.05), np.arange(middle - 4, middle + 4, 0.05), indexing="ij")
+    bumps = rough * (np.sin(x * 1.3) + np.cos(y * 1.7 + x))
+    ground = np.column_stack([x.ravel(), y.ravel(), np.where(x > high[0] + 0.3, bumps, 0).ravel()])
+    at = np.array([high[0] + 1.5, middle - 4, 0]) + rng.random((plants, 3)) * (6.5, 8, 0)
+    leaves = [place + rng.normal(0, 1, (400, 3)) * (0.3, 0.3, 0.3) + (0, 0, 0.5) for place in at]
+    return np.concatenate([rooms[~door], ground, *leaves])
+
+
+@pytest.mark.longer
+@pytest.mark.parametrize(("rough", "plants"), [(0.0, 0), (0.04, 6), (0.08, 15)])
+def test_a_garden_seen_from_a_house_is_outside(rough: float, plants: int) -> None:
+    """Ground without a ceiling lies out of doors where the rooms of that scan have one."""
+    rooms = extract(house_and_garden(rough, plants), carve=False).rooms
+    indoors = rooms["centroid"][:, 0] < 8.0
+    garden = ~indoors & (rooms["area"] > 10)
+    assert garden.any() and (rooms["outside"][garden] > 0.5).all()
+    assert (rooms["outside"][indoors & (rooms["area"] > 5)] < 0.3).all()

@@ -290,8 +290,8 @@ SIMULATED = {
         *(f"{of}.seed=0" for of in ("data", "painted", "flat")), "folds=2",
     ],
     "room_odds": [
-        "data=plan_scans", "data.scans=4", "open.scans=2", "grids.scans=2", "folds=2",
-        *(f"{of}.seed=0" for of in ("data", "open", "grids")),
+        "data=plan_scans", "data.scans=4", "open.scans=2", "closed.scans=2", "grids.scans=2", "folds=2",
+        *(f"{of}.seed=0" for of in ("data", "open", "closed", "grids")),
         *(f"{of}.scans=1" for of in ("heldout", "heldout_open", "heldout_grids")),
     ],
     "place_evidence": [*NETWORKS["place_evidence"], *SMALL_GRIDS],

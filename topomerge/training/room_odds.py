@@ -52,21 +52,25 @@ def fit_room_odds(settings: RoomOdds, say: Say) -> Fitted:
         raise InputError(f"fit must be some of {', '.join(FAMILIES)}, not {settings.fit}")
     weights: dict[str, Any] = {} if set(settings.fit) == set(FAMILIES) else room_weights()
     scores: dict[str, float] = {}
-    origin: dict[str, Any] = {"split": recipes(settings, heldout=False)[settings.fit[0]].split}
+    origin: dict[str, Any] = {"split": recipes(settings, heldout=False)[settings.fit[0]][0].split}
     for key in settings.fit:
-        family, recipe = FAMILIES[key], recipes(settings, heldout=False)[key]
-        scans = room_scans(recipe, settings, say)
-        origin[key] = {"set": recipe.name, "scans": len(scans)}
+        family, sets = FAMILIES[key], recipes(settings, heldout=False)[key]
+        scans = [scan for recipe in sets for scan in room_scans(recipe, settings, say)]
+        origin[key] = {"sets": [recipe.name for recipe in sets], "scans": len(scans)}
         scores |= _left_out_scores(family, scans, settings)
         weights = with_weights(weights, family, fitted_weights(family, scans, settings.pull))
     return Fitted(weights, scores, origin)
 
 
-def recipes(settings: RoomOdds, heldout: bool) -> dict[str, PlanRecipe]:
-    """The set of scans of each of `FAMILIES`, to fit to or to judge on."""
+def recipes(settings: RoomOdds, heldout: bool) -> dict[str, list[PlanRecipe]]:
+    """The sets of scans of each of `FAMILIES`, to fit to or to judge on. What lies outside is told in ordinary scans, too."""
     if heldout:
-        return {"scans": settings.heldout, "open": settings.heldout_open, "grids": settings.heldout_grids}
-    return {"scans": settings.data, "open": settings.open, "grids": settings.grids}
+        return {
+            "scans": [settings.heldout],
+            "open": [settings.heldout_open, settings.heldout],
+            "grids": [settings.heldout_grids],
+        }
+    return {"scans": [settings.data], "open": [settings.open, settings.closed], "grids": [settings.grids]}
 
 
 def with_weights(weights: dict[str, Any], family: Family, fitted: dict[str, Any]) -> dict[str, Any]:
@@ -175,9 +179,10 @@ def judge(settings: RoomOdds, file: Path, say: Say) -> dict[str, Any]:
     """Scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
     scores: dict[str, Any] = {}
-    for key, recipe in recipes(settings, heldout=True).items():
+    for key, sets in recipes(settings, heldout=True).items():
         family = FAMILIES[key]
+        scans = [scan for recipe in sets for scan in room_scans(recipe, settings, say)]
         guesses: dict[str, list[Array]] = {name: [] for name in family.lengths}
-        _guess(weights[family.key] if family.key else weights, family, room_scans(recipe, settings, say), guesses)
+        _guess(weights[family.key] if family.key else weights, family, scans, guesses)
         scores |= _scores(family, guesses)
     return scores

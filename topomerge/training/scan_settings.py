@@ -206,8 +206,8 @@ class DoorClassification(NetworkTask):
 @dataclass
 class RoomOdds(TaskSettings):
     """Args:
-    data, open, grids: scans; scans of buildings with their surroundings, for what lies outside; and robots' grids of such ones;
-        heldout, heldout_open, heldout_grids: likewise, of other buildings.
+    data: scans; open, closed: scans of buildings with their surroundings and ordinary ones, for what lies outside; grids: robots'
+        grids of buildings with their surroundings; heldout, heldout_open, heldout_grids: likewise, of other buildings.
     fit: which of `scans`, `open` and `grids` to fit; the weights of the others stay those in use.
     pull: to 0, of all weights but the constant.
     folds: of scans, for the scores.
@@ -217,6 +217,7 @@ class RoomOdds(TaskSettings):
     name: str = "room_odds"
     data: PlanRecipe = field(default_factory=PlanRecipe)
     open: PlanRecipe = field(default_factory=PlanRecipe)
+    closed: PlanRecipe = field(default_factory=PlanRecipe)
     grids: PlanRecipe = field(default_factory=PlanRecipe)
     heldout: PlanRecipe = field(default_factory=PlanRecipe)
     heldout_open: PlanRecipe = field(default_factory=PlanRecipe)
