@@ -50,6 +50,7 @@ class PlanRecipe:
         folder: of the real data; empty: procedural buildings only.
         flat: slices, robots' grids and drawings alone; sparse: share of scans that lose most of their points, there;
             painted: share of scans with colours or intensities, there.
+        surroundings: do the buildings stand in the open, so that sensors see gardens, streets and fans of rays (`open_scans`)?
     """
 
     name: str = "plan_scans"
@@ -60,6 +61,7 @@ class PlanRecipe:
     flat: bool = False
     sparse: float = 0.0
     painted: float = 0.0
+    surroundings: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,19 +1,22 @@
 """Rooms of simulated scans with what is true about them: what the odds of rooms are fitted to (`extraction.room_odds`).
 
 The scans are drawn as those of `plan_examples` are (`scan_items`). Each is extracted with the sensor's places and as if they were
-unknown. A file holds the rooms of one scan.
+unknown. Scans of buildings with their surroundings (`open_scans`) are extracted without the places only. A file holds the rooms
+of one scan.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from topomerge.datasets.core.builder import Row, Say, Sharing, make_item
 from topomerge.datasets.core.plan import Plan
+from topomerge.datasets.pairs.open_scans import open_scan
 from topomerge.datasets.pairs.plan_examples import LONGEST_SCAN, VOXEL_SIZES, PlanRecipe, build_scans
 from topomerge.datasets.pairs.scan_items import PlanItem, Plans, draw_item, scan_of_item
 from topomerge.datasets.simulation.floor_truth import in_frame, truth_of
@@ -21,7 +24,7 @@ from topomerge.datasets.simulation.room_truth import room_truth
 from topomerge.datasets.simulation.scanner import moved
 
 from topomerge.extraction.extract import extract
-from topomerge.extraction.room_features import POSE_FEATURES, pose_features, room_features
+from topomerge.extraction.room_features import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES, pose_features, room_features
 from topomerge.extraction.scan import read_scan
 from topomerge.io import archive
 from topomerge.types import Array
@@ -30,8 +33,11 @@ ROOM_EXAMPLE_FORMAT = 4  # raise it when the same item gives other bytes: it is 
 ANSWERS = ("one", "whole", "entered", "outside")
 
 
+@dataclass(frozen=True)
 class RoomItem(PlanItem):
-    """As of plans; what is made of it has a version of its own."""
+    """As of plans, and does the building stand in the open? What is made of it has a version of its own."""
+
+    surroundings: bool = False
 
     @property
     def name(self) -> str:
@@ -41,12 +47,13 @@ class RoomItem(PlanItem):
 
 def build_rooms(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> list[Path]:
     """The files of a set, made where they are missing, in the order of the seeds."""
-    return build_scans(recipe, "rooms", draw_room_item, make_room_file, sharing, say)[0]
+    draw = partial(draw_room_item, flat=recipe.flat, surroundings=recipe.surroundings)
+    return build_scans(recipe, "rooms", draw, make_room_file, sharing, say)[0]
 
 
-def draw_room_item(seed: int, plans: Plans) -> RoomItem:
+def draw_room_item(seed: int, plans: Plans, flat: bool = False, surroundings: bool = False) -> RoomItem:
     """The item of a seed: that of `scan_items`."""
-    return RoomItem(**asdict(draw_item(seed, plans)))
+    return RoomItem(**asdict(draw_item(seed, plans, flat)), surroundings=surroundings)
 
 
 def make_room_file(item: RoomItem, plan: Plan | None, folder: str) -> Row:
@@ -55,8 +62,10 @@ def make_room_file(item: RoomItem, plan: Plan | None, folder: str) -> Row:
 
 
 def room_rows(item: RoomItem, plan: Plan | None) -> Mapping[str, Array]:
-    """Features and answers of the rooms of a scan: `x` and answers without poses; `posed.x`, `posed.p` and answers with them."""
-    made = scan_of_item(item, plan)
+    """Features and answers of the rooms of a scan: `x` and answers without poses; `posed.x`, `posed.p` and answers with them. `x`
+    are `GRID_FEATURES` of robots' grids of buildings that stand in the open."""
+    made = open_scan(item, plan) if item.surroundings else scan_of_item(item, plan)
+    features = GRID_FEATURES if item.surroundings and item.flat else ROOM_FEATURES
     visited = np.isin(np.arange(len(made.building.rooms)), made.visited)
     anchors, drift = made.shift or (None, None)
     points = made.cloud.points.astype(np.float64) + made.cloud.shift
@@ -64,13 +73,13 @@ def room_rows(item: RoomItem, plan: Plan | None) -> Mapping[str, Array]:
     cloud, voxel = moved(made.cloud, made.frame), VOXEL_SIZES[item.seed % len(VOXEL_SIZES)]
     arrays: dict[str, Array] = {}
     for prefix, source in (("", replace(cloud, poses=None, pose_of=None)), ("posed.", cloud)):
-        if source.poses is None and prefix:
+        if prefix and (source.poses is None or item.surroundings):
             continue
         map = extract(source, voxel_size=voxel, carve=False)
         answers = room_truth(map, truth, made.building.rooms)
         rows = answers.judged
         arrays |= {f"{prefix}{name}": getattr(answers, name)[rows] for name in ANSWERS}
-        arrays[f"{prefix}x"] = room_features(map)[rows]
+        arrays[f"{prefix}x"] = room_features(map, features)[rows]
         if prefix:
             poses = pose_features(map, read_scan(cloud, voxel).rays)
             arrays["posed.p"] = (np.full((len(rows), len(POSE_FEATURES)), np.nan) if poses is None else poses)[rows]

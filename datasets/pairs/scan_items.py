@@ -91,7 +91,7 @@ def scan_of_item(item: PlanItem, plan: Plan | None) -> SimulatedScan:
     seed = item.seed
     rng = np.random.default_rng(seed)
     difficulty = draw_difficulty(rng)
-    source, sensor = _draw_source(rng, item.flat)
+    source, sensor = draw_source(rng, item.flat)
     if plan is not None:
         rng.integers(item.candidates)  # which plan: drawn already
         building = erect([plan], difficulty, rng, f"{source}-{seed}")
@@ -117,7 +117,7 @@ def draw_item(seed: int, plans: Plans, flat: bool = False) -> PlanItem:
     """
     rng = np.random.default_rng(seed)
     draw_difficulty(rng)
-    source, _ = _draw_source(rng, flat)
+    source, _ = draw_source(rng, flat)
     entries = plans.get(source, ())
     if not entries:
         return PlanItem(seed, "procedural", 0, "", "", flat)
@@ -125,7 +125,8 @@ def draw_item(seed: int, plans: Plans, flat: bool = False) -> PlanItem:
     return PlanItem(seed, source, len(entries), name, digest((plan,)), flat)
 
 
-def _draw_source(rng: np.random.Generator, flat: bool) -> tuple[str, str]:
+def draw_source(rng: np.random.Generator, flat: bool) -> tuple[str, str]:
+    """Where a building is from, and by which sensor it is seen."""
     sources, sensors = (FLAT_SOURCE_SHARES, FLAT_SENSOR_SHARES) if flat else (SOURCE_SHARES, SENSOR_SHARES)
     source = str(rng.choice(list(sources), p=list(sources.values())))
     return source, str(rng.choice(list(sensors), p=list(sensors.values())))

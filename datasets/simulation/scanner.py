@@ -86,6 +86,18 @@ def scan(
     return moved(cloud, frame) if frame else cloud
 
 
+def seen_from_poses(
+    building: Building, sensor: Sensor, poses: Array, number: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """(n, 3) points that a sensor sees from poses (K, 4, 4), wherever these are, and (n,) from which.
+
+    Args:
+        number: of rays a pose.
+    """
+    hits = _degrade(building, poses, cast(building, sensor, poses, number, rng), sensor, rng)
+    return placed(poses, hits, hits.ranges), hits.pose
+
+
 def moved(cloud: PointCloud, frame: Sim3) -> PointCloud:
     """The same cloud in another frame: points, poses and rooms."""
     poses = None

@@ -36,6 +36,12 @@ def test_a_raised_plan_is_one_in_any_frame(drawn: Path, ceiling: bool) -> None:
     assert is_raised(read_scan(cloud.points @ turn.T + (3.03, -7.1, 2.22), 0.1).grid)
 
 
+@pytest.mark.parametrize("resolution", [0.02, 0.04, 0.08, 0.1, 0.12, 0.15])
+def test_a_raised_plan_is_one_at_any_resolution(drawn: Path, resolution: float) -> None:
+    """Pixels of a cell's size leave some levels of the walls empty, but the same ones everywhere."""
+    assert is_raised(read_scan(read_points(drawn, resolution=resolution), 0.1).grid)
+
+
 def test_a_scan_is_none() -> None:
     scan = read_scan(two_rooms().points(), 0.1)
     assert not is_raised(scan.grid) and with_raised_slice(scan) is scan

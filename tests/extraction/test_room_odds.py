@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests import scenes
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.extraction.room_features import POSE_FEATURES, ROOM_FEATURES, pose_features, room_features
+from topomerge.extraction.room_features import (
+    GRID_FEATURES,
+    POSE_FEATURES,
+    ROOM_FEATURES,
+    pose_features,
+    room_features,
+    thin_share,
+)
 from topomerge.extraction.room_odds import ROOM_ODDS_FILE, with_room_odds
+from topomerge.io import read_points
 from topomerge.io.weight_files import VARIABLE, weights_file
 from topomerge.kernels.sight import seen_from
 from topomerge.types import ROOM_ODDS, Array, PointCloud, Sim3, TopometricMap, mostly_unseen, with_outline_odds
@@ -144,7 +154,9 @@ def test_by_the_outline_alone(points: Array) -> None:
     assert np.array_equal(thesis["glimpsed"], mostly_unseen(thesis))
 
 
-@pytest.mark.parametrize("change", [{"features": ["none"]}, {"entered": [1.0]}, {"scale": [float("nan")] * 13}])
+@pytest.mark.parametrize(
+    "change", [{"features": ["none"]}, {"entered": [1.0]}, {"scale": [float("nan")] * 13}, {"open": {}}, {"grids": [1.0]}]
+)
 def test_damaged_weights_are_named(points: Array, change: dict[str, object], tmp_path, monkeypatch) -> None:
     values = json.loads(weights_file("topomerge.extraction", ROOM_ODDS_FILE).read_text())
     (tmp_path / ROOM_ODDS_FILE).write_text(json.dumps({**values, **change}))
@@ -163,3 +175,92 @@ def test_sight_ends_at_what_is_not_free() -> None:
     assert seen_from(free, targets, np.array([[0, 4], [2, 3]]), 20.0).tolist() == [True, False, True, False]
     assert not seen_from(free, targets, np.array([[0, 4]]), 5.0).any()
     assert not seen_from(free, targets, np.zeros((0, 2), np.int64), 20.0).any()
+
+
+@pytest.fixture(scope="module")
+def fan_grid(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., TopometricMap]:
+    """Maps of a picture of two rooms of 6 m x 5 m with a door, and of rays that left through a window of the right one."""
+
+    def make(cell: float, spread: float, window: float, reach: float) -> TopometricMap:
+        """The map, with a window `window` m wide, rays within +- `spread` rad, `reach` m long."""
+        size = np.array([13.0 + reach, max(6.0, 2 * reach * np.sin(spread) + window + 1)])
+        x, y = np.meshgrid(*((np.arange(int(s / cell)) + 0.5) * cell for s in size), indexing="ij")
+        y = y - size[1] / 2
+        image = np.full(x.shape, 205, np.uint8)
+        building = (x > 0.3) & (x < 12.7) & (np.abs(y) < 2.7)
+        wall = building & ((x < 0.5) | (x > 12.5) | (np.abs(y) > 2.5) | ((np.abs(x - 6.5) < 0.1) & (np.abs(y) > 0.5)))
+        image[building] = 254
+        image[wall] = 0
+        out = (x > 12.4) & (np.abs(y) < window / 2 + (x - 12.7).clip(0) * np.tan(spread)) & (x < 12.7 + reach)
+        angle = np.arctan2(y, x - 11.5)
+        image[out & ((np.sin(angle * 40) > -0.4) | (x < 14.0))] = 254  # single rays, farther away
+        path = tmp_path_factory.mktemp("fan") / "map.png"
+        Image.fromarray(image.T[::-1]).save(path)
+        return extract(read_points(path, resolution=cell))
+
+    return make
+
+
+FANS = [(0.05, 0.5, 1.5, 5.0), (0.05, 0.2, 1.2, 8.0), (0.1, 0.7, 2.0, 4.0), (0.04, 0.35, 2.5, 6.0)]
+
+
+@pytest.mark.parametrize(("cell", "spread", "window", "reach"), FANS)
+def test_rays_through_a_window_of_a_grid_are_only_looked_into(fan_grid, cell, spread, window, reach) -> None:
+    """Rays that end nowhere bound no room; the rooms that the robot stood in are not held for looked into because of them."""
+    rooms = fan_grid(cell, spread, window, reach).rooms
+    outside = rooms["centroid"][:, 0] > 12.7
+    assert outside.any() and rooms["glimpsed"][outside].all() and (rooms["entered"][outside] < 0.3).all()
+    large = ~outside & (rooms["area"] > 15)
+    assert large.any() and not rooms["glimpsed"][large].any() and (rooms["outside"][large] < 0.3).all()
+    assert (rooms["outside"][outside] > 0.1).all() and (rooms["outside"][outside].min() > rooms["outside"][large].max())
+
+
+def test_rays_have_an_open_outline_and_are_thin(fan_grid) -> None:
+    map = fan_grid(*FANS[0])
+    x = dict(zip(GRID_FEATURES, room_features(map, GRID_FEATURES).T, strict=True))
+    outside = map.rooms["centroid"][:, 0] > 12.7
+    assert (x["open_outline"][outside] > 0.3).all() and (x["open_outline"][~outside] < 0.1).all()
+    assert (x["thin"][~outside & (map.rooms["area"] > 15)] < 0.05).all()
+
+
+@pytest.mark.parametrize("edge", [0.05, 0.1, 0.2])
+def test_a_single_ray_is_thin_and_a_room_is_not(edge: float) -> None:
+    room, ray = np.zeros((2, 100, 100), bool)
+    room[10:50, 10:50] = True
+    ray[10:90, 10 : 10 + round(0.4 / edge)] = True
+    assert thin_share(room, edge) < 0.01 and thin_share(ray, edge) == 1
+    joined = room.copy()
+    joined[50:90, 20 : 20 + round(0.4 / edge)] = True
+    assert thin_share(joined, edge) == pytest.approx((joined & ~room).sum() / joined.sum(), abs=0.1)
+
+
+def test_grids_and_scans_are_weighed_by_models_of_their_own(points: Array) -> None:
+    map = extract(points, carve=False)
+    scan, grid = with_room_odds(map).rooms, with_room_odds(map, None, raised=True).rooms
+    assert not np.array_equal(scan["entered"], grid["entered"]) and ((grid["entered"] >= 0) & (grid["entered"] <= 1)).all()
+
+
+def house_and_garden(rough: float, plants: int) -> Array:
+    """Points of two rooms with ceilings, and of 8 m x 8 m of uneven ground before an open door of 1.6 m, with bushes on it."""
+    rng = np.random.default_rng(3)
+    rooms = scenes.two_rooms().points(0.03)
+    low, high = rooms.min(axis=0), rooms.max(axis=0)
+    middle = (low[1] + high[1]) / 2
+    door = (rooms[:, 0] > high[0] - 0.3) & (abs(rooms[:, 1] - middle) < 0.8) & (rooms[:, 2] > 0.1) & (rooms[:, 2] < 2.1)
+    x, y = np.meshgrid(np.arange(high[0] - 0.3, high[0] + 8, 0.05), np.arange(middle - 4, middle + 4, 0.05), indexing="ij")
+    bumps = rough * (np.sin(x * 1.3) + np.cos(y * 1.7 + x))
+    ground = np.column_stack([x.ravel(), y.ravel(), np.where(x > high[0] + 0.3, bumps, 0).ravel()])
+    at = np.array([high[0] + 1.5, middle - 4, 0]) + rng.random((plants, 3)) * (6.5, 8, 0)
+    leaves = [place + rng.normal(0, 1, (400, 3)) * (0.3, 0.3, 0.3) + (0, 0, 0.5) for place in at]
+    return np.concatenate([rooms[~door], ground, *leaves])
+
+
+@pytest.mark.longer
+@pytest.mark.parametrize(("rough", "plants"), [(0.0, 0), (0.04, 6), (0.08, 15)])
+def test_a_garden_seen_from_a_house_is_outside(rough: float, plants: int) -> None:
+    """Ground without a ceiling lies out of doors where the rooms of that scan have one."""
+    rooms = extract(house_and_garden(rough, plants), carve=False).rooms
+    indoors = rooms["centroid"][:, 0] < 8.0
+    garden = ~indoors & (rooms["area"] > 10)
+    assert garden.any() and (rooms["outside"][garden] > 0.5).all()
+    assert (rooms["outside"][indoors & (rooms["area"] > 5)] < 0.3).all()

@@ -289,7 +289,11 @@ SIMULATED = {
         *(f"{of}.scans=2" for of in ("data", "painted", "flat", "heldout", "heldout_painted", "heldout_flat")),
         *(f"{of}.seed=0" for of in ("data", "painted", "flat")), "folds=2",
     ],
-    "room_odds": ["data=plan_scans", "data.scans=4", "data.seed=0", "folds=2", "heldout.scans=1"],
+    "room_odds": [
+        "data=plan_scans", "data.scans=4", "open.scans=2", "closed.scans=2", "grids.scans=2", "folds=2",
+        *(f"{of}.seed=0" for of in ("data", "open", "closed", "grids")),
+        *(f"{of}.scans=1" for of in ("heldout", "heldout_open", "heldout_grids")),
+    ],
     "place_evidence": [*NETWORKS["place_evidence"], *SMALL_GRIDS],
     "merge_belief": [*SMALL_GRIDS, *WITHOUT_MORE["merge_belief"], "folds=2"],
     "match_odds": [*SMALL_PAIRS, "folds=2"],

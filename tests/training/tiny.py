@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from topomerge.datasets.pairs.plan_examples import PlanExample, example_arrays
+from topomerge.datasets.pairs.plan_examples import PlanExample, PlanRecipe, example_arrays
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 from topomerge.datasets.pairs.scan_items import PlanItem
 from topomerge.datasets.pairs.wall_examples import WallExample, WallItem, wall_arrays
@@ -18,7 +18,7 @@ from topomerge.embedding.turns import FACTS, TurnedRows
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.extraction.room_features import POSE_FEATURES, ROOM_FEATURES
+from topomerge.extraction.room_features import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
 from topomerge.fusion.evidence.crops import LOOKED, SIDE
 from topomerge.fusion.match_belief import BELIEVED_METHODS
 from topomerge.io import archive
@@ -188,11 +188,12 @@ def match_rows(*_: Any) -> list[MatchRows]:
     return rows
 
 
-def room_scans(*_: Any) -> list[dict[str, Any]]:
+def room_scans(recipe: PlanRecipe, *_: Any) -> list[dict[str, Any]]:
     """Rooms of scans of which those with a higher first feature were entered; every third scan has no poses."""
     rng, scans = np.random.default_rng(0), []
     for k in range(16):
-        x, p = rng.random((9, len(ROOM_FEATURES))), rng.random((9, len(POSE_FEATURES)))
+        x = rng.random((9, len(GRID_FEATURES if recipe.flat and recipe.surroundings else ROOM_FEATURES)))
+        p = rng.random((9, len(POSE_FEATURES)))
         scan = {"x": x, "one": x[:, 1] > 0.3, "whole": x[:, 2] > 0.5, "entered": x[:, 0] > 0.5, "outside": x[:, 3] < 0.1}
         scans.append(scan if k % 3 == 0 else {**scan, "posed.x": x, "posed.p": p, "posed.entered": p[:, 0] > 0.5})
     return scans

@@ -155,7 +155,7 @@ def _with_odds_and_openings(
     the sensor was carried through; what is odd about its way; and what these say of its rooms."""
     if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
         return replace(map, rooms=with_outline_odds(map.rooms)), [], _Reconsidered()
-    map = with_room_odds(map, scan.rays)
+    map = with_room_odds(map, scan.rays, scan.raised)
     walls = None
     if p.walls and scan.fine is not None and len(map.rooms):
         walls = wall_elevations(map, scan.fine, scan.shades, scan.crossed)

@@ -6,9 +6,10 @@ are shares or logarithms, so that they do not change with the frame, and little 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import edt
 import numpy as np
 import shapely
 from scipy import ndimage
@@ -34,6 +35,18 @@ ROOM_FEATURES = (
     "between",  # share of its floor that lies between other rooms of the storey: within their convex hull
     "floor_step",  # m that its floor is higher or lower than the storey
 )
+GRID_FEATURES = (  # of robots' grids and drawings, whose walls were all raised alike
+    "completeness",
+    "log_area",
+    "log_width",
+    "floor_seen",
+    "walls_hidden",
+    "log_hidden",
+    "contact",
+    "between",
+    "open_outline",  # share of its outline beside which there is neither a wall nor the floor of another room: rays end there
+    "thin",  # share of its floor that is narrower than a body and its way: single rays
+)
 POSE_FEATURES = (
     "stood_in",  # 1: a place of the sensor is over its floor
     "own_rays",  # share of what was seen of it that was seen from there
@@ -43,6 +56,7 @@ VIEWPOINTS = 3.0  # m about a room: from there others look into it
 VIEW_STEP = 0.3  # m between them
 SIGHT_REACH = 8.0  # m
 WALL_BESIDE = 0.2  # m between the floor's edge and a wall
+THIN_HALF_WIDTH, THIN_REACH = 0.45, 0.55  # m: floor is thin that is farther than the second from all that is wider than the first
 BODY = 1.6  # m: lower things over the floor are no ceiling
 POSE_REACH = 0.4  # m beside the floor: places of a sensor in a narrow room, or adrift
 POSE_HEIGHTS = (-0.5, 3.0)  # m above the floor
@@ -66,10 +80,14 @@ class _StoreyFloor:
     edge: float
 
 
-def room_features(map: TopometricMap) -> Array:
-    """(R, 13) `ROOM_FEATURES` of a map, which need no poses."""
+def room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATURES) -> Array:
+    """(R, F) features of a map that need no poses.
+
+    Args:
+        names: of `ROOM_FEATURES` and `GRID_FEATURES`.
+    """
     rooms = map.rooms
-    table = {name: np.zeros(len(rooms)) for name in ROOM_FEATURES}
+    table = {name: np.zeros(len(rooms)) for name in (*ROOM_FEATURES, *GRID_FEATURES)}
     covered = np.zeros((2, len(rooms)))  # columns with a ceiling, and all
     for storey in _storey_floors(map):
         hulls = _Hulls(storey)
@@ -89,7 +107,7 @@ def room_features(map: TopometricMap) -> Array:
     table["completeness"] = rooms["completeness"]
     table["log_area"] = np.log(np.maximum(rooms["area"], 0.1))
     table["log_density"], table["log_cells"] = np.log(cells / mean), np.log(cells)
-    return np.stack([table[name] for name in ROOM_FEATURES], axis=1)
+    return np.stack([table[name] for name in names], axis=1)
 
 
 def pose_features(map: TopometricMap, rays: tuple[Array, Array] | None) -> Array | None:
@@ -189,7 +207,18 @@ def _outline(storey: _StoreyFloor, own: Array, window: tuple[slice, slice]) -> d
         "walls_hidden": float(hidden.mean()) if len(walls) else 0.0,
         "log_hidden": float(np.log1p(hidden.sum() * storey.edge)),
         "contact": float(contact.sum() / around),
+        "open_outline": float((end & ~contact & ~near).sum() / around),
+        "thin": thin_share(own, storey.edge),
     }
+
+
+def thin_share(own: Array, edge: float) -> float:
+    """Share of a room's columns (nx, ny) that are farther than `THIN_REACH` from what is `THIN_HALF_WIDTH` from its outline."""
+    wide = edt.edt(np.pad(own, 1).view(np.uint8), parallel=1)[1:-1, 1:-1] * edge >= THIN_HALF_WIDTH
+    if not wide.any():
+        return 1.0
+    away = edt.edt((~np.pad(wide, 1)).view(np.uint8), parallel=1)[1:-1, 1:-1] * edge
+    return float((away[own] > THIN_REACH).mean())
 
 
 class _Hulls:

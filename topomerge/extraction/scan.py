@@ -41,6 +41,7 @@ class Scan:
         warnings: what the user should know.
         crossed: cells that its rays crossed (`free_space.with_crossed_cells`); None where that is unknown.
         levelling: (4, 4) that took the points of a tilted cloud into the frame of the grid; None where it was level.
+        raised: is it a robot's grid or a drawing, whose walls were all raised alike (`slices.is_raised`)?
     """
 
     grid: VoxelGrid
@@ -52,6 +53,7 @@ class Scan:
     warnings: tuple[str, ...] = ()
     crossed: VoxelGrid | None = None
     levelling: Array | None = None
+    raised: bool = False
 
     @property
     def places(self) -> Array:

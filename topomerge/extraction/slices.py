@@ -16,6 +16,7 @@ from topomerge.types import Array, VoxelGrid
 
 EXTRUDED_HEIGHT = 2.4  # m, of the walls that a slice becomes
 RAISED_SHARE = 0.999  # of the columns of a raised plan are filled alike; of scans at most 0.6 were, usually a tenth
+RAISED_LEVELS = 0.5  # of the levels of a raised wall are filled at least, whatever the size of the pixels
 RAISED_FROM, BELOW_TOP = 0.5, 0.3  # m above the floor, and m below the top of the walls, between which these are looked at
 WALL_THICKNESS = 1.0  # m: what is wider both ways is no wall, nor a row of legs
 FLOOR_SHARE = 0.7  # of the columns of a floor lie in such areas; of slices 0 to 0.2 do
@@ -35,7 +36,7 @@ def with_raised_slice(scan: Scan) -> Scan:
         InputError: it is a floor, or a ceiling.
     """
     if not is_slice(scan.grid):
-        return replace(scan, fine=None) if is_raised(scan.grid) else scan
+        return replace(scan, fine=None, raised=True) if is_raised(scan.grid) else scan
     if is_floor(scan.grid):
         flat = f"only a floor or a ceiling was seen (all within {SLICE_HEIGHT:g} m of height, over whole areas), and no walls"
         raise InputError(f"{flat}: rooms can't be told from it; give a scan that shows walls, too")
@@ -71,7 +72,8 @@ def is_raised(grid: VoxelGrid) -> bool:
     standing = (z >= bottom) & (z < top)
     filled = np.bincount(x[standing].astype(np.int64) * grid.shape[1] + y[standing])
     filled = filled[filled > 0]
-    return bool(len(filled) and (filled == top - bottom).mean() >= RAISED_SHARE)
+    most = filled.max(initial=0)  # not all levels where the picture's pixels are as large as the cells
+    return bool(most >= RAISED_LEVELS * (top - bottom) > 0 and (filled == most).mean() >= RAISED_SHARE)
 
 
 def _extent(grid: VoxelGrid) -> tuple[int, int]:

@@ -1,7 +1,8 @@
 """Task `room_odds`: is a room of a map one, whole, entered, outside (`extraction.room_odds`)?
 
-Simulated scans are extracted with and without the sensor's places; what is true about their rooms answers. Each scan counts
-alike per root of its rooms, so that hospitals do not outweigh flats.
+Simulated scans are extracted with and without the sensor's places, robots' grids and scans of buildings with their surroundings
+without; what is true about their rooms answers. Each scan counts alike per root of its rooms, so that hospitals do not outweigh
+flats.
 """
 
 from __future__ import annotations
@@ -18,8 +19,13 @@ from scipy.stats import rankdata
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.room_examples import build_rooms, read_room_rows
 from topomerge.errors import InputError
-from topomerge.extraction.room_features import POSE_FEATURES, ROOM_FEATURES
-from topomerge.extraction.room_odds import ENTERED_BY_POSES, MODEL_LENGTHS, model_inputs
+from topomerge.extraction.room_odds import (
+    ENTERED_BY_POSES,
+    FAMILIES,
+    Family,
+    model_inputs,
+    room_weights,
+)
 from topomerge.numpy_nn import sigmoid
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
@@ -37,17 +43,51 @@ def fit(settings: RoomOdds, say: Say) -> dict[str, float]:
 
 
 def fit_room_odds(settings: RoomOdds, say: Say) -> Fitted:
-    """Weights from all scans, and scores of those that were fitted without each fold of them."""
-    scans = room_scans(settings.data, settings, say)
-    origin = {"set": settings.data.name, "split": settings.data.split, "scans": len(scans)}
+    """Weights from all scans, and scores of those that were fitted without each fold of them.
+
+    Raises:
+        InputError: `fit` names no family, or no scan could be made.
+    """
+    if not settings.fit or set(settings.fit) - set(FAMILIES):
+        raise InputError(f"fit must be some of {', '.join(FAMILIES)}, not {settings.fit}")
+    weights: dict[str, Any] = {} if set(settings.fit) == set(FAMILIES) else room_weights()
+    scores: dict[str, float] = {}
+    origin: dict[str, Any] = {"split": recipes(settings, heldout=False)[settings.fit[0]][0].split}
+    for key in settings.fit:
+        family, sets = FAMILIES[key], recipes(settings, heldout=False)[key]
+        scans = [scan for recipe in sets for scan in room_scans(recipe, settings, say)]
+        origin[key] = {"sets": [recipe.name for recipe in sets], "scans": len(scans)}
+        scores |= _left_out_scores(family, scans, settings)
+        weights = with_weights(weights, family, fitted_weights(family, scans, settings.pull))
+    return Fitted(weights, scores, origin)
+
+
+def recipes(settings: RoomOdds, heldout: bool) -> dict[str, list[PlanRecipe]]:
+    """The sets of scans of each of `FAMILIES`, to fit to or to judge on. What lies outside is told in ordinary scans, too."""
+    if heldout:
+        return {
+            "scans": [settings.heldout],
+            "open": [settings.heldout_open, settings.heldout],
+            "grids": [settings.heldout_grids],
+        }
+    return {"scans": [settings.data], "open": [settings.open, settings.closed], "grids": [settings.grids]}
+
+
+def with_weights(weights: dict[str, Any], family: Family, fitted: dict[str, Any]) -> dict[str, Any]:
+    """The weights with those of a family in place of its earlier ones."""
+    return {**weights, family.key: fitted} if family.key else {**weights, **fitted}
+
+
+def _left_out_scores(family: Family, scans: Sequence[Rows], settings: RoomOdds) -> dict[str, float]:
+    """Scores of a family's models on scans that were left out of the fit, a fold at a time."""
     fold = np.arange(len(scans)) % settings.folds
-    guesses: dict[str, list[Array]] = {name: [] for name in MODEL_LENGTHS}
+    guesses: dict[str, list[Array]] = {name: [] for name in family.lengths}
     for k in range(settings.folds):
         rest = [scan for scan, at in zip(scans, fold, strict=True) if at != k]
         if len(rest) < len(scans):
-            weights = fitted_weights(rest, settings.pull)
-            _guess(weights, [scan for scan, at in zip(scans, fold, strict=True) if at == k], guesses)
-    return Fitted(fitted_weights(scans, settings.pull), _scores(guesses), origin)
+            weights = fitted_weights(family, rest, settings.pull)
+            _guess(weights, family, [scan for scan, at in zip(scans, fold, strict=True) if at == k], guesses)
+    return _scores(family, guesses)
 
 
 def room_scans(recipe: PlanRecipe, settings: RoomOdds, say: Say) -> list[Rows]:
@@ -63,30 +103,30 @@ def room_scans(recipe: PlanRecipe, settings: RoomOdds, say: Say) -> list[Rows]:
     return scans
 
 
-def fitted_weights(scans: Sequence[Rows], pull: float) -> dict[str, Any]:
-    """What `room_odds.json` holds."""
+def fitted_weights(family: Family, scans: Sequence[Rows], pull: float) -> dict[str, Any]:
+    """What `room_odds.json` holds of a family."""
     x = np.concatenate([scan["x"] for scan in scans])
     low, high = np.quantile(x, CLIPPED, axis=0)
     clipped = np.clip(x, low, high)
     standard = {"low": low, "high": high, "mean": clipped.mean(axis=0), "scale": clipped.std(axis=0) + 1e-3}
-    weights: dict[str, Any] = {"features": [*ROOM_FEATURES, *POSE_FEATURES]}
+    weights: dict[str, Any] = {"features": list(family.features)}
     weights |= {name: np.round(values, 4).tolist() for name, values in standard.items()}
-    for name in MODEL_LENGTHS:
-        tables = [table for scan in scans if len(table := _table(weights, scan, name)[0])]
-        answers = [answer for scan in scans if len(answer := _table(weights, scan, name)[1])]
+    for name in family.lengths:
+        tables = [table for scan in scans if len(table := _table(weights, family, scan, name)[0])]
+        answers = [answer for scan in scans if len(answer := _table(weights, family, scan, name)[1])]
         if not tables:
             raise InputError("data.scans: too few scans: none has poses")
         weights[name] = np.round(_logistic(tables, answers, pull), 4).tolist()
     return weights
 
 
-def _table(weights: dict[str, Any], scan: Rows, name: str) -> tuple[Array, Array]:
+def _table(weights: dict[str, Any], family: Family, scan: Rows, name: str) -> tuple[Array, Array]:
     """Inputs of a model and answers, of the rooms of a scan; none where the model needs poses and the scan has none."""
     if name != ENTERED_BY_POSES:
-        return model_inputs(weights, scan["x"]), scan[ANSWER_OF[name]]
+        return model_inputs(weights, family, scan["x"]), scan[ANSWER_OF[name]]
     if "posed.x" not in scan or not np.isfinite(scan["posed.p"]).all():
-        return np.zeros((0, MODEL_LENGTHS[name])), np.zeros(0, bool)
-    return model_inputs(weights, scan["posed.x"], scan["posed.p"]), scan[ANSWER_OF[name]]
+        return np.zeros((0, family.lengths[name])), np.zeros(0, bool)
+    return model_inputs(weights, family, scan["posed.x"], scan["posed.p"]), scan[ANSWER_OF[name]]
 
 
 def _logistic(tables: Sequence[Array], answers: Sequence[Array], pull: float) -> Array:
@@ -106,21 +146,22 @@ def _logistic(tables: Sequence[Array], answers: Sequence[Array], pull: float) ->
     return weights
 
 
-def _guess(weights: dict[str, Any], scans: Sequence[Rows], guesses: dict[str, list[Array]]) -> None:
+def _guess(weights: dict[str, Any], family: Family, scans: Sequence[Rows], guesses: dict[str, list[Array]]) -> None:
     """Add to each model's guesses (n, 2): probability and whether it is so."""
-    for name in MODEL_LENGTHS:
+    for name in family.lengths:
         for scan in scans:
-            table, answer = _table(weights, scan, name)
+            table, answer = _table(weights, family, scan, name)
             p = sigmoid(np.clip(table @ np.array(weights[name]), -30, 30))
             guesses[name].append(np.column_stack([p, answer]))
 
 
-def _scores(guesses: Mapping[str, Sequence[Array]]) -> dict[str, float]:
+def _scores(family: Family, guesses: Mapping[str, Sequence[Array]]) -> dict[str, float]:
     scores: dict[str, float] = {}
     for name, parts in guesses.items():
         rows = np.concatenate([np.zeros((0, 2)), *parts])
         if len(rows):
-            scores |= {f"{name}_{score}": value for score, value in guess_scores(rows[:, 0], rows[:, 1] > 0).items()}
+            title = f"{family.key}_{name}" if family.key else name
+            scores |= {f"{title}_{score}": value for score, value in guess_scores(rows[:, 0], rows[:, 1] > 0).items()}
     return scores
 
 
@@ -137,6 +178,11 @@ def guess_scores(p: Array, y: Array) -> dict[str, float]:
 def judge(settings: RoomOdds, file: Path, say: Say) -> dict[str, Any]:
     """Scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
-    guesses: dict[str, list[Array]] = {name: [] for name in MODEL_LENGTHS}
-    _guess(weights, room_scans(settings.heldout, settings, say), guesses)
-    return _scores(guesses)
+    scores: dict[str, Any] = {}
+    for key, sets in recipes(settings, heldout=True).items():
+        family = FAMILIES[key]
+        scans = [scan for recipe in sets for scan in room_scans(recipe, settings, say)]
+        guesses: dict[str, list[Array]] = {name: [] for name in family.lengths}
+        _guess(weights[family.key] if family.key else weights, family, scans, guesses)
+        scores |= _scores(family, guesses)
+    return scores

@@ -206,6 +206,9 @@ class DoorClassification(NetworkTask):
 @dataclass
 class RoomOdds(TaskSettings):
     """Args:
+    data: scans; open, closed: scans of buildings with their surroundings and ordinary ones, for what lies outside; grids: robots'
+        grids of buildings with their surroundings; heldout, heldout_open, heldout_grids: likewise, of other buildings.
+    fit: which of `scans`, `open` and `grids` to fit; the weights of the others stay those in use.
     pull: to 0, of all weights but the constant.
     folds: of scans, for the scores.
     """
@@ -213,7 +216,13 @@ class RoomOdds(TaskSettings):
     task: str = "room_odds"
     name: str = "room_odds"
     data: PlanRecipe = field(default_factory=PlanRecipe)
+    open: PlanRecipe = field(default_factory=PlanRecipe)
+    closed: PlanRecipe = field(default_factory=PlanRecipe)
+    grids: PlanRecipe = field(default_factory=PlanRecipe)
     heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout_open: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout_grids: PlanRecipe = field(default_factory=PlanRecipe)
+    fit: list[str] = field(default_factory=lambda: ["scans", "open", "grids"])
     pull: float = 1.0
     folds: int = 8
     watch: str = "entered_auc"
