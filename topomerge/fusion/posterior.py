@@ -17,7 +17,7 @@ from topomerge.types import Array
 WRONG = ("elsewhere", "storey", "half", "wing", "building", "outside")
 POSTERIOR = ("here", *WRONG)
 KINDS = ("elsewhere", "storey", "wing", "building", "outside")  # what the model of wrong poses tells apart
-SAME_PLAN = ("storey", "half")  # places whose walls agree by plan, told by furniture and by what differs sharply
+SAME_PLAN = ("storey", "half")  # places whose walls agree by plan, told by furniture
 # Of the pairs that somebody would try, how many are of each kind, and (elsewhere) how often maps that do share a place are laid
 # on another one: an assumption, not a measurement; the models are fitted to pairs weighed so.
 PRIORS = {"here": 0.5, "elsewhere": 0.1, "storey": 0.08, "half": 0.03, "wing": 0.08, "building": 0.15, "outside": 0.06}
@@ -50,7 +50,7 @@ def posterior(here: float, plan: float, kinds: Mapping[str, Any], x: Array, same
 
     Args:
         here: probability of this place where nothing is known, against all but another place of the same plan.
-        plan: log odds of this place against another one of the same plan (`SAME_PLAN`), priors included.
+        plan: odds of another place of the same plan (`SAME_PLAN`) against this one, beside those that `here` holds.
         kinds: model of what it is if it is not: ``mean``, ``scale`` (F,), ``weight`` (5, F), ``bias`` (5,), of `KINDS`.
         x: (F,) what that model sees.
         same: what the user knows the maps to be of, a key of `SAME`.
@@ -60,7 +60,7 @@ def posterior(here: float, plan: float, kinds: Mapping[str, Any], x: Array, same
     weight = dict(zip(KINDS, ((1 - here) * chances / chances.sum()).tolist(), strict=True))
     priors = sum(PRIORS[name] for name in SAME_PLAN)
     for name in SAME_PLAN:
-        weight[name] = weight.get(name, 0.0) + here * float(np.exp(-plan)) * PRIORS[name] / priors
+        weight[name] = weight.get(name, 0.0) + here * plan * PRIORS[name] / priors
     weight["here"] = here
     possible = {name: weight[name] if name in SAME[same] else 0.0 for name in POSTERIOR}
     total = sum(possible.values())

@@ -17,8 +17,6 @@ from topomerge.matching.refinement import storeys_at
 from topomerge.types import Array, Sim3
 
 WALL_RUN = 0.8  # m, length from which walls on free ground are no noise
-SPOT_AREA = 0.03  # m2 of wall in one piece on free floor of the other map, from which on it is no noise
-SPOT_FLOOR = 0.6  # share of the columns around such a piece that are free floor: nothing is near that drift could move
 SQUARE_SIDE = 3.0  # m, side of the squares in which walls are compared
 SQUARE_WALLS = 0.3  # m2 of walls in a square, below which it tells nothing
 AGREES, DISAGREES = 0.7, 0.4  # share of a square's walls that agree
@@ -34,13 +32,12 @@ HANGING_PIECE = 0.3  # m2 of a lamp or a piece of a beam
 def winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
     """Further features of a pose: m2, shares, and numbers of squares and of pieces of furniture."""
     walls = np.zeros((0, 6))
-    conflict, spots, back = np.zeros(2), 0.0, pose.inverse()
+    conflict, back = np.zeros(2), pose.inverse()
     main = np.radians(float(judge.a[0].profile.argmax()) / 2)
     moved = np.zeros(2)
     for v, w in storeys_at(judge.a, judge.b, pose.translation[2], pose.scale):
         for source, target, move, side in ((w, v, pose, 0), (v, w, back, 1)):
-            rows, stuck, places = _walls(source, target, move)
-            spots += places
+            rows, stuck = _walls(source, target, move)
             moved += _moved(rows, target, main if side == 0 else main - pose.yaw)
             rows[:, 5] *= (pose.scale if side == 0 else 1.0) ** 2
             if side == 1:  # all in the frame of a
@@ -51,14 +48,12 @@ def winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
             conflict[side] += stuck * (pose.scale if side == 0 else 1.0) ** 2
     shares = _shares(walls, float(conflict.sum()), main)
     shares["moved_walls"] = float(moved[0] / max(moved[1], 1e-6))
-    shares["spots"] = spots
     return {**shares, **_furniture(judge, pose), **_overhead(judge, pose)}
 
 
-def _walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, float, int]:
-    """(n, 6) of each wall column: place in the other map, is it on known ground, does it agree, direction, m2; the m2 of high
-    walls in runs that stand on free ground; and how many pieces of any length stand in
-    the midst of free floor (ends of walls, columns, niches: another storey of one plan has them elsewhere)."""
+def _walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, float]:
+    """(n, 6) of each wall column: place in the other map, is it on known ground, does it agree, direction, m2; and the m2 of high
+    walls in runs that stand on free ground."""
     points = source.walls
     at = move.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
     cells = np.floor((at - target.plan.origin) / target.plan.edge).astype(np.int64)
@@ -71,16 +66,12 @@ def _walls(source: PlanFields, target: PlanFields, move: Sim3) -> tuple[Array, f
     rows = np.column_stack([at, seen, near, source.directions, np.full(len(at), area)])
     mask = np.zeros(source.plan.wall.shape, bool)
     mask[source.plan.wall] = clash & source.tall
-    label, count = ndimage.label(mask, np.ones((3, 3), int))
+    label, _ = ndimage.label(mask, np.ones((3, 3), int))
     long = 0.0
     for number, box in enumerate(ndimage.find_objects(label), 1):
         if max(s.stop - s.start for s in box) * source.plan.edge >= WALL_RUN:
             long += float((label[box] == number).sum())
-    piece = label[source.plan.wall]
-    size = np.bincount(piece, minlength=count + 1)[1:]
-    around = np.bincount(piece, weights=target.open_floor[i, j], minlength=count + 1)[1:] / np.maximum(size, 1)
-    spots = int(((size * area * move.scale**2 >= SPOT_AREA) & (around >= SPOT_FLOOR)).sum())
-    return rows, long * area, spots
+    return rows, long * area
 
 
 def _moved(rows: Array, target: PlanFields, main: float) -> Array:

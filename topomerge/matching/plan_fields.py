@@ -16,7 +16,6 @@ FREE_MARGIN = 0.25  # m that free ground keeps from anything standing
 DISTANCE_CAP = 1.0  # m, of the distance fields
 HEAD_HEIGHT = 2.0  # m above the floor
 CEILING_SLACK = 0.15  # m below a ceiling that still are it
-AROUND = 0.4  # m, half of the side of the square that is around a column
 LINTEL_REACH = 0.5  # m from walls: nearer, what is above a head is part of the wall
 TALL_HEIGHTS = (2.0, 2.5)  # m above the floor: little furniture is that high
 DIRECTION_STEP = 0.5  # degrees, of the direction profile
@@ -54,12 +53,6 @@ class PlanFields:
     def core(self) -> Array:
         """(nx, ny) bool: free ground `FREE_MARGIN` from anything that stands."""
         return self.plan.free & (self.to_any >= FREE_MARGIN)
-
-    @cached_property
-    def open_floor(self) -> Array:
-        """(nx, ny) float32 share of the columns around each that are free."""
-        width = 2 * round(AROUND / self.plan.edge) + 1
-        return ndimage.uniform_filter(self.plan.free.astype(np.float32), width, mode="constant")
 
     @cached_property
     def face(self) -> Array:

@@ -22,7 +22,7 @@ SIGN = {
     "level": -1, "ceilings": -1, "margin": 1, "ahead": 1, "tall": -1, "crossing": 1, "worst_ratio": 1, "squares": 1,
     "bad_squares": -1, "in_place": 1, "out_of_place": -1, "kept": 1, "moved_walls": -1, "hanging": 1, "fallen": -1, "held": 1,
     "alone": 1, "strain": -1, "doubted": -1, "place_mean": 1, "place_total": 1, "place_worst": 1,
-    "furniture": 1, "furniture_sliced": 1, "spots": -1, "spots_sliced": -1,
+    "furniture": 1, "furniture_sliced": 1,
 }  # fmt: skip
 
 

@@ -28,6 +28,7 @@ from topomerge.fusion.verify import (
     bent_pose_vector,
     lead,
     model,
+    plan_odds,
     plan_vector,
     vector,
 )
@@ -223,9 +224,9 @@ def collect_winners(t: Table, scores: Array, bent: dict[str, Any], settings: Mer
     is_first = np.arange(len(both)) < len(first)
     weight = np.where(is_first, 1.0, settings.missed) * [t.rows[i].get("weight", 1.0) for i, _ in both]
     trains = (y >= 0) & np.array([t.trains[i] for i, _ in both])
-    columns = [np.array([b[k] for _, b in both]) for k in (1, 3, 2)]
+    x, share, plan = (np.array([b[k] for _, b in both]) for k in (1, 2, 3))
     building = np.array([t.building[i] for i, _ in both])
-    return Winners([t.rows[i] for i, _ in both], is_first, y, *columns, building, weight, trains)
+    return Winners([t.rows[i] for i, _ in both], is_first, y, x, plan, share, building, weight, trains)
 
 
 def fit_verdict(w: Winners, flat: bool, ordinary: int, settings: MergeBelief) -> tuple[dict[str, Any], Array]:
@@ -238,7 +239,7 @@ def fit_verdict(w: Winners, flat: bool, ordinary: int, settings: MergeBelief) ->
     of_plan, other = w.trains & (alike | (w.y == 1)), w.trains & ~alike
     truth = np.array([what_it_is(row, int(label)) for row, label in zip(w.rows, w.y, strict=True)])
     weight = prior_weights(truth, w.weight * other) * np.where(flat & (w.y == 0), settings.strict, 1.0)
-    balance = plan_weights(alike, w.weight * of_plan)
+    balance = plan_weights(alike, w.weight * of_plan) * np.where(alike, settings.plan_strict, 1.0)
     shipped = model()["flat" if flat else "solid"] if settings.refit == "plan" else {}
 
     def fit_place(rows: Array) -> dict[str, Any]:
@@ -252,7 +253,7 @@ def fit_verdict(w: Winners, flat: bool, ordinary: int, settings: MergeBelief) ->
 
     believed = np.zeros(len(w.y))
     for train, test in folds(w.building, settings.folds, ordinary):
-        against = np.exp(-logits(fit_place(train), w.x[test])) + np.exp(-logits(fit_plan(train), w.plan[test]))
+        against = np.exp(-logits(fit_place(train), w.x[test])) + plan_odds(fit_plan(train), w.plan[test])
         believed[test] = 1 / (1 + against)
     every, wrong = np.arange(len(w.y)), other & (w.y == 0)
     kinds = shipped.get("kinds") or fitted_kinds(w.x[wrong], truth[wrong], weight[wrong], settings.kinds_strength)
@@ -308,9 +309,9 @@ def judge(settings: MergeBelief, file: Path, say: Say) -> dict[str, Any]:
         for i, row in enumerate(of):
             if (first := best(t, scores, models["bent"], i)) is not None:
                 odds = float(logits(models["winner"], first[1][None])[0])
-                by_plan = float(logits(models["plan"], first[3][None])[0])
+                by_plan = float(plan_odds(models["plan"], first[3][None])[0])
                 scored_rows.append(row)
-                believed.append(min(1 / (1 + np.exp(-odds) + np.exp(-by_plan)), first[2]))
+                believed.append(min(1 / (1 + np.exp(-odds) + by_plan), first[2]))
                 true.append(t.y[first[0]])
     if not scored_rows:
         raise InputError(f"{settings.heldout.name}: no pair has a hypothesis that can be judged")

@@ -61,6 +61,7 @@ class MergeBelief(TaskSettings):
     hypotheses: of a pair; inspected: how many of them are looked at more closely.
     pose_strength, winner_strength, kinds_strength, plan_strength: of the models; the smaller, the simpler.
     missed: weight of a pair whose right hypothesis is taken away.
+    plan_strict: weight of a place of the same plan, beside its prior: rather refused than wrong.
     strict: weight of a wrong hypothesis where a slice or a drawing hides what tells storeys apart: rather refused than wrong.
     folds: of buildings, for the scores.
     floor: weight of a pair of the development floor; 0: it is not fitted to.
@@ -83,11 +84,12 @@ class MergeBelief(TaskSettings):
     winner_strength: float = 0.3
     kinds_strength: float = 0.03
     plan_strength: float = 1.0
+    plan_strict: float = 2.0
     missed: float = 0.2
     strict: float = 1.25
     folds: int = 8
     floor: float = 0.5
-    risk: float = 30.0
+    risk: float = 25.0
     refit: str = "all"
     halves: list[str] = field(default_factory=list)
     lookalikes: str = "none"

@@ -64,7 +64,7 @@ def conflict_columns(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim
             walls = source.walls
             moved = move.apply(np.column_stack([walls, np.zeros(len(walls))]))[:, :2]
             cells = np.floor((moved - target.plan.origin) / target.plan.edge).astype(np.int64)
-            inside = ((cells >= 0) & (cells < target.plan.wall.shape)).all(axis=1)
+            inside = np.asarray(((cells >= 0) & (cells < target.plan.wall.shape)).all(axis=1))
             x, y = np.where(inside[:, None], cells, 0).T
             clash = inside & (target.kind[x, y] == align.FREE_STATE) & (target.to_any[x, y] >= FREE_MARGIN)
             at = (moved if n == 0 else walls)[clash]

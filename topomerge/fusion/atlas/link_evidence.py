@@ -192,7 +192,8 @@ class _Weighing:
     def link(self, least: float) -> Link:
         """The link with its log odds, or some below the least ones, and the pair that spoke most against it."""
         costs = self._contradictions(self.move)
-        against = min(((-cost, pair) for pair, cost in costs[1].items()), default=(0.0, None), key=lambda entry: entry[0])
+        costly: list[tuple[float, tuple[int, int] | None]] = [(-cost, pair) for pair, cost in costs[1].items()]
+        against = min(costly, default=(0.0, None), key=lambda entry: entry[0])
         log_odds = [self._odds_of_any() - costs[0]]
         for rival in self._rivals() if log_odds[0] >= least else ():
             if log_odds[-1] < least:
