@@ -25,7 +25,12 @@ FEATURES = {
 def registration(probability: float, **features: float) -> Registration:
     best, other = PoseHypothesis(Sim3(), 2.0, features=FEATURES), PoseHypothesis(Sim3(), 1.0, features=FEATURES)
     rest = (1 - probability) / 10
-    each = {"here": probability, "elsewhere": 6 * rest, **dict.fromkeys(("storey", "wing", "building", "outside"), rest)}
+    each = {
+        "here": probability,
+        "elsewhere": 6 * rest,
+        **dict.fromkeys(("storey", "wing", "building", "outside"), rest),
+        "half": 0.0,
+    }
     return Registration(Sim3(), probability, False, {**FEATURES, **features}, (best, other), posterior=each)
 
 

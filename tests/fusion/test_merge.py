@@ -186,7 +186,17 @@ def test_cells_of_maps_that_were_joined_before_are_theirs(merged, halves):
 def test_json_has_the_schema(merged, refused):
     listing = merge_to_json(merged)
     assert list(listing)[:5] == ["format", "status", "probability", "reason", "descriptor"]
-    assert list(listing)[5:] == ["maps", "transforms", "bend", "matches", "seconds", "points", "alternatives", "places"]
+    assert list(listing)[5:] == [
+        "maps",
+        "transforms",
+        "bend",
+        "matches",
+        "seconds",
+        "points",
+        "alternatives",
+        "places",
+        "contradictions",
+    ]
     assert listing["descriptor"] == "learned"
     assert listing["format"] == 1 and listing["status"] == "merged" and 0 <= listing["probability"] <= 1
     assert listing["maps"][0] == {"source": "a.ply", "rooms": len(merged.maps[0].rooms), "storeys": 1}

@@ -8,6 +8,7 @@ import pytest
 from topomerge.errors import InputError
 from topomerge.fusion.posterior import (
     FEW,
+    KINDS,
     POSTERIOR,
     PRIORS,
     SAME,
@@ -21,33 +22,43 @@ from topomerge.fusion.posterior import (
     threshold_of,
 )
 
-KINDS = {"mean": [0.0, 1.0], "scale": [1.0, 2.0], "weight": [[1, 0], [0, 1], [0, 0], [-1, 0], [0, -1]], "bias": [0, 0.5, 0, 1, 0]}
+MODEL = {"mean": [0.0, 1.0], "scale": [1.0, 2.0], "weight": [[1, 0], [0, 1], [0, 0], [-1, 0], [0, -1]], "bias": [0, 0.5, 0, 1, 0]}
 X = np.array([0.3, -1.0])
 
 
 def test_the_alternatives_sum_to_one_and_follow_their_model():
-    each = posterior(0.6, KINDS, X)
+    each = posterior(0.6, 0.0, MODEL, X)
     assert tuple(each) == POSTERIOR and sum(each.values()) == pytest.approx(1.0) and each["here"] == pytest.approx(0.6)
     scores = np.array([0.3, -0.5, 0.0, 0.7, 1.0])
-    assert [each[n] for n in WRONG] == pytest.approx((0.4 * np.exp(scores) / np.exp(scores).sum()).tolist())
+    assert each["half"] == 0 and [each[n] for n in KINDS] == pytest.approx((0.4 * np.exp(scores) / np.exp(scores).sum()).tolist())
     assert sum(PRIORS.values()) == pytest.approx(1.0) and set(PRIORS) == set(POSTERIOR) == set(WORDS)
 
 
 @pytest.mark.parametrize("here", [0.0, 0.01, 0.5, 0.999, 1.0])
 def test_knowing_more_never_lowers_a_place(here):
-    nothing, building, storey = (posterior(here, KINDS, X, same) for same in ("nothing", "building", "storey"))
+    nothing, building, storey = (posterior(here, 0.4, MODEL, X, same) for same in ("nothing", "building", "storey"))
     assert nothing["here"] <= building["here"] <= storey["here"]
-    assert building["building"] == storey["building"] == storey["storey"] == 0 < building["storey"] + (here == 1)
+    assert building["building"] == storey["building"] == storey["storey"] == 0 < building["storey"]
     for each in (nothing, building, storey):
         assert sum(each.values()) == pytest.approx(1.0)
+    assert (here == 0) == (storey["half"] == 0)  # another half is possible on one storey, too
     odds = nothing["wing"] * building["outside"], nothing["outside"] * building["wing"]
     assert odds[0] == pytest.approx(odds[1])  # what is left keeps its odds
+
+
+@pytest.mark.parametrize("plan", [0.0, 0.5, 3.0])
+def test_another_place_of_the_plan_takes_its_odds_from_this_one_alone(plan):
+    usual, each = posterior(0.8, 0.0, MODEL, X), posterior(0.8, plan, MODEL, X)
+    assert sum(each.values()) == pytest.approx(1.0) and each["here"] == pytest.approx(1 / (1 / 0.8 + plan))
+    added = {name: each[name] / each["here"] - usual[name] / usual["here"] for name in WRONG}
+    assert sum(added.values()) == pytest.approx(plan) and added["half"] == pytest.approx(plan * 0.03 / 0.11)
+    assert added["storey"] == pytest.approx(plan * 0.08 / 0.11) and added["wing"] == pytest.approx(0.0)
 
 
 def test_what_little_evidence_can_carry():
     assert evidence_limit({"walls": 0.9, "free": 50.0}) == evidence_limit({"walls": 9.0, "free": 5.9}) == FEW
     assert evidence_limit({"walls": 3.0, "free": 30.0}) == 1.0
-    each = posterior(0.95, KINDS, X)
+    each = posterior(0.95, 0.0, MODEL, X)
     less = limited(each, FEW)
     assert less["here"] == FEW and sum(less.values()) == pytest.approx(1.0) and less["wing"] == pytest.approx(10 * each["wing"])
     assert limited(each, 1.0) == each
@@ -66,7 +77,7 @@ def test_the_threshold_follows_from_the_risk():
 
 
 def test_a_sure_place_on_an_unsure_storey_is_told_so():
-    each = {"here": 0.55, "elsewhere": 0.01, "storey": 0.41, "wing": 0.01, "building": 0.01, "outside": 0.01}
+    each = {"here": 0.55, "elsewhere": 0.01, "storey": 0.41, "half": 0.0, "wing": 0.01, "building": 0.01, "outside": 0.01}
     assert in_words(each, 0.8) == "the position is certain (0.96), the storey is not (0.55 for this one)"
     twin = {**each, "storey": 0.01, "wing": 0.41}
     assert in_words(twin, 0.8).startswith("it could also be a wing") and "0.41" in in_words(twin, 0.8)

@@ -7,18 +7,23 @@ import pytest
 
 from tests.fusion.plans_of import MOVE, grid_of, off, office, part
 from tests.scenes import Scene
-from topomerge.fusion.posterior import FEW, POSTERIOR, WRONG
+from topomerge.fusion.posterior import FEW, KINDS, POSTERIOR
 from topomerge.fusion.registration import register
 from topomerge.fusion.verify import (
+    AMOUNT_COUNTS,
     BELIEF_VECTOR,
     BENT_POSE_VECTOR,
     MARGIN_CAP,
+    PLAN_VECTOR,
     POSE_VECTOR,
     WINNER_VECTOR,
     bent_pose_vector,
     bent_score,
+    furniture_log_odds,
     lead,
     model,
+    plan_odds,
+    plan_vector,
     plausibility,
     quality_lag,
     vector,
@@ -40,7 +45,8 @@ def test_the_calibration_fits_its_features():
     for kind in ("solid", "flat"):
         sizes = {"pose": len(POSE_VECTOR), "bent": len(BENT_POSE_VECTOR), "winner": len(BELIEF_VECTOR)}
         assert all(len(found[kind][which]["weight"]) == size for which, size in sizes.items())
-        assert np.shape(found[kind]["kinds"]["weight"]) == (len(WRONG), len(BELIEF_VECTOR))
+        assert np.shape(found[kind]["kinds"]["weight"]) == (len(KINDS), len(BELIEF_VECTOR))
+        assert len(found[kind]["plan"]["weight"]) == len(PLAN_VECTOR) and min(found[kind]["plan"]["weight"]) > 0
     assert 0.5 <= found["threshold"] < 1
     thresholds, false = np.array(found["risk"]).T
     assert (np.diff(thresholds) > 0).all() and (np.diff(false) <= 0).all()
@@ -135,11 +141,14 @@ def test_the_lead_over_rivals_by_hand():
     features = [{**FEATURES, **PLACES, **more} for more in ({}, {"walls": 7.0}, {"walls": 5.0, "ratio": 0.9})]
     vectors = np.array([bent_pose_vector(f) for f in features])
     margin, ahead, alone, share = lead(scores, vectors, one, 2 * one)
-    assert margin == 1.0 and share == pytest.approx(1 / (1 + np.exp(-1) + np.exp(-4)))
-    assert alone == pytest.approx(np.log(share / (1 - share + 1e-3)))
+    of_odds = 1 / (1 + np.exp(-1) + np.exp(-4))
+    assert margin == 1.0 and alone == pytest.approx(np.log(of_odds / (1 - of_odds + 1e-3)))
     names = ("ratio", "conflict", "worst", "opposed", "lift", "sliced_conflict", "level", "ceilings", "place_mean", "place_worst")
     quality = [sum(v[BENT_POSE_VECTOR.index(n)] / 2 for n in names) for v in vectors]
     assert ahead == pytest.approx(quality[0] - quality[1])  # the third explains too little to be a rival
+    # The amounts of the second count in part. The third explains too little, and counts as it scores.
+    near = AMOUNT_COUNTS * -1.0 + (1 - AMOUNT_COUNTS) * min(quality[1] - quality[0], 0.0)
+    assert share == pytest.approx(1 / (1 + np.exp(max(near, -1.0)) + np.exp(-4))) and share < of_odds
     assert lead(scores[:1], vectors[:1], one, one)[:3] == (MARGIN_CAP, MARGIN_CAP, pytest.approx(MARGIN_CAP))
 
 
@@ -193,3 +202,34 @@ def test_one_square_metre_abstains():
 def test_what_speaks_against_a_pose_makes_it_less_plausible(change):
     assert plausibility({**FEATURES, **change}) < plausibility(FEATURES)
     assert plausibility({**FEATURES, "sliced": 1.0}) != plausibility(FEATURES)  # slices are judged by models of their own
+
+
+def test_furniture_tells_places_of_one_plan_and_nothing_does_where_none_is_seen():
+    def odds(pieces: float, in_place: float, by_chance: float) -> float:
+        return furniture_log_odds({"pieces": pieces, "in_place": in_place, "by_chance": by_chance})
+
+    assert odds(0.0, 0.0, 0.0) == pytest.approx(0.0)
+    assert odds(10.0, 1.0, 1.0) < -1 < 1 < odds(10.0, 8.0, 1.0)
+    assert odds(20.0, 2.0, 2.0) < odds(10.0, 1.0, 1.0) < odds(2.0, 0.2, 0.2) < 0  # more pieces say more
+    assert abs(odds(10.0, 8.0, 7.0)) < 0.5 < odds(10.0, 8.0, 1.0)  # in a crowded room much meets by chance
+    rising = [odds(10.0, k, 1.0) for k in range(11)]
+    assert (np.diff(rising) > 0).all()
+
+
+def test_a_place_of_the_same_plan_gains_by_what_speaks_for_it_alone():
+    fitted = {"mean": [0.0, 0.0], "scale": [1.0, 1.0], "weight": [2.0, 1.0], "bias": 1.0}
+    nothing, against, in_favour = plan_odds(fitted, np.array([[0.0, 0.0], [-1.0, 0.0], [1.5, 0.0]]))
+    assert nothing == in_favour == 0 and against == pytest.approx(np.exp(1.0) - np.exp(-1.0))
+    solid = {"pieces": 10.0, "in_place": 1.0, "by_chance": 1.0, "sliced": 0.0}
+    told, sliced = plan_vector(solid), plan_vector({**solid, "sliced": 1.0})
+    assert told[1] == sliced[0] == 0 and told[0] == sliced[1] < -1
+
+
+def test_furniture_that_stands_elsewhere_on_both_sides_is_refused_however_much_walls_agree():
+    same = {**GOOD, **QUIET, "pieces": 12.0, "in_place": 9.0, "by_chance": 1.0}
+    other = {**same, "in_place": 1.2}
+    believed, refused = (verdict([f], f) for f in (same, other))
+    assert believed.posterior["here"] > 0.9 and refused.posterior["here"] < 0.4
+    assert refused.posterior["storey"] + refused.posterior["half"] > 0.5
+    known = verdict([other], other, "storey")
+    assert known.posterior["storey"] == 0 and known.posterior["here"] > refused.posterior["here"]

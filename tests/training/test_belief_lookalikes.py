@@ -103,5 +103,5 @@ def test_the_models_of_rigid_poses_may_stay_as_they_are(words: list[str]) -> Non
 
 
 def test_another_word_for_what_is_refitted_is_refused(words: list[str]) -> None:
-    with pytest.raises(InputError, match="refit must be all or closely"):
+    with pytest.raises(InputError, match="refit must be all, closely or plan"):
         train(settings_of([*words, "refit=some"]), quiet)

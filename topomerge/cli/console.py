@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 NEAR_LIMIT = 0.8  # of the memory that a process may take
+LEAST_MEMORY = 550_000_000  # bytes of address space that the libraries alone take, with a small map
 PAGE_SUFFIXES = (".html", ".htm")
 Report = Callable[[float, str], None]  # fraction done in 0..1, what is being done
 
@@ -146,6 +147,23 @@ def _memory_limit() -> str:
         return ""
     most, _ = resource.getrlimit(resource.RLIMIT_AS)
     return "" if most == resource.RLIM_INFINITY else f" (ulimit -v allows {most / 2**30:.2g} GB)"
+
+
+def check_memory_limit() -> None:
+    """Refuse to start where the process may take less memory than its libraries do: OpenBLAS then ends it with words of its own.
+
+    Raises:
+        InputError: the address space is limited to less than `LEAST_MEMORY`.
+    """
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if most != resource.RLIM_INFINITY and most < LEAST_MEMORY:
+        raise InputError(
+            f"not enough memory{_memory_limit()}: at least {LEAST_MEMORY / 2**30:.2g} GB are needed; raise the limit"
+        )
 
 
 def failure_line(error: BaseException, paths: Sequence[str], outputs: Sequence[str] = ()) -> str:

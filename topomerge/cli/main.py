@@ -19,7 +19,7 @@ from topomerge import __version__
 from topomerge.cli.atlas import ATLAS
 from topomerge.cli.command import Command
 from topomerge.cli.completion import COMPLETION
-from topomerge.cli.console import PrintError, failure_line, printing, signal_behind
+from topomerge.cli.console import PrintError, check_memory_limit, failure_line, printing, signal_behind
 from topomerge.cli.embed import EMBED
 from topomerge.cli.export import EXPORT
 from topomerge.cli.export_embedder import EXPORT_EMBEDDER
@@ -144,6 +144,7 @@ def _run(args: argparse.Namespace) -> int:
     debug = args.verbose > 1 or os.environ.get("TOPOMERGE_DEBUG", "") not in ("", "0")
     _show_log(args.verbose, debug)
     try:
+        check_memory_limit()
         status = int(args.run(args))
         with printing():
             sys.stdout.flush()

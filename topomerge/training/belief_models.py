@@ -103,13 +103,15 @@ def risk_curve(believed: Array, true: Array, truth: Array, weight: Array) -> lis
         truth: (n,) what it is, of `POSTERIOR`.
         weight: (n,) of each pair among those of its kind.
     """
+    kinds = {kind: (truth == kind) & (true == 0) for kind in WRONG}
+    least = min((1000 * PRIORS[kind] / int(mine.sum()) for kind, mine in kinds.items() if mine.any()), default=0.0)
     curve: list[list[float]] = []
     for threshold in THRESHOLDS:
         false = 0.0
-        for kind in WRONG:
-            mine = (truth == kind) & (true == 0)
+        for kind, mine in kinds.items():
             if mine.any():
                 false += 1000 * PRIORS[kind] * float(np.average(believed[mine] >= threshold, weights=weight[mine]))
+        false = max(false, least)  # less than one pair of a kind was not measured
         curve.append([threshold, min(false, curve[-1][1]) if curve else false])
     return curve
 
