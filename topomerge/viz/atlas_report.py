@@ -184,11 +184,11 @@ def _links(result: AtlasResult, within: Sequence[int] | None = None) -> Markup:
     if differing:
         words = "Walls of one map stand on free floor of the other. Both versions are kept, with their source."
         rooms = [tuple(", ".join(map(str, of)) or "none" for of in c.rooms) for c in differing]
-        rows: list[tuple[str, ...]] = [
+        told: list[tuple[str, ...]] = [
             (*_pair(result, c.maps), *of, f"{c.area:.1f} m²") for c, of in zip(differing, rooms, strict=True)
         ]
         heads = ("map", "map", "rooms of the first", "rooms of the second", "walls")
-        parts += [element("h3", "Contradictions"), element("p", words, class_="note"), _texts(heads, rows)]
+        parts += [element("h3", "Contradictions"), element("p", words, class_="note"), _texts(heads, told)]
     tried = f"{result.registered[0]} of {result.registered[1]} pairs were registered, in {result.seconds:.1f} s."
     if within is None:
         parts.append(element("p", tried, class_="note"))
