@@ -155,7 +155,7 @@ BELIEF_OPTIONS = (
         "--threshold",
         type=share,
         metavar="P",
-        help="merge from this probability on (default 0.65; in an atlas 0.8, or 0.9 above eleven maps)",
+        help="merge from this probability on (default 0.61; in an atlas 0.8, or 0.9 above eleven maps)",
     ),
 )
 ATLAS_OPTIONS = (
