@@ -233,3 +233,11 @@ def test_furniture_that_stands_elsewhere_on_both_sides_is_refused_however_much_w
     assert refused.posterior["storey"] + refused.posterior["half"] > 0.5
     known = verdict([other], other, "storey")
     assert known.posterior["storey"] == 0 and known.posterior["here"] > refused.posterior["here"]
+
+
+@pytest.mark.parametrize(
+    ("pieces", "in_place", "by_chance"), [(10.0, 10.0, 10.0), (0.3, 0.4, 0.9), (50.0, 0.0, 50.0), (1e-9, 0.0, 0.0)]
+)
+def test_odds_of_furniture_are_numbers_however_crowded_a_room_is(pieces, in_place, by_chance):
+    odds = furniture_log_odds({"pieces": pieces, "in_place": in_place, "by_chance": by_chance})
+    assert np.isfinite(odds) and abs(odds) < 30

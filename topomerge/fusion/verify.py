@@ -25,6 +25,7 @@ AMOUNT_COUNTS = 0.5  # of the log odds of rivals that amounts of evidence make: 
 FURNITURE_STAYS = 0.44  # of the furniture that meets nothing by chance stands at a later visit where it stood
 OTHER_FURNITURE = (1.2, 0.04)  # share that another room's furniture meets: so many times that of shifted furniture, and so much
 # more, as furniture follows walls
+MOST_BY_CHANCE = 0.7  # share of the furniture that meets something wherever it is shifted: more tells nothing
 CERTAINTY = 20.0  # of both shares: sum of the parameters of their beta distributions
 INDEPENDENT_PIECES = 0.5  # of the pieces of 0.4 m2: a bed is several
 Features = Mapping[str, float]
@@ -203,7 +204,7 @@ def furniture_log_odds(f: Features) -> float:
     """
     n = INDEPENDENT_PIECES * f["pieces"]
     met = min(INDEPENDENT_PIECES * f["in_place"], n)
-    chance = float(np.clip(f["by_chance"] / max(f["pieces"], 1e-6), 0.0, 0.8))
+    chance = float(np.clip(f["by_chance"] / max(f["pieces"], 1e-6), 0.0, MOST_BY_CHANCE))
     factor, more = OTHER_FURNITURE
     a, c = CERTAINTY * (chance + (1 - chance) * FURNITURE_STAYS), CERTAINTY * (factor * chance + more)
     b, d = CERTAINTY - a, CERTAINTY - c

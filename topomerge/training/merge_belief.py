@@ -249,6 +249,8 @@ def fit_verdict(w: Winners, flat: bool, ordinary: int, settings: MergeBelief) ->
 
     def fit_plan(rows: Array) -> dict[str, Any]:
         rows = rows[of_plan[rows]]
+        if not alike[rows].any() or alike[rows].all():  # nothing to learn it from
+            return dict(model()["flat" if flat else "solid"]["plan"])
         return fitted(w.plan[rows], w.y[rows] > 0, PLAN_VECTOR, settings.plan_strength, balance[rows])
 
     believed = np.zeros(len(w.y))
