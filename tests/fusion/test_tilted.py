@@ -31,12 +31,21 @@ def tilt(degrees: float, about: float) -> np.ndarray:
 
 
 TILTS = tilt(6.0, 25.0), tilt(9.0, 140.0)
+MORE = ((6.5, 4.6), (12, 1), (10, 10.5), (6.4, 8.6), (14.3, 3), (12.8, 12.5), (7.5, 0.4), (11, 9), (9.8, 5))  # m, in the middle
+
+
+def furnished() -> np.ndarray:
+    """Points of an office with furniture enough in what both halves show: fewer pieces may stand so on another storey, too."""
+    scene = office()
+    for x, y in MORE:
+        scene.box(x, y, 0, x + 0.7, y + 0.9, 0.9)
+    return scene.points()
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The west and the east of an office, each tilted in its own way."""
-    folder, points = tmp_path_factory.mktemp("tilted"), office().points()
+    folder, points = tmp_path_factory.mktemp("tilted"), furnished()
     halves = part(points, high=(16, 99)), MOVE.apply(part(points, low=(5, -99)))
     paths = [folder / "west.npy", folder / "east.npy"]
     for path, half, turn in zip(paths, halves, TILTS, strict=True):

@@ -8,7 +8,8 @@ none:
 - Of sources that name both placements, or were never registered, the strongest one counts. A look-alike is one to all maps that
   see it, so that the others repeat what it says.
 - Sources that see the rival placement and do not name it add up: there would be something to name.
-- Sources that do not see it, and all that only say that the maps share a place at all, add `CLOSING_GAIN` at most.
+- Sources that do not see it, that name the link with less than they leave to none, and all that only say that the maps share a
+  place at all, add `CLOSING_GAIN` at most. A source that names the link and not the rival never counts against the link.
 - Walls on free floor count against the placement under which they stand there, each place once.
 """
 
@@ -293,6 +294,10 @@ class _Weighing:
             seen = [not source.direct or self._check(source.pair, move).overlap for move in (self.move, rival)]
             if source.named:
                 odds = float(np.log((shares[0] or source.none) / (shares[1] or source.none)))
+                if shares[0] is not None and shares[1] is None:
+                    least = min(support_of(float(np.log(shares[0] / max(1 - shares[0], LEAST_SHARE)))), CLOSING_GAIN)
+                    if odds < least:  # what is left to none is spread over all that is not named, and is not this rival's
+                        odds, seen = least, [False, False]
             else:
                 said = [np.clip(self._check(source.pair, move).log_odds, 0.0, CLOSING_GAIN) for move in (self.move, rival)]
                 odds = float(said[0] - said[1])
