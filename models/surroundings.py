@@ -15,6 +15,7 @@ from topomerge.embedding.network import CROP_CHANNELS
 from topomerge.embedding.surroundings import CROP_PLANES, CROP_SHAPES, DOOR_PART
 
 FULL_VALUE = 255.0  # of a pixel
+CROPS_A_PLAN = 512  # convolutions on CUDA see multiples of so many crops while training
 
 
 class BatchNorm(nn.Module):
@@ -51,8 +52,13 @@ class SurroundingsEncoder(nn.Module):
 
     def forward(self, crops: Tensor) -> Tensor:
         x = crops.permute(0, 3, 1, 2).float() / FULL_VALUE
+        count = len(x)
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
-            x = norm(convolution(x)).relu()
+            if self.training and x.is_cuda:  # cuDNN looks for a plan, 3 ms, for each number of crops that it has not seen
+                x = convolution(nn.functional.pad(x, (0, 0, 0, 0, 0, 0, 0, -count % CROPS_A_PLAN)))[:count]
+            else:
+                x = convolution(x)
+            x = norm(x).relu()
         out: Tensor = self.out(self.drop(x.flatten(1)))
         return out
 

@@ -22,6 +22,7 @@ from topomerge.models.embedder import Embedder
 from topomerge.models.losses import Objective
 from topomerge.models.weights import read_embedder, save_embedder
 from topomerge.training.batches import ChangedPairs, MapPair
+from topomerge.training.device_batches import DevicePairs, supports_device_batches
 from topomerge.training.embedding_pictures import show_embedder
 from topomerge.training.log import Log
 from topomerge.training.loop import Loop, Schedule, State, made_by_threads, mixed, pace
@@ -46,13 +47,14 @@ def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr,
     if settings.overfit:
         settings = replace(settings, watch="f1", patience=0)
     check(settings)
-    fabric = _fabric(settings)
+    fabric = start_fabric(settings)
     chief = fabric.is_global_zero
     say = say if chief else lambda text: None
     train, watched = _data(settings, say, fabric)
     network = _network(settings, train)
     trained = [p for p in network.parameters() if p.requires_grad]
-    optimizer = torch.optim.AdamW(trained, settings.rate, weight_decay=settings.decay)
+    fused = fabric.device.type == "cuda"  # one launch for all weights
+    optimizer = torch.optim.AdamW(trained, settings.rate, weight_decay=settings.decay, fused=fused)
     state = State()
     if settings.resume:
         state = State(**load_state(settings.folder / "last", network, optimizer))
@@ -84,6 +86,21 @@ class EmbeddingJob:
         self.train, self.watched = pairs
         self.steps = max(len(self.train) // (settings.batch * fabric.world_size), 1)
         self.augment: Augment | None = None if settings.overfit else settings.augment
+        self.pairs = self._load_pairs()
+
+    def _load_pairs(self) -> ChangedPairs | DevicePairs:
+        """Return the pairs that batches are made of, on the device or on the host, as `batches` says.
+
+        Raises:
+            InputError: batches cannot be made on the device.
+        """
+        wanted, names = self.settings.batches, self.network.tensors
+        if wanted == "device" or (wanted == "auto" and self.fabric.device.type != "cpu"):
+            if supports_device_batches(self.settings.network, names, self.augment):
+                return DevicePairs(self.train, names, self.augment, self.fabric.device)
+            if wanted == "device":
+                raise InputError("batches=device: this network or augmentation needs batches=host")
+        return ChangedPairs(self.train, names, self.augment, lambda pair: pair)
 
     def batches(self, state: State) -> Generator[MapPair, None, None]:
         """Those of the state's epoch from its step on, made by threads while the ones before are worked on."""
@@ -95,11 +112,19 @@ class EmbeddingJob:
             order = list(range(len(self.train)))
         rank, world, size = self.fabric.global_rank, self.fabric.world_size, settings.batch
         steps = [order[k * size * world :][: size * world][rank::world] for k in range(state.step, self.steps)]
-        pairs = ChangedPairs(self.train, self.network.tensors, self.augment, lambda pair: mixed(settings.seed, state.epoch, pair))
+
+        def seed_of(pair: int) -> int:
+            return mixed(settings.seed, state.epoch, pair)
+
+        if isinstance(self.pairs, DevicePairs):
+            for numbers in steps:
+                yield self.pairs.make_batch(numbers, seed_of)
+            return
+        pairs = ChangedPairs(self.train, self.network.tensors, self.augment, seed_of)
         yield from made_by_threads(pairs.batch, steps, settings.threads)
 
-    def step(self, batch: MapPair, state: State) -> dict[str, float]:
-        """One step of the optimizer; the losses."""
+    def step(self, batch: MapPair, state: State) -> dict[str, torch.Tensor]:
+        """Take one step of the optimizer; return the losses, which may still be under way on the device."""
         settings, done = self.settings, state.epoch * self.steps + state.step
         for group in self.optimizer.param_groups:
             group["lr"] = settings.rate * pace(done / (settings.epochs * self.steps), settings.warmup)
@@ -110,7 +135,7 @@ class EmbeddingJob:
         self.fabric.backward(losses["loss"])
         self.fabric.clip_gradients(self.objective, self.optimizer, max_norm=settings.clip)
         self.optimizer.step()
-        return {name: float(value.detach()) for name, value in losses.items()}
+        return {name: value.detach() for name, value in losses.items()}
 
     def size(self, batch: MapPair) -> int:
         """Rooms."""
@@ -150,13 +175,18 @@ def about(settings: Training, row: Mapping[str, Any]) -> dict[str, Any]:
     return {"run": settings.name, **origin, **{k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}}
 
 
-def _fabric(settings: Training) -> Any:
+def start_fabric(settings: Training) -> Any:
+    """Return the Fabric of a training: its device, its precision and its processes."""
     from lightning_fabric import Fabric
 
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     devices = int(os.environ.get("LOCAL_WORLD_SIZE", settings.devices))
+    precision = settings.precision
+    if precision == "auto":
+        on_cuda = settings.accelerator in ("cuda", "gpu", "auto") and torch.cuda.is_available()
+        precision = "bf16-mixed" if on_cuda else "32-true"
     fabric = Fabric(
-        accelerator=settings.accelerator, devices=devices, precision=settings.precision,  # type: ignore[arg-type]
+        accelerator=settings.accelerator, devices=devices, precision=precision,  # type: ignore[arg-type]
         strategy="ddp" if devices > 1 else "auto",
     )  # fmt: skip
     fabric.launch()

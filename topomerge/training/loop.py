@@ -26,6 +26,7 @@ from topomerge.checkpoint import save_state
 from topomerge.errors import InputError
 from topomerge.training.log import Clock, Log
 
+STEPS_BETWEEN_CHECKS = 20  # of whether the losses are finite: each waits for the device
 Say = Callable[[str], None]
 T = TypeVar("T")
 K = TypeVar("K")
@@ -71,8 +72,8 @@ class Job(Protocol):
     def batches(self, state: State) -> Generator[Any, None, None]:
         """Those of the state's epoch, from its step on."""
 
-    def step(self, batch: Any, state: State) -> dict[str, float]:
-        """One step of the optimizer; the losses, `loss` among them."""
+    def step(self, batch: Any, state: State) -> Mapping[str, Any]:
+        """One step of the optimizer; the losses, `loss` among them: numbers, or tensors of one that may be on a device."""
 
     def size(self, batch: Any) -> int:
         """How many rooms, columns or examples a batch has."""
@@ -156,20 +157,31 @@ class Loop:
             waited += time.perf_counter() - before
             if batch is None:
                 break
-            losses = self.job.step(batch, state)
-            if not math.isfinite(losses["loss"]):
-                raise InputError(f"training diverged in epoch {state.epoch + 1}: lower rate")
-            for name, value in losses.items():
+            for name, value in self.job.step(batch, state).items():
                 state.sums[name] = state.sums.get(name, 0.0) + value
             sizes += self.job.size(batch)
             state.step += 1
+            if state.step % STEPS_BETWEEN_CHECKS == 0 or self.stop:
+                self._read_losses()
             if self.stop:
                 batches.close()
                 self._save()
                 raise KeyboardInterrupt
+        self._read_losses()
         took = max(time.perf_counter() - began, 1e-9)
         row = {"epoch": state.epoch, "seconds": took, "rooms_per_second": self.job.total(sizes) / took, "waiting": waited / took}
         return row | {f"train/{name}": value / self.schedule.steps for name, value in state.sums.items()}
+
+    def _read_losses(self) -> None:
+        """Turn sums of losses that are on a device into numbers.
+
+        Raises:
+            InputError: the training diverged.
+        """
+        state = self.state
+        state.sums = {name: float(value) for name, value in state.sums.items()}
+        if not math.isfinite(state.sums.get("loss", 0.0)):
+            raise InputError(f"training diverged in epoch {state.epoch + 1}: lower rate")
 
     def _keep(self, row: dict[str, Any], better: bool) -> None:
         """Write metrics, the best network and the state after an epoch."""

@@ -15,6 +15,7 @@ from topomerge.models.losses import LossSettings
 from topomerge.models.losses import check as check_loss
 
 FREEZE = ("", "geometry")
+BATCHES = ("auto", "host", "device")
 
 
 @dataclass
@@ -66,6 +67,8 @@ class Training:
     resume: go on where the run of this name stopped.
     threads: that make batches, of each process; beside an accelerator as many as there are cores.
     watch: what is best: a score of validation.
+    precision: of Fabric, such as `32-true` or `bf16-mixed`; `auto`: bf16 on CUDA, 32 bits elsewhere.
+    batches: made on the `device` (`device_batches`), or by threads of the `host`; `auto`: on the device beside an accelerator.
     export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
     """
 
@@ -88,7 +91,8 @@ class Training:
     accelerator: str = "cpu"
     devices: int = 1
     threads: int = 1
-    precision: str = "32-true"
+    precision: str = "auto"
+    batches: str = "auto"
     geometry_from: str = ""
     freeze: str = ""
     overfit: bool = False
@@ -126,6 +130,8 @@ def check(settings: Training) -> None:
     for key, value in shares.items():
         if not 0 <= value < 1:
             raise InputError(f"{key} must be 0 or more and below 1, not {value}")
+    if settings.batches not in BATCHES:
+        raise InputError(f"batches: unknown {settings.batches!r}; {', '.join(BATCHES)} are possible")
     if settings.freeze not in FREEZE:
         raise InputError(f"freeze: unknown {settings.freeze!r}; geometry or nothing are possible")
     if settings.freeze and not settings.geometry_from:

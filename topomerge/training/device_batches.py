@@ -1,0 +1,489 @@
+"""Batches of pairs of maps that are made where the network is: storeys stay on the device, crops are sampled there.
+
+The host decides what is in a batch (rooms and doors that are lost, turns). The device draws its values for all maps at once:
+sizes, ways and crops. A crop is sampled straight from the storey through the turn, the zoom and the drift of its map, so that no
+storey is warped. Random numbers are hashes of a pair's seed: they depend neither on the batch nor on the device.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from topomerge.embedding.network import Network
+from topomerge.embedding.schema import column, columns_of_power
+from topomerge.embedding.surroundings import (
+    CROP_PART,
+    CROP_SHAPES,
+    DOOR_CROP,
+    DOOR_CROPS,
+    DOOR_PART,
+    SHEET_PLANES,
+    TIE,
+    WIDE_PART,
+    WIDE_STEP,
+)
+from topomerge.training.batches import ALIKE_AREAS, MapPair
+from topomerge.training.other_sensors import BEND_STEP, PATCH, PATCHES, SEEN_AS
+from topomerge.training.packed import GraphPair
+from topomerge.training.settings import Augment
+from topomerge.training.turned_views import DOOR_SHIFT, MIRRORED_COLUMNS, WILD, WILD_SHARE, quarters_between, ways_of
+from topomerge.types import Array
+
+SUPPORTED = {"x", "edge_index", "edge_attr", "edge_way", *CROP_SHAPES}  # tensors that are made on the device
+PIXELS_AT_ONCE = 1 << 26  # of crops: bounds the memory of coordinates
+EVEN_BYTES = 0x00FF00FF00FF00FF
+ROOM_BYTE = -(1 << 56)  # 255 in the highest of eight bytes
+# Streams of random numbers of a map: one of each kind of change.
+ROOM_LOSS, EDGE_LOSS, RATES, SIZES, LENGTHS, MIDDLES, DOORS, KNOTS, SHAPE, TURNS, GAPS = range(1, 12)
+
+
+def supports_device_batches(network: Network, names: Sequence[str], augment: Augment | None) -> bool:
+    """Tell whether batches of these tensors, changed in this way, can be made on a device."""
+    changes = () if augment is None else (augment.walks, augment.slices, augment.rough)
+    return network.turns > 1 and set(names) <= SUPPORTED and not any(changes)
+
+
+def hash_numbers(seed: Array, stream: int, index: Array) -> Array:
+    """Return (n,) uint64, well mixed numbers of seeds (n,), a stream and indices (n,) (the finaliser of SplitMix64)."""
+    with np.errstate(over="ignore"):
+        x = seed.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + index.astype(np.uint64) * np.uint64(0xD1B54A32D192ED03)
+        x += np.uint64(stream) * np.uint64(0x8CB92BA72F3D8DD7)
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return x ^ (x >> np.uint64(31))
+
+
+def draw_uniform(seed: Array, stream: int, index: Array) -> Array:
+    """Return (n,) float64 uniform numbers between 0 and 1."""
+    return (hash_numbers(seed, stream, index) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+def hash_tensors(seed: Tensor, stream: int, index: Tensor) -> Tensor:
+    """Return int64 tensors with the bits of `hash_numbers`, of int64 seeds and indices that broadcast."""
+
+    def shifted(x: Tensor, bits: int) -> Tensor:
+        return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+    x = seed * _signed(0x9E3779B97F4A7C15) + index * _signed(0xD1B54A32D192ED03) + _signed(stream * 0x8CB92BA72F3D8DD7)
+    x = (x ^ shifted(x, 30)) * _signed(0xBF58476D1CE4E5B9)
+    x = (x ^ shifted(x, 27)) * _signed(0x94D049BB133111EB)
+    return x ^ shifted(x, 31)
+
+
+def draw_uniforms(seed: Tensor, stream: int, index: Tensor) -> Tensor:
+    """Return float32 uniform numbers between 0 and 1 of int64 seeds and indices that broadcast."""
+    return ((hash_tensors(seed, stream, index) >> 11) & ((1 << 53) - 1)).double().mul(2.0**-53).float()
+
+
+def draw_normal(seed: Tensor, stream: int, index: Tensor) -> Tensor:
+    """Return float32 normal numbers (Box and Muller) of int64 seeds and indices that broadcast."""
+    first, second = (hash_tensors(seed, stream, 2 * index + k) for k in (0, 1))
+    u, v = (((x >> 11) & ((1 << 53) - 1)).double() * 2.0**-53 for x in (first, second))
+    return ((-2 * (1 - u).log()).sqrt() * (2 * math.pi * v).cos()).float()
+
+
+def _signed(number: int) -> int:
+    number &= (1 << 64) - 1
+    return number - (1 << 64) if number >> 63 else number
+
+
+def concatenate_ranges(first: Array, count: Array) -> Array:
+    """Return the numbers first[0], first[0] + 1, ... (count[0] of them), then those of the next, int64."""
+    ends = np.cumsum(count)
+    total = int(ends[-1]) if len(ends) else 0
+    return np.arange(total) + np.repeat(first - (ends - count), count)
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What a batch is made of: its parts are a, b, and b once more where it is turned wrongly, of each pair.
+
+    Args:
+        room, edge: (R,), (E,) rows of the tables.
+        room_part, edge_part: (R,), (E,) part of the batch that each is of.
+        part_map: (P,) map of each part; side: (P,); pair: (P,) of the batch.
+        rotation: (P, 2, 2) which place of a map lies where, of each part: quarter turns and mirrors.
+        seed: (P,) of the map's changes.
+        edge_index: (2, E); match_index: (2, M) rooms of the batch.
+        true: (R,); clear: (R,) bool; counts: (pairs, 2) rooms of a and b.
+    """
+
+    room: Array
+    edge: Array
+    room_part: Array
+    edge_part: Array
+    part_map: Array
+    side: Array
+    pair: Array
+    rotation: Array
+    seed: Array
+    edge_index: Array
+    match_index: Array
+    true: Array
+    clear: Array
+    counts: Array
+
+
+class DevicePairs:
+    """Pairs of maps on a device, and batches of them.
+
+    Args:
+        pairs: with their sheets (`load_pairs(extras=["sheet"])`).
+        names: tensors that the network reads, of `SUPPORTED`.
+        augment: how maps are changed; None: not at all.
+        device: that the network is on.
+    """
+
+    def __init__(self, pairs: Sequence[GraphPair], names: Sequence[str], augment: Augment | None, device: torch.device) -> None:
+        self.names, self.augment, self.device = tuple(names), augment, device
+        graphs = [graph for pair in pairs for graph in (pair.a, pair.b)]
+        self.rooms = np.array([len(graph["x"]) for graph in graphs])
+        self.edges = np.array([graph["edge_index"].shape[1] for graph in graphs])
+        self.first_room = np.concatenate([[0], np.cumsum(self.rooms)])
+        self.first_edge = np.concatenate([[0], np.cumsum(self.edges)])
+        self.edge_index = torch.cat([graph["edge_index"] for graph in graphs], dim=1).numpy()
+        self.true = np.concatenate([rooms.numpy() for pair in pairs for rooms in pair.true])
+        self.matches = np.concatenate([pair.matches.numpy().reshape(-1, 2) for pair in pairs])
+        self.first_match = np.concatenate([[0], np.cumsum([len(pair.matches) for pair in pairs])])
+        self.quarters = np.array([-1 if (k := quarters_between(pair)) is None else k for pair in pairs])
+        x = torch.cat([graph["x"] for graph in graphs])
+        self.glimpsed = x[:, column("x", "glimpsed")].numpy() != 0
+        self.log_area = np.log(np.maximum(x[:, column("x", "area")].numpy(), 0.1))
+        self.tables = {"x": x, "edge_attr": torch.cat([graph["edge_attr"] for graph in graphs])}
+        if "edge_way" in names:
+            self.tables["edge_way"] = torch.cat([ways_of(graph, names)["edge_way"] for graph in graphs])
+        self.tables["anchor"] = torch.cat([graph["anchor"] for graph in graphs])
+        self.tables["doors"] = torch.cat([_pad_doors(graph["door_anchor"]) for graph in graphs])
+        self.tables = {name: table.to(device) for name, table in self.tables.items()}
+        self.has_door = np.isfinite(self.tables["doors"][..., 0].cpu().numpy())
+        self.powers = _mark_columns(x.shape[1], {power: columns_of_power("x", power) for power in (1, 2, 3)}).to(device)
+        edge_columns = self.tables["edge_attr"].shape[1]
+        self.lengths = _mark_columns(edge_columns, {1: columns_of_power("edge_attr", 1)}).to(device)
+        mirrored = [column("edge_attr", MIRRORED_COLUMNS["edge_attr"])]
+        self.sign = (1 - _mark_columns(edge_columns, {2: mirrored})).to(device)
+        self._load_sheets([(graph["sheet"], graph["sheet_room"]) for graph in graphs])
+
+    def _load_sheets(self, sheets: Sequence[tuple[Tensor, Tensor]]) -> None:
+        """Put each storey on the device once: eight bytes a pixel, its planes, and its room."""
+        number: dict[tuple[int, int], int] = {}
+        once = []
+        keys = [(planes.data_ptr(), room.data_ptr()) for planes, room in sheets]  # pairs share the storeys of their maps
+        for key, sheet in zip(keys, sheets, strict=True):
+            if key not in number:
+                number[key] = len(once)
+                once.append(sheet)
+        sizes = np.array([room.shape for _, room in once]).reshape(-1, 2)
+        first = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
+        pixels = torch.zeros((int(first[-1]), 8), dtype=torch.uint8)
+        rooms = torch.empty(int(first[-1]), dtype=torch.int16)
+        for (planes, room), start in zip(once, first[:-1].tolist(), strict=True):
+            pixels[start : start + room.numel(), : len(SHEET_PLANES)] = planes.reshape(-1, len(SHEET_PLANES))
+            rooms[start : start + room.numel()] = room.reshape(-1)
+        self.pixels, self.pixel_rooms = pixels.view(torch.int64)[:, 0].to(self.device), rooms.to(self.device)
+        of_map = np.array([number[key] for key in keys], np.int64)
+        self.sheet_size, self.sheet_first = sizes[of_map], first[:-1][of_map]
+
+    def make_batch(self, numbers: Sequence[int], seed_of: Callable[[int], int]) -> MapPair:
+        """Return pairs of these numbers as a batch on the device, changed by the seeds of their numbers."""
+        structure = self.decide(np.asarray(numbers, np.int64), np.array([seed_of(number) for number in numbers], np.uint64))
+        return self.fill(structure)
+
+    def decide(self, numbers: Array, seeds: Array) -> Structure:
+        """Return what a batch holds: the rooms and edges that are left, and how each part is turned."""
+        maps = (2 * numbers[:, None] + [0, 1]).ravel()
+        map_seed = hash_numbers(np.repeat(seeds, 2), RATES, np.tile([0, 1], len(numbers))) >> np.uint64(1)
+        keep, edge_keep, rows, edge_rows = self._lose(maps, map_seed)
+        of_map = np.repeat(np.arange(len(maps)), self.rooms[maps])
+        kept = np.bincount(of_map[keep], minlength=len(maps))
+        edge_of_map = np.repeat(np.arange(len(maps)), self.edges[maps])
+        edges_kept = np.bincount(edge_of_map[edge_keep], minlength=len(maps))
+        number = np.cumsum(keep) - 1  # among all that are kept
+        start, edge_start = np.cumsum(kept) - kept, np.cumsum(edges_kept) - edges_kept
+
+        copies = 2 if self.augment is None else 3
+        part = (2 * np.arange(len(numbers))[:, None] + [0, 1, 1][:copies]).ravel()
+        side, pair = np.tile([0, 1, 1][:copies], len(numbers)), np.repeat(np.arange(len(numbers)), copies)
+        wrong = np.tile([False, False, True][:copies], len(numbers))
+        part_start = np.cumsum(kept[part]) - kept[part]
+        pick = concatenate_ranges(start[part], kept[part])
+        edge_pick = concatenate_ranges(edge_start[part], edges_kept[part])
+        room, edge = rows[keep][pick], edge_rows[edge_keep][edge_pick]
+        room_part, edge_part = np.repeat(np.arange(len(part)), kept[part]), np.repeat(np.arange(len(part)), edges_kept[part])
+
+        first = (np.cumsum(self.rooms[maps]) - self.rooms[maps])[part]  # of each part's map among all of the batch
+        ends = self.edge_index[:, edge] + first[edge_part]
+        edge_index = number[ends] - start[part][edge_part] + part_start[edge_part]
+
+        match_rows = concatenate_ranges(self.first_match[numbers], np.diff(self.first_match)[numbers])
+        match_pair = np.repeat(np.arange(len(numbers)), np.diff(self.first_match)[numbers])
+        map_first = np.cumsum(self.rooms[maps]) - self.rooms[maps]
+        ends = self.matches[match_rows].T + np.stack([map_first[2 * match_pair], map_first[2 * match_pair + 1]])
+        there = keep[ends].all(axis=0)
+        ends, match_pair = ends[:, there], match_pair[there]
+        parts = np.stack([copies * match_pair, copies * match_pair + 1])
+        match_index = number[ends] - start[np.stack([2 * match_pair, 2 * match_pair + 1])] + part_start[parts]
+
+        true = np.where(wrong[room_part], -1, self.true[room])
+        clear = self._see_well(room, match_index) & ~wrong[room_part]
+        rotation = self._turn(numbers, seeds, side, wrong)
+        return Structure(
+            room, edge, room_part, edge_part, maps[part], side, pair, rotation, map_seed[part], edge_index, match_index, true,
+            clear, kept.reshape(-1, 2),
+        )  # fmt: skip
+
+    def _lose(self, maps: Array, seed: Array) -> tuple[Array, Array, Array, Array]:
+        """Return which rooms and edges of maps are kept (bool), and their rows: at least two rooms of each, doors both ways."""
+        count, edges = self.rooms[maps], self.edges[maps]
+        rows, edge_rows = concatenate_ranges(self.first_room[maps], count), concatenate_ranges(self.first_edge[maps], edges)
+        if self.augment is None:
+            return np.ones(len(rows), bool), np.ones(len(edge_rows), bool), rows, edge_rows
+        of_map, edge_of_map = np.repeat(np.arange(len(maps)), count), np.repeat(np.arange(len(maps)), edges)
+        local, edge_local = rows - self.first_room[maps][of_map], edge_rows - self.first_edge[maps][edge_of_map]
+        rate = self.augment.rooms * draw_uniform(seed, RATES, np.zeros(len(maps)))
+        keep = draw_uniform(seed[of_map], ROOM_LOSS, local) >= rate[of_map]
+        keep |= (np.bincount(of_map[keep], minlength=len(maps)) < 2)[of_map]
+        rate = self.augment.edges * draw_uniform(seed, RATES, np.ones(len(maps)))
+        half = np.maximum(edges // 2, 1)[edge_of_map]
+        edge_keep = draw_uniform(seed[edge_of_map], EDGE_LOSS, edge_local % half) >= rate[edge_of_map]
+        first = (np.cumsum(count) - count)[edge_of_map]
+        return keep, edge_keep & keep[self.edge_index[:, edge_rows] + first].all(axis=0), rows, edge_rows
+
+    def _see_well(self, room: Array, match_index: Array) -> Array:
+        """Return (R,) bool as `batches.seen_well`: entered in both maps, areas alike, or entered and without a partner."""
+        a, b = room[match_index]
+        alike = np.abs(self.log_area[a] - self.log_area[b]) <= math.log(ALIKE_AREAS)
+        well, linked = np.zeros(len(room), bool), np.zeros(len(room), bool)
+        linked[match_index.ravel()] = True
+        good = alike & ~self.glimpsed[a] & ~self.glimpsed[b]
+        well[match_index[:, good].ravel()] = True
+        return well | (~linked & ~self.glimpsed[room])
+
+    def _turn(self, numbers: Array, seeds: Array, side: Array, wrong: Array) -> Array:
+        """Return (P, 2, 2) int64: a place of a part, seen from its middle -> that of its map."""
+        copies = len(side) // len(numbers)
+        draws = np.stack([draw_uniform(seeds, TURNS, np.full(len(seeds), k)) for k in range(4)])
+        more, free, false = (4 * draws[0]).astype(int), (4 * draws[1]).astype(int), 1 + (3 * draws[3]).astype(int)
+        mirror = draws[2] < 0.5
+        true = np.where(self.quarters[numbers] < 0, free, self.quarters[numbers])
+        if self.augment is None:
+            more, true, false, mirror = (np.zeros(len(numbers), int) for _ in range(4))
+        quarter = np.array([[0, 1], [-1, 0]])  # where a pixel of a crop that is turned once was before
+        powers = np.stack([np.linalg.matrix_power(quarter, k) for k in range(4)])
+        flips = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]]])
+        pair = np.repeat(np.arange(len(numbers)), copies)
+        turns = (more[pair] + np.where(side == 1, true[pair], 0)) % 4
+        last = np.where(wrong, false[pair], 0)
+        return np.asarray(powers[turns] @ flips[mirror[pair].astype(int)] @ powers[last], np.int64)
+
+    def fill(self, structure: Structure) -> MapPair:
+        """Return the batch of a structure, with values drawn on the device."""
+        s, device = structure, self.device
+        rows = [s.room, s.room_part, s.edge, s.edge_part, s.true, s.clear, s.pair[s.room_part], s.side[s.room_part]]
+        sent = torch.from_numpy(np.concatenate(rows).astype(np.int64)).to(device, non_blocking=True)
+        room, room_part, edge, edge_part, true, clear, pair, side = sent.split([len(row) for row in rows])
+        ends, match = (torch.from_numpy(index).to(device, non_blocking=True) for index in (s.edge_index, s.match_index))
+        seed = torch.from_numpy(s.seed.astype(np.int64)).to(device)
+        rotation = torch.from_numpy(s.rotation).to(device)
+        views = self._draw_views(s, seed, rotation)
+        local = room - torch.from_numpy(self.first_room[s.part_map]).to(device)[room_part]
+        tensors = self._draw_tables(room, room_part, local, edge, edge_part, seed, views)
+        door = torch.from_numpy(np.flatnonzero(self.has_door[s.room])).to(device, non_blocking=True)
+        tensors |= self._sample_crops(room, room_part, local, door, views)
+        batch = MapPair(
+            **{name: tensors[name] for name in self.names if name in tensors}, edge_index=ends, side=side, true=true,
+            clear=clear.bool(), match_index=match, room_counts=torch.from_numpy(s.counts.ravel()), num_nodes=len(s.room),
+        )  # fmt: skip
+        batch["batch"] = pair
+        return batch
+
+    def _draw_views(self, s: Structure, seed: Tensor, rotation: Tensor) -> _Views:
+        """Draw how the storey of each part is turned, stretched, bent, and what of it is missing."""
+        augment, device = self.augment, self.device
+        size, first = (torch.from_numpy(of[s.part_map]).to(device) for of in (self.sheet_size, self.sheet_first))
+        if augment is None:
+            shape = torch.tensor([[0.0, 1.0, 1.0]], device=device).expand(len(seed), 3)
+            return _Views(seed, size, first, rotation.float(), shape, None, None, None)
+        draws = draw_uniforms(seed[:, None], GAPS, torch.arange(3 + 4 * PATCHES, device=device))
+        normal = draw_normal(seed[:, None], SHAPE, torch.arange(3, device=device))
+        wild = torch.where(draws[:, 0] < WILD_SHARE, WILD, 1.0)
+        angle, zoom = wild * math.radians(augment.tilt) * normal[:, 0], (wild * augment.zoom * normal[:, 1]).exp()
+        shape = torch.stack([angle, zoom, (augment.scale * normal[:, 2]).exp()], dim=1)
+        rows, columns = ((self.sheet_size[s.part_map] // BEND_STEP).max(axis=0) + 2).tolist()
+        index = torch.arange(2 * rows * columns, device=device)
+        knots = augment.bend * draw_normal(seed[:, None], KNOTS, index).reshape(len(seed), rows, columns, 2)
+        return _Views(seed, size, first, rotation.float(), shape, knots, *self._draw_gaps(draws[:, 1:], size))
+
+    def _draw_gaps(self, draws: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw which planes a map lacks, as a mask of bytes, and patches that it did not see (P, 4, n): low and high x, y."""
+        edges = torch.tensor(np.cumsum([share for _, share in SEEN_AS])[:-1], device=self.device, dtype=torch.float32)
+        bytes_of = [~sum(255 << (8 * SHEET_PLANES.index(name)) for name in names) for names, _ in SEEN_AS]
+        mask = torch.tensor(bytes_of, device=self.device)[torch.bucketize(draws[:, 0].contiguous(), edges, right=True)]
+        count = (draws[:, 1] * (PATCHES + 1)).floor()
+        starts, sides = draws[:, 2:].reshape(len(draws), 2, 2, PATCHES).unbind(dim=1)
+        low = (starts * size[..., None]).floor()
+        some = torch.arange(PATCHES, device=self.device) < count[:, None]
+        high = low + (PATCH[0] + (sides * (PATCH[1] - PATCH[0])).floor()) * some[:, None]
+        return mask, torch.cat([low, high], dim=1)
+
+    def _draw_tables(
+        self, room: Tensor, part: Tensor, local: Tensor, edge: Tensor, edge_part: Tensor, seed: Tensor, views: _Views
+    ) -> dict[str, Tensor]:
+        """Return features of rooms and edges, of other sizes, turned as their part is."""
+        augment, out = self.augment, {"x": self.tables["x"][room], "edge_attr": self.tables["edge_attr"][edge]}
+        if "edge_way" in self.names:
+            out["edge_way"] = self.tables["edge_way"][edge]
+        if augment is None:
+            return out
+        scale, powers, lengths, sign = views.shape[:, 2], self.powers, self.lengths, self.sign
+        index = local[:, None] * len(powers) + torch.arange(len(powers), device=self.device)
+        jitter = (augment.jitter * draw_normal(seed[part][:, None], SIZES, index)).exp()
+        out["x"] = out["x"] * torch.where(powers > 0, scale[part][:, None] ** powers * jitter, 1.0)
+        index = edge[:, None] * len(lengths) + torch.arange(len(lengths), device=self.device)
+        jitter = (augment.jitter * draw_normal(seed[edge_part][:, None], LENGTHS, index)).exp()
+        out["edge_attr"] = out["edge_attr"] * torch.where(lengths > 0, scale[edge_part][:, None] * jitter, 1.0)
+        (a, b), (c, d) = views.rotation.permute(1, 2, 0)
+        flipped = a * d < b * c
+        out["edge_attr"] = torch.where(flipped[edge_part][:, None], out["edge_attr"] * sign, out["edge_attr"])
+        if "edge_way" in out:
+            turn = views.rotation.mT @ build_turns(
+                views.shape[:, 0], torch.ones_like(scale)
+            )  # the rotation leads back to the map
+            out["edge_way"] = (out["edge_way"].reshape(-1, 2, 2) @ turn.mT[edge_part]).flatten(1)
+        return out
+
+    def _sample_crops(self, room: Tensor, part: Tensor, local: Tensor, door: Tensor, views: _Views) -> dict[str, Tensor]:
+        """Return the crops that the network reads, about middles and doors (D,) that lie elsewhere."""
+        out = {}
+        anchor, doors, augment = self.tables["anchor"][room].double(), self.tables["doors"][room].double(), self.augment
+        axes = torch.arange(2, device=self.device)
+        anchor, doors = views.move(anchor, part), views.move(doors.flatten(0, 1), part.repeat_interleave(DOOR_CROPS))
+        if augment is not None:
+            seed = views.seed[part][:, None]
+            anchor = anchor + augment.shift * draw_normal(seed, MIDDLES, 2 * local[:, None] + axes)
+            index = 2 * DOOR_CROPS * local[:, None] + torch.arange(2 * DOOR_CROPS, device=self.device)
+            doors = doors + DOOR_SHIFT * draw_normal(seed, DOORS, index).reshape(-1, 2)
+        for name, step in ((CROP_PART, 1), (WIDE_PART, WIDE_STEP)):
+            if name in self.names:
+                out[name] = self._sample(anchor, part, local, CROP_SHAPES[name][0], step, views)
+        if DOOR_PART in self.names:
+            of = door // DOOR_CROPS
+            crops = torch.zeros((len(doors), *CROP_SHAPES[DOOR_PART][1:]), dtype=torch.uint8, device=self.device)
+            crops[door] = self._sample(doors[door], part[of], local[of], DOOR_CROP, 1, views)
+            out[DOOR_PART] = crops.unflatten(0, (len(room), DOOR_CROPS))
+        return out
+
+    def _sample(self, middle: Tensor, part: Tensor, number: Tensor, side: int, step: int, views: _Views) -> Tensor:
+        """Return (n, side, side, 8) uint8 crops about places (n, 2) of the changed storeys of parts (n,), showing rooms (n,)."""
+        at_once = max(PIXELS_AT_ONCE // (side * side * step * step), 1)
+        chunks = [
+            self._sample_pixels(middle[k : k + at_once], part[k : k + at_once], number[k : k + at_once], side, step, views)
+            for k in range(0, len(middle), at_once)
+        ]
+        pixels = torch.cat(chunks) if chunks else torch.zeros((0, side * side), dtype=torch.int64, device=self.device)
+        return pixels[..., None].view(torch.uint8).unflatten(1, (side, side))
+
+    def _sample_pixels(self, middle: Tensor, part: Tensor, number: Tensor, side: int, step: int, views: _Views) -> Tensor:
+        """Return (n, side * side) int64, eight bytes a pixel; the arguments as of `_sample`."""
+        middle = (middle + (0.5 + TIE)).floor()
+        back = views.build_back()[part]
+        offset = (torch.arange(side, device=self.device) + 0.5 - side / 2) * step  # of blocks
+        grid = torch.cartesian_prod(offset, offset)
+        turned = back @ views.rotation[part]  # of a place about the middle -> of the map
+        centre = (back.double() @ middle[..., None])[..., 0].float()[:, None] + grid @ turned.mT
+        place = centre - views.measure_drift(centre, part)
+        if step == 1:
+            return self._read_pixels(place, part, number, views)
+        fine = torch.arange(step, device=self.device) + 0.5 - step / 2
+        within = torch.cartesian_prod(fine, fine) @ turned.mT
+        every = self._read_pixels((place[:, :, None] + within[:, None]).flatten(1, 2), part, number, views)
+        every = every.unflatten(1, (side * side, step * step))
+        bits = (step * step).bit_length() - 1  # sums of eight bytes, in four wider ones each
+        low, high = (((every >> k) & EVEN_BYTES).sum(dim=2) >> bits & EVEN_BYTES for k in (0, 8))
+        return low | (high << 8)
+
+    def _read_pixels(self, place: Tensor, part: Tensor, number: Tensor, views: _Views) -> Tensor:
+        """Return (n, m) int64, eight bytes a pixel, at places (n, m, 2) of the storeys as they were."""
+        x, y = place.floor().unbind(dim=-1)
+        size = views.size[part].float()
+        there = (x >= 0) & (y >= 0) & (x < size[:, :1]) & (y < size[:, 1:])
+        if views.patches is not None:
+            low_x, low_y, high_x, high_y = views.patches[part][:, None].unbind(dim=2)
+            at_x, at_y = x[..., None], y[..., None]
+            there &= ~((at_x >= low_x) & (at_y >= low_y) & (at_x < high_x) & (at_y < high_y)).any(dim=-1)
+        at = torch.where(there, views.first[part][:, None] + x.long() * views.size[part][:, 1:] + y.long(), 0)
+        pixels = self.pixels[at] if views.mask is None else self.pixels[at] & views.mask[part][:, None]
+        pixels = pixels | torch.where(self.pixel_rooms[at] == number[:, None], ROOM_BYTE, 0)
+        return torch.where(there, pixels, 0)
+
+
+@dataclass(frozen=True)
+class _Views:
+    """How the storey of each part of a batch is seen.
+
+    Args:
+        seed: (P,); size: (P, 2) pixels; first: (P,) pixel of it on the device.
+        rotation: (P, 2, 2) a place of a crop about its middle -> that of the storey.
+        shape: (P, 3) angle in rad, zoom, and scale of lengths.
+        knots: (P, m, n, 2) pixels by which places `BEND_STEP` apart moved; None: not at all.
+        mask: (P,) int64 of the bytes that are seen; patches: (P, 4, n) that are not; None: all is.
+    """
+
+    seed: Tensor
+    size: Tensor
+    first: Tensor
+    rotation: Tensor
+    shape: Tensor
+    knots: Tensor | None
+    mask: Tensor | None
+    patches: Tensor | None
+
+    def build_back(self) -> Tensor:
+        """Return (P, 2, 2): what takes back the turn and the zoom of a storey."""
+        return build_turns(-self.shape[:, 0], 1 / self.shape[:, 1])
+
+    def measure_drift(self, place: Tensor, part: Tensor) -> Tensor:
+        """Return (n, m, 2) pixels by which places (n, m, 2) of storeys moved, between the four knots about each."""
+        if self.knots is None:
+            return torch.zeros_like(place)
+        last = (self.size[part] // BEND_STEP + 1)[:, None]
+        at = torch.minimum((place / BEND_STEP).clamp(min=0), (last - 1e-3).to(place.dtype))
+        low = at.floor()
+        (u, v), (i, j) = (at - low)[..., None].unbind(dim=-2), low.long().unbind(dim=-1)
+        _, rows, columns, _ = self.knots.shape
+        flat, start = self.knots.reshape(-1, 2), part[:, None] * (rows * columns) + i * columns + j
+        a, b, c, d = (flat[start + k] for k in (0, columns, 1, columns + 1))
+        return torch.lerp(torch.lerp(a, b, u), torch.lerp(c, d, u), v)
+
+    def move(self, place: Tensor, part: Tensor) -> Tensor:
+        """Return (n, 2) float64 where places of storeys lie after turn, zoom and drift."""
+        moved = place + self.measure_drift(place.nan_to_num().float()[:, None], part)[:, 0]
+        out: Tensor = (build_turns(self.shape[:, 0], self.shape[:, 1])[part].double() @ moved[..., None])[..., 0]
+        return out
+
+
+def build_turns(angle: Tensor, zoom: Tensor) -> Tensor:
+    """Return (P, 2, 2) float32 matrices that turn by angles (P,), rad, and stretch by factors (P,)."""
+    c, s = zoom * angle.cos(), zoom * angle.sin()
+    return torch.stack([c, -s, s, c], dim=1).reshape(-1, 2, 2)
+
+
+def _mark_columns(count: int, marks: dict[int, Sequence[int]]) -> Tensor:
+    """Return (count,) float32: the mark of each column, 0 of the others."""
+    out = torch.zeros(count)
+    for mark, columns in marks.items():
+        out[list(columns)] = mark
+    return out
+
+
+def _pad_doors(doors: Tensor) -> Tensor:
+    """Return (R, DOOR_CROPS, 2) places of doors, nan where a room has fewer."""
+    out = torch.full((len(doors), DOOR_CROPS, 2), float("nan"))
+    some = doors[:, :DOOR_CROPS]
+    out[:, : some.shape[1]] = some
+    return out
