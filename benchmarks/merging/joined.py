@@ -28,12 +28,12 @@ from benchmarks.merging.tables import RESULTS_CACHE, put, table
 from benchmarks.real_data import real_data
 from topomerge.errors import InputError
 from topomerge.evaluation.doubled_walls import doubled_walls
-from topomerge.fusion.bend.bend import bend
-from topomerge.fusion.bend.drift import sensor_drift
 from topomerge.fusion.fuse import fuse
-from topomerge.fusion.prepared import prepare
-from topomerge.fusion.registration import fine
 from topomerge.fusion.resampling import Laying
+from topomerge.registration.bend.bend import bend
+from topomerge.registration.bend.pieces import sensor_drift
+from topomerge.registration.pipeline import fine
+from topomerge.registration.prepared import prepare
 from topomerge.types import Sim3, TopometricMap
 
 Row = dict[str, Any]

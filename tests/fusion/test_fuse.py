@@ -15,7 +15,7 @@ from topomerge.errors import InputError
 from topomerge.extraction.cell_means import cell_middles
 from topomerge.fusion.fuse import _JoinedCells, fuse, rooms_in_common
 from topomerge.fusion.resampling import Laying, laid_means, resampled
-from topomerge.fusion.storey_levels import extruded
+from topomerge.registration.storeys import extruded
 from topomerge.types import Sim3, TopometricMap, VoxelGrid
 
 

@@ -10,8 +10,8 @@ import pytest
 import topomerge as tm
 from tests.scenes import Scene
 from topomerge.fusion.fuse import fuse
-from topomerge.fusion.joined_doors import laid_part, with_doors
 from topomerge.fusion.resampling import Laying
+from topomerge.fusion.transfer import laid_part, with_doors
 from topomerge.types import Sim3, TopometricMap
 
 MOVE = Sim3(0.6, (3.0, -2.0, 0.5))

@@ -57,7 +57,7 @@ def read_bag(path: Path) -> int:
 
 def read_map(path: Path) -> int:
     """Read a map, what `topomerge info` prints of it, and how the maps that it was joined of were bent."""
-    from topomerge.fusion.bend.placement import bends_of
+    from topomerge.fusion.result import bends_of
     from topomerge.io.listing import json_text, map_to_json, map_to_text
     from topomerge.io.maps import load_map
 
@@ -81,7 +81,7 @@ def read_plans(path: Path) -> int:
 
 def read_atlas(path: Path) -> int:
     """Read the listing of an atlas."""
-    from topomerge.fusion.atlas.stored import read_atlas
+    from topomerge.fusion.atlas.folder import read_atlas
 
     return len(read_atlas(path.parent).entries)
 
@@ -121,8 +121,8 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     """Name -> file, in a folder: those of `samples`, and pictures, a map and a folded scene."""
     from PIL import Image
 
-    from tests.fusion.bend.test_deformation import deformation
-    from topomerge.fusion.bend.placement import Placement, with_bends
+    from tests.types.test_deformation import deformation
+    from topomerge.fusion.result import Placement, with_bends
     from topomerge.io.maps import save_map
     from topomerge.types import Sim3
 

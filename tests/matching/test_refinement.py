@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tests.fusion.plans_of import MOVE, grid_of, off, office
-from topomerge.fusion.storey_plan import plans
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.refinement import refine, storeys_at
+from topomerge.registration.storeys import plans
 from topomerge.types import Sim3
 
 

@@ -24,17 +24,23 @@ from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
-from topomerge.fusion.bend.deformation import Deformation
-from topomerge.fusion.joined_doors import laid_floor, laid_part, with_doors
-from topomerge.fusion.joined_odds import with_part_odds
-from topomerge.fusion.joined_windows import laid_fixtures, laid_windows, with_joined_fixtures, with_joined_windows
-from topomerge.fusion.resampling import Laying, decoded, encoded, laid_means, resampled
-from topomerge.fusion.single_walls import copies
-from topomerge.fusion.storey_levels import extruded
+from topomerge.fusion.resampling import Laying, copies, decoded, encoded, laid_means, resampled
+from topomerge.fusion.transfer import (
+    laid_fixtures,
+    laid_floor,
+    laid_part,
+    laid_windows,
+    with_doors,
+    with_joined_fixtures,
+    with_joined_windows,
+    with_part_odds,
+)
 from topomerge.kernels.voxelise import OFFSET_STEPS
 from topomerge.matching.consistency import matches_under
 from topomerge.matching.room_plans import room_plans
+from topomerge.registration.storeys import extruded
 from topomerge.types import JOINED, LEVELLED, Array, Sim3, TopometricMap, VoxelGrid, is_level
+from topomerge.types.deformation import Deformation
 
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
 PROVENANCE_BITS = 32  # maps that one bit set tells apart

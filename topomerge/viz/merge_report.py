@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.fusion.bend.placement import placements
 from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row, posterior_rows
 from topomerge.fusion.fuse import room_of_rooms
-from topomerge.fusion.registration import Registration
-from topomerge.fusion.result import MergeResult, merge_to_json
+from topomerge.fusion.result import MergeResult, merge_to_json, placements
 from topomerge.io.atomic import replacing
 from topomerge.io.listing import json_text
 from topomerge.io.maps import save_map
 from topomerge.io.palette import room_colours
 from topomerge.io.rooms_ply import save_rooms_ply
+from topomerge.registration.pipeline import Registration
 from topomerge.types import Array, Sim3
 from topomerge.viz.atlas_report import atlas_html
 from topomerge.viz.bend_plan import bend_table

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topomerge.fusion.evidence.crops import PARTS
-from topomerge.fusion.evidence.places import MOST_ODDS, Places
-from topomerge.fusion.joined_doors import laid_floor
 from topomerge.fusion.resampling import Laying
+from topomerge.fusion.transfer import laid_floor
+from topomerge.registration.evidence.crops import PARTS
+from topomerge.registration.evidence.places import MOST_ODDS, Places
 from topomerge.types import Array, Sim3, TopometricMap
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.merge_plan import Drawn
