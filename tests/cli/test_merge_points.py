@@ -20,8 +20,7 @@ from topomerge.cli.main import main as cli
 from topomerge.cli.merge_points import point_files
 from topomerge.fusion.result import MergeResult
 from topomerge.io.maps import save_map
-from topomerge.types import Array, Sim3, TopometricMap
-from topomerge.types.deformation import Deformation
+from topomerge.types import Array, Deformation, Sim3, TopometricMap
 
 POSE = Sim3(0.4, (480_000.25, 5_400_000.5, 12.125))
 BENDS = {

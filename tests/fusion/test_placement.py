@@ -11,10 +11,9 @@ import pytest
 from tests.scenes_map import building
 from tests.types.test_deformation import deformation, points
 from topomerge.errors import InputError
-from topomerge.fusion.result import BEND_PARAMETER, MergeResult, Placement, bends_of, merge_to_json, room_moves
+from topomerge.fusion.result import BEND_PARAMETER, MergeResult, bends_of, merge_to_json, room_moves
 from topomerge.io.maps import load_map, save_map
-from topomerge.types import Sim3
-from topomerge.types.deformation import Deformation
+from topomerge.types import Deformation, Placement, Sim3
 from topomerge.viz.report import report_html
 
 POSE = Sim3(0.7, (480_000.0, 5_400_000.0, 12.0))  # into a national grid
@@ -30,21 +29,22 @@ def merged(bend: Deformation | None, pose: Sim3 = POSE) -> MergeResult:
 def test_a_map_that_was_bent_and_saved_is_read_again(tmp_path) -> None:
     result = merged(deformation(MOVES, storeys=2))
     save_map(result.map, tmp_path / "map.tmap")
-    (read,) = bends_of(load_map(tmp_path / "map.tmap"))
-    assert (read.map, read.source) == (1, "b.ply")
+    joined = load_map(tmp_path / "map.tmap")
+    ((number, read),) = bends_of(joined).items()
+    assert (number, joined.parameters[BEND_PARAMETER][0]["source"]) == (1, "b.ply")
     p = points(high=5.5)
-    there = result.placements[1].apply(p)
+    there = result.placements[1].transform_points(p)
     assert np.allclose(there, POSE.apply(result.bends[1].apply(p)))
-    assert np.abs(read.apply(p) - there).max() < 1e-6  # m, of coordinates of millions
-    assert np.abs(read.undo(there) - p).max() < 1e-6
+    assert np.abs(read.transform_points(p) - there).max() < 1e-6  # m, of coordinates of millions
+    assert np.abs(read.invert_points(there) - p).max() < 1e-6
 
 
 def test_rigid_maps_leave_no_trace() -> None:
     for bend in (None, deformation(np.zeros((0, 4)))):
         result = merged(bend)
-        assert BEND_PARAMETER not in result.map.parameters and bends_of(result.map) == ()
+        assert BEND_PARAMETER not in result.map.parameters and bends_of(result.map) == {}
         assert merge_to_json(result)["bend"] == {} and result.placements[1].bend is None
-    assert np.allclose(result.placements[1].apply(points()), POSE.apply(points()))
+    assert np.allclose(result.placements[1].transform_points(points()), POSE.apply(points()))
     assert set(result.placements) == {0, 1} and MergeResult("abstained", 0.1, "").placements == {}
 
 
@@ -115,5 +115,5 @@ def test_the_report_of_a_joined_map_does_not_list_all_pieces() -> None:
 
 
 def test_a_placement_without_bending_is_its_pose() -> None:
-    rigid = Placement(0, "", POSE)
-    assert np.allclose(rigid.undo(rigid.apply(points())), points(), atol=1e-6)
+    rigid = Placement(POSE)
+    assert np.allclose(rigid.invert_points(rigid.transform_points(points())), points(), atol=1e-6)

@@ -9,7 +9,7 @@ from tests.fusion.plans_of import MOVE, doubled, grid_of, off, office, part
 from tests.scenes import HEIGHT, Scene
 from topomerge.errors import InputError
 from topomerge.matching.poses import PoseHypothesis
-from topomerge.registration.pipeline import Resort, register
+from topomerge.registration.pipeline import FallbackProposals, register
 from topomerge.registration.posterior import FEW, WRONG
 from topomerge.types import Sim3, VoxelGrid
 
@@ -87,7 +87,7 @@ def test_poses_are_asked_for_only_where_those_of_walls_are_not_believed(halves, 
     def never():
         raise AssertionError("asked though walls are believed")
 
-    assert register(*halves, proposed=Resort(never, joined.probability)).transform == joined.transform
+    assert register(*halves, proposed=FallbackProposals(never, joined.probability)).transform == joined.transform
 
 
 def test_poses_of_rooms_decide_where_the_search_of_walls_fails(halves, joined, monkeypatch):
@@ -96,12 +96,12 @@ def test_poses_of_rooms_decide_where_the_search_of_walls_fails(halves, joined, m
     monkeypatch.setattr("topomerge.registration.pipeline.search", lambda *_: [astray])
     pose = joined.transform
     assert not register(*halves).accepted
-    late = register(*halves, proposed=Resort(lambda: [pose], 0.65))
+    late = register(*halves, proposed=FallbackProposals(lambda: [pose], 0.65))
     assert late.accepted and off(late.transform, pose, middle_in_b())[0] < 0.03
-    back = register(*reversed(halves), proposed=Resort(lambda: [pose.inverse()], 0.65))
+    back = register(*reversed(halves), proposed=FallbackProposals(lambda: [pose.inverse()], 0.65))
     assert back.accepted and off(back.transform.inverse(), pose, middle_in_b())[0] < 0.03
     assert len(late.alternatives) == 2 and late.alternatives[0].from_rooms and not late.alternatives[1].from_rooms
-    assert not register(*halves, proposed=Resort(list, 0.65)).accepted  # no matched rooms: as it was
+    assert not register(*halves, proposed=FallbackProposals(list, 0.65)).accepted  # no matched rooms: as it was
 
 
 @pytest.mark.longer

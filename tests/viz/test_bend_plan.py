@@ -91,7 +91,7 @@ def test_arrows_stand_on_their_storey_and_are_not_too_many() -> None:
 
 
 def test_the_table_names_the_largest(merged: MergeResult) -> None:
-    places = [Placement(0, "a.ply", Sim3()), Placement(1, "b.ply", Sim3(), merged.bends[1])]
+    places = [Placement(Sim3()), Placement(Sim3(), merged.bends[1])]
     words = re.sub("<[^>]*>", "|", bend_table(places, ("a", "b"), ("a", None)))
     shifts = PieceShifts.of(merged.bends[1])
     room = int(shifts.room[shifts.length.argmax()])

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from topomerge.embedding.embedders import DEFAULT, descriptor_name
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.turns import Rows
-from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.fusion.atlas.solve import AtlasSettings, RegistrationsByPair, solve
 from topomerge.fusion.explanation import why
 from topomerge.fusion.fuse import fuse, rooms_in_common
@@ -28,12 +28,11 @@ from topomerge.matching.match import match
 from topomerge.matching.odds import match_probability
 from topomerge.matching.result import Matching
 from topomerge.registration.bend.bend import NEITHER_BENDS
-from topomerge.registration.pipeline import Registration, Resort, register
+from topomerge.registration.pipeline import FallbackProposals, Registration, register
 from topomerge.registration.posterior import check_same
 from topomerge.registration.prepared import registration_order
 from topomerge.registration.surfaces import check_open3d, room_poses
-from topomerge.types import Sim3, TopometricMap
-from topomerge.types.deformation import Deformation
+from topomerge.types import Deformation, Sim3, TopometricMap
 
 
 @one_blas_thread
@@ -74,52 +73,49 @@ def merge(
     check_poses(poses, len(maps), scale)
     if poses == "surfaces":
         check_open3d()
-    read = [loaded(map) for map in maps]
     check_scale(scale)
     check_same(same)
-    settings = _Settings(scale, force, threshold, embedder, poses, rigid, same)
-    return _merge_two(read[0], read[1], settings) if len(read) == 2 else _merge_several(read, settings)
+    config = MergeConfig(scale, threshold, embedder, rigid, same, force, poses)
+    loaded_maps = [loaded(map) for map in maps]
+    began = time.perf_counter()
+    placed = (_place_pair if len(loaded_maps) == 2 else _place_set)(loaded_maps, config)
+    result = replace(_join(placed), descriptor=descriptor_name(embedder))
+    return replace(result, seconds=_split_seconds(placed.seconds, time.perf_counter() - began))
 
 
 @dataclass(frozen=True)
-class _Settings:
+class MergeConfig(AtlasSettings):
     """The keywords of `merge`."""
 
-    scale: str
-    force: bool
-    threshold: float | None
-    embedder: str | Descriptor
-    poses: str
-    rigid: bool
-    same: str
+    force: bool = False
+    poses: str = "search"
 
 
-def _merge_two(a: TopometricMap, b: TopometricMap, settings: _Settings) -> MergeResult:
-    check_pair(a, b, settings.scale)
-    threshold = checked_threshold(settings.threshold)
-    clock = _Clock()
-    describe = _Timed(settings.embedder, clock, settings.poses == "rooms")
-    searched = settings.poses == "search"
-    hypotheses = Resort(partial(_room_hypotheses, a, b, settings, describe), threshold if searched else np.inf)
-    choices: dict[str, Any] = {"rigid": settings.rigid, "same": settings.same}
-    registration = register(a, b, scale=settings.scale, proposed=hypotheses, searched=searched, **choices)
-    believed = registration.transform is not None and registration.probability >= threshold
-    result = MergeResult(
-        "merged" if believed else "abstained",
+def _place_pair(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResult:
+    """Register two maps; where nothing is believed, matched rooms propose poses, too."""
+    a, b = maps
+    check_pair(a, b, config.scale)
+    threshold = checked_threshold(config.threshold)
+    watch = Stopwatch()
+    describe = _TimedDescriptor(config.embedder or DEFAULT, watch, config.poses == "rooms")
+    searched = config.poses == "search"
+    proposals = FallbackProposals(partial(_room_hypotheses, a, b, config, describe), threshold if searched else np.inf)
+    choices: dict[str, Any] = {"rigid": config.rigid, "same": config.same}
+    registration = register(a, b, scale=config.scale, proposed=proposals, searched=searched, **choices)
+    accepted = registration.transform is not None and registration.probability >= threshold
+    transforms = {1: registration.transform} if registration.transform and (accepted or config.force) else {}
+    deformations = registration.bend.deformations if registration.bend and transforms else ()
+    return MergeResult(
+        "merged" if accepted else "abstained",
         registration.probability,
-        why(registration, threshold, settings.force),
+        why(registration, threshold, config.force),
+        transforms=transforms,
+        bends={k: d for k, d in enumerate(deformations) if len(d)},
+        seconds=watch.seconds,
         maps=(a, b),
         registration=registration,
-        warnings=(*pair_warnings(a, b, settings.scale), *_not_bent(registration)),
-        descriptor=descriptor_name(settings.embedder),
+        warnings=(*pair_warnings(a, b, config.scale), *_not_bent(registration)),
     )
-    pose = registration.transform
-    if pose is None or not (believed or settings.force):
-        return replace(result, seconds=clock.all())
-    bends = {} if registration.bend is None else {k: d for k, d in enumerate(registration.bend.deformations) if len(d)}
-    joined = fuse((a, b), [(0, Sim3()), (1, pose)], bends)
-    matches = tuple(_room_matches((a, b), (0, 1), pose, registration.probability, bends))
-    return replace(result, transforms={1: pose}, bends=bends, matches=matches, map=joined, seconds=clock.all())
 
 
 def _not_bent(registration: Registration) -> Iterator[str]:
@@ -128,45 +124,43 @@ def _not_bent(registration: Registration) -> Iterator[str]:
         yield f"the maps were not bent: {registration.bend.reason}"
 
 
-def _merge_several(maps: Sequence[TopometricMap], settings: _Settings) -> MergeResult:
-    """What an atlas brings together with the first map is joined; the reason names the maps that stand apart."""
-    began = time.perf_counter()
+def _place_set(maps: Sequence[TopometricMap], config: MergeConfig) -> MergeResult:
+    """Bring together with the first map what belongs to it; the reason names the maps that stand apart."""
     registrations: RegistrationsByPair = {}
-    descriptor = None if settings.embedder == DEFAULT else settings.embedder  # the default only says which pairs to try first
-    atlas_settings = AtlasSettings(settings.scale, settings.threshold, descriptor, settings.rigid, settings.same)
-    atlas = solve(maps, atlas_settings, registrations)
-    reason, status = atlas.words(), "merged" if _with_first(atlas)[1:] else "abstained"
+    if config.embedder == DEFAULT:  # of sets, the default only says which pairs to try first
+        config = replace(config, embedder=None)
+    atlas = solve(maps, config, registrations)
+    members, reason = atlas.components[atlas.component_of(0)], atlas.words()
+    status = "merged" if members[1:] else "abstained"
     if status == "abstained" and atlas.status != "abstained":
         reason = f"not merged: {atlas.names[0]} stands apart; {reason}"
-    if settings.force and atlas.status != "merged":
+    if config.force and atlas.status != "merged":
         reason += "; joined anyway (--force)"
-        atlas = solve(maps, replace(atlas_settings, threshold=0.0), registrations)
-    members, component = _with_first(atlas), atlas.component_of(0)
-    matches: list[RoomMatch] = []
-    for n, k in enumerate(members):
-        for m in members[n + 1 :]:
-            pose = atlas.transforms[k].inverse() @ atlas.transforms[m]
-            matches += _room_matches(maps, (k, m), pose, atlas.probability(component), atlas.bends)
-    joined = atlas.joined(component) if len(members) > 1 else None
+        atlas = solve(maps, replace(config, threshold=0.0), registrations)
+        members = atlas.components[atlas.component_of(0)]
     return MergeResult(
         status,
-        atlas.probability(component),
+        atlas.probability(atlas.component_of(0)),
         reason,
         transforms={k: atlas.transforms[k] for k in members[1:]},
         bends={k: atlas.bends[k] for k in members if k in atlas.bends},
-        matches=tuple(matches),
-        seconds={**dict.fromkeys(MERGE_STEPS, 0.0), "fuse": time.perf_counter() - began},
-        map=joined,
         maps=tuple(maps),
         atlas=atlas,
         warnings=atlas.warnings,
-        descriptor=descriptor_name(settings.embedder),
     )
 
 
-def _with_first(atlas: AtlasResult) -> tuple[int, ...]:
-    """The maps that lie in the frame of the first one, itself included."""
-    return atlas.components[atlas.component_of(0)]
+def _join(result: MergeResult) -> MergeResult:
+    """Fuse the maps that have a place, and match their rooms."""
+    if not result.transforms:
+        return result
+    poses = {0: Sim3(), **result.transforms}
+    joined = fuse(result.maps, list(poses.items()), result.bends)
+    matches: list[RoomMatch] = []
+    for k, m in combinations(poses, 2):
+        pose = poses[m] if k == 0 else poses[k].inverse() @ poses[m]
+        matches += _room_matches(result.maps, (k, m), pose, result.probability, result.bends)
+    return replace(result, matches=tuple(matches), map=joined)
 
 
 def _room_matches(
@@ -180,37 +174,24 @@ def _room_matches(
         yield RoomMatch(pair, (i, j), p)
 
 
-class _Clock:
-    """Seconds of embedding and matching; fusing is the rest."""
-
-    def __init__(self) -> None:
-        self.seconds = dict.fromkeys(MERGE_STEPS, 0.0)
-        self.began = time.perf_counter()
-
-    @contextmanager
-    def __call__(self, step: str) -> Iterator[None]:
-        began = time.perf_counter()
-        yield
-        self.seconds[step] += time.perf_counter() - began
-
-    def all(self) -> dict[str, float]:
-        """Of each step; embedding is part of no other."""
-        s = self.seconds
-        s["match"] = max(s["match"] - s["embed"], 0.0)
-        s["fuse"] = max(time.perf_counter() - self.began - s["match"] - s["embed"], 0.0)
-        return s
+def _split_seconds(seconds: Mapping[str, float], total: float) -> dict[str, float]:
+    """Split the seconds of a merge: embedding is part of no other step, and fusing is the rest."""
+    split = {step: seconds.get(step, 0.0) for step in MERGE_STEPS}
+    split["match"] = max(split["match"] - split["embed"], 0.0)
+    split["fuse"] = max(total - split["match"] - split["embed"], 0.0)
+    return split
 
 
-def _room_hypotheses(a: TopometricMap, b: TopometricMap, settings: _Settings, describe: _Timed) -> list[Sim3]:
+def _room_hypotheses(a: TopometricMap, b: TopometricMap, config: MergeConfig, describe: _TimedDescriptor) -> list[Sim3]:
     """Poses T_ab of matched rooms: under which sets of them lie on each other, or (`poses` "surfaces") of each by itself."""
     if not len(a.rooms) or not len(b.rooms):
         return []
     if registration_order(b) < registration_order(a):  # as registration: nothing may depend on which comes first
-        return [h.inverse() for h in _room_hypotheses(b, a, settings, describe)]
-    with describe.clock("match"):
-        if settings.poses == "surfaces":
+        return [h.inverse() for h in _room_hypotheses(b, a, config, describe)]
+    with describe.watch.measure("match"):
+        if config.poses == "surfaces":
             return _surface_hypotheses(a, b, match(a, b, describe, "growing"))
-        return [h.transform for h in match(a, b, describe, scale_free=settings.scale == "free").alternatives]
+        return [h.transform for h in match(a, b, describe, scale_free=config.scale == "free").alternatives]
 
 
 def _surface_hypotheses(a: TopometricMap, b: TopometricMap, matching: Matching) -> list[Sim3]:
@@ -224,27 +205,27 @@ def _surface_hypotheses(a: TopometricMap, b: TopometricMap, matching: Matching) 
     return [pose for pose, _ in room_poses(a, b, rooms, weights)]
 
 
-class _Timed:
+class _TimedDescriptor:
     """A descriptor whose seconds are those of embedding.
 
     Args:
         scales: offer rows at other scales; where walls are searched, they find the scale in a tenth of the time.
     """
 
-    def __init__(self, embedder: str | Descriptor, clock: _Clock, scales: bool) -> None:
-        self.describe, self.clock = make_embedder(embedder), clock
+    def __init__(self, embedder: str | Descriptor, watch: Stopwatch, scales: bool) -> None:
+        self.describe, self.watch = make_embedder(embedder), watch
         if scales and hasattr(self.describe, "at_scales"):
             self.at_scales = self._at_scales
 
     def __call__(self, map: TopometricMap) -> Rows:
-        with self.clock("embed"):
+        with self.watch.measure("embed"):
             return self.describe(map)
 
     def _at_scales(self, map: TopometricMap) -> Callable[[float], Rows]:
         rows_at: Callable[[float], Rows] = self.describe.at_scales(map)  # type: ignore[attr-defined]
 
         def timed(scale: float) -> Rows:
-            with self.clock("embed"):
+            with self.watch.measure("embed"):
                 return rows_at(scale)
 
         return timed

@@ -15,44 +15,16 @@ from topomerge.io.listing import plain
 from topomerge.matching.listing import map_to_entry
 from topomerge.registration.evidence.places import Places
 from topomerge.registration.pipeline import Registration
-from topomerge.types import Array, Sim3, TopometricMap, between_files
-from topomerge.types.deformation import Deformation
+from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap, between_files
 from topomerge.writers import WRITERS
 
 if TYPE_CHECKING:
     from topomerge.fusion.atlas.result import AtlasResult
 
 BEND_PARAMETER = "bend"  # of a joined map: how the maps that it was joined of were bent
-ROUNDING = 1e-6  # by which a matrix in a file may miss a similarity that keeps the vertical, times the size of its numbers
 AROUND = np.array([(1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0)]) / 2  # m: places that stand for a room without a floor
 MERGE_FORMAT = 1
 MERGE_STEPS = ("read", "extract", "embed", "match", "fuse")
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """A map in the frame of the joined map: it is bent in its own frame, then posed.
-
-    Args:
-        map: its number.
-        source: the file that it came from.
-        pose: of the bent map in the joined one.
-        bend: None where it is rigid.
-    """
-
-    map: int
-    source: str
-    pose: Sim3
-    bend: Deformation | None = None
-
-    def apply(self, points: Array) -> Array:
-        """(n, 3) points of the map, in the joined one."""
-        return self.pose.apply(points if self.bend is None else self.bend.apply(points))
-
-    def undo(self, points: Array) -> Array:
-        """(n, 3) points of the joined map, in this one."""
-        own = self.pose.inverse().apply(points)
-        return own if self.bend is None else self.bend.undo(own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,21 +96,26 @@ def bend_to_json(map: TopometricMap, placement: Placement) -> dict[str, Any]:
     return {**placement.bend.to_json(), "rooms": rooms}
 
 
-def with_bends(joined: TopometricMap, placements: Sequence[Placement]) -> TopometricMap:
-    """The joined map, that remembers how the maps it was joined of were bent; as it is where all are rigid."""
+def with_bends(joined: TopometricMap, placements: Mapping[int, Placement], sources: Sequence[str]) -> TopometricMap:
+    """Let the joined map remember how the maps it was joined of were bent; as it is where all are rigid.
+
+    Args:
+        placements: k -> where map k lies in the joined frame.
+        sources: of all maps.
+    """
     bent = [
-        {"map": p.map, "source": p.source, "transform": p.pose.matrix.tolist(), "deformation": p.bend.to_json()}
-        for p in placements
+        {"map": k, "source": sources[k], "transform": p.pose.matrix.tolist(), "deformation": p.bend.to_json()}
+        for k, p in placements.items()
         if p.bend is not None
     ]
     return replace(joined, parameters={**joined.parameters, BEND_PARAMETER: bent}) if bent else joined
 
 
-def bends_of(joined: TopometricMap) -> tuple[Placement, ...]:
-    """How the maps that a map was joined of were bent: what `with_bends` put there, also after `save_map` and `load_map`.
+def bends_of(joined: TopometricMap) -> dict[int, Placement]:
+    """Read how the maps that a map was joined of were bent: what `with_bends` put there, also after `save_map` and `load_map`.
 
     Returns:
-        One for each bent map; none of a map that was extracted, or joined of rigid ones.
+        One for each bent map, by its number; none of a map that was extracted, or joined of rigid ones.
 
     Raises:
         InputError: something else stands there.
@@ -147,7 +124,7 @@ def bends_of(joined: TopometricMap) -> tuple[Placement, ...]:
     try:
         if not isinstance(listed, list | tuple):
             raise ValueError("no list")
-        return tuple(_placement(entry) for entry in listed)
+        return dict(_placement(entry) for entry in listed)
     except InputError as error:
         raise InputError(f"{joined.source or 'map'}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -155,42 +132,24 @@ def bends_of(joined: TopometricMap) -> tuple[Placement, ...]:
         raise InputError(f"{joined.source or 'map'}: damaged bending ({reason}); merge the maps again") from error
 
 
-def _placement(entry: Mapping[str, Any]) -> Placement:
+def _placement(entry: Mapping[str, Any]) -> tuple[int, Placement]:
     number, source = entry["map"], entry["source"]
     if not isinstance(number, int) or isinstance(number, bool) or number < 0 or not isinstance(source, str):
         raise ValueError(f"map {number!r}")
-    pose = similarity(np.array(entry["transform"], np.float64))
-    return Placement(number, source, pose, Deformation.from_json(entry["deformation"]))
+    pose = Sim3.from_matrix(np.array(entry["transform"], np.float64))
+    return number, Placement(pose, Deformation.from_json(entry["deformation"]))
 
 
-def similarity(matrix: Array) -> Sim3:
-    """The similarity of a (4, 4) matrix.
-
-    Raises:
-        ValueError: it is none that keeps the vertical.
-    """
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or matrix[2, 2] <= 0:
-        raise ValueError("a transform that is none")
-    x, y, z = matrix[:3, 3].tolist()
-    pose = Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), (x, y, z), float(matrix[2, 2]))
-    if not np.allclose(pose.matrix, matrix, rtol=0, atol=ROUNDING * max(pose.scale, 1.0)):
-        raise ValueError("a transform that is none")
-    return pose
-
-
-def placements(
-    maps: Sequence[TopometricMap], transforms: Mapping[int, Sim3], bends: Mapping[int, Deformation]
-) -> list[Placement]:
-    """Where each map that has a transform lies, and the first one, ascending.
+def placements(transforms: Mapping[int, Sim3], bends: Mapping[int, Deformation]) -> dict[int, Placement]:
+    """Place each map that has a transform, and the first one, ascending.
 
     Args:
-        maps: what was merged.
         transforms: k -> T_0k.
         bends: k -> how map k is bent; rigid ones are left out.
     """
     poses = {0: Sim3(), **transforms}
     bent = {k: bend for k, bend in bends.items() if len(bend)}
-    return [Placement(k, maps[k].source, poses[k], bent.get(k)) for k in sorted(poses)]
+    return {k: Placement(poses[k], bent.get(k)) for k in sorted(poses)}
 
 
 @dataclass(frozen=True)
@@ -250,7 +209,7 @@ class MergeResult:
         if self.status not in ("merged", "abstained"):
             raise ValueError(f"status must be merged or abstained, not {self.status!r}")
         if self.map is not None:  # whoever has only the joined map can bend what it was joined of, too
-            object.__setattr__(self, "map", with_bends(self.map, list(self.placements.values())))
+            object.__setattr__(self, "map", with_bends(self.map, self.placements, [m.source for m in self.maps]))
 
     @property
     def merged(self) -> bool:
@@ -260,7 +219,7 @@ class MergeResult:
     @property
     def placements(self) -> dict[int, Placement]:
         """k -> where the points of map k lie in the joined frame, of every map that is part of it; none where nothing is."""
-        return {p.map: p for p in placements(self.maps, self.transforms, self.bends)} if self.transforms else {}
+        return placements(self.transforms, self.bends) if self.transforms else {}
 
     @property
     def file_transforms(self) -> dict[int, Array]:

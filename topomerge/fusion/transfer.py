@@ -13,8 +13,7 @@ from topomerge.extraction.distinct_doors import LEVEL_KINDS, distinct_doors, roo
 from topomerge.extraction.elevations.fixtures import fixtures_in_map
 from topomerge.extraction.elevations.windows import in_map, same_windows
 from topomerge.extraction.plans.part_rooms import PartRooms
-from topomerge.fusion.resampling import Laying
-from topomerge.types import EDGE_DTYPE, FIXTURE_DTYPE, WINDOW_DTYPE, Array, TopometricMap
+from topomerge.types import EDGE_DTYPE, FIXTURE_DTYPE, WINDOW_DTYPE, Array, Placement, TopometricMap
 from topomerge.types.arrays import within_turn
 
 DOOR_SIDE = 1.0  # m around a door in which floor says which rooms it joins
@@ -32,16 +31,16 @@ class LaidPart(NamedTuple):
     doors: Array
 
 
-def laid_part(part: TopometricMap, laying: Laying) -> LaidPart:
+def laid_part(part: TopometricMap, placement: Placement) -> LaidPart:
     """A part as it lies in the joined map."""
     doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)].copy()
     for name in ("centre", "lower", "upper"):
-        doors[name] = laying.apply(doors[name])
-    doors["direction"] = (doors["direction"] + laying.pose.yaw) % np.pi
+        doors[name] = placement.transform_points(doors[name])
+    doors["direction"] = (doors["direction"] + placement.pose.yaw) % np.pi
     for name in ("width", "height"):
-        doors[name] *= laying.pose.scale
-    area = (laying.pose.scale * part.navigable.edge) ** 2
-    return LaidPart(PartRooms(*laid_floor(part, laying), part.rooms["entered"], area), doors)
+        doors[name] *= placement.pose.scale
+    area = (placement.pose.scale * part.navigable.edge) ** 2
+    return LaidPart(PartRooms(*laid_floor(part, placement), part.rooms["entered"], area), doors)
 
 
 def with_doors(joined: TopometricMap, parts: Iterable[LaidPart]) -> TopometricMap:
@@ -61,10 +60,10 @@ def with_doors(joined: TopometricMap, parts: Iterable[LaidPart]) -> TopometricMa
     return distinct_doors(replace(joined, edges=edges[np.lexsort((*edges["centre"].T[::-1], *edges["rooms"].T[::-1]))]))
 
 
-def laid_floor(part: TopometricMap, laying: Laying) -> tuple[Array, Array]:
+def laid_floor(part: TopometricMap, placement: Placement) -> tuple[Array, Array]:
     """(k, 3) m in the joined map, and (k,) their rooms in the part: the floor of its rooms."""
     inside = part.navigable_room >= 0
-    return laying.apply(part.navigable.centroids(part.navigable.cells[inside])), part.navigable_room[inside]
+    return placement.transform_points(part.navigable.centroids(part.navigable.cells[inside])), part.navigable_room[inside]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,28 +154,28 @@ def with_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> Topomet
     return replace(joined, rooms=rooms)
 
 
-def laid_windows(part: TopometricMap, laying: Laying) -> Array:
+def laid_windows(part: TopometricMap, placement: Placement) -> Array:
     """(W,) WINDOW_DTYPE of a part in the joined map, without rooms."""
-    windows = _laid(part.windows, laying, ("width", "sill", "head"), np.pi)
+    windows = _laid(part.windows, placement, ("width", "sill", "head"), np.pi)
     windows["rooms"] = -1
     return windows
 
 
-def laid_fixtures(part: TopometricMap, laying: Laying) -> Array:
+def laid_fixtures(part: TopometricMap, placement: Placement) -> Array:
     """(F,) FIXTURE_DTYPE of a part in the joined map, without a room."""
-    fixtures = _laid(part.fixtures, laying, ("width", "depth", "bottom", "top"), 2 * np.pi)
+    fixtures = _laid(part.fixtures, placement, ("width", "depth", "bottom", "top"), 2 * np.pi)
     fixtures["room"] = -1
     return fixtures
 
 
-def _laid(rows: Array, laying: Laying, lengths: Sequence[str], full_turn: float) -> Array:
+def _laid(rows: Array, placement: Placement, lengths: Sequence[str], full_turn: float) -> Array:
     """Rows with `centre` and `direction` in the joined map, the columns of lengths at its scale."""
     rows = rows.copy()
     if len(rows):
-        rows["centre"] = laying.apply(rows["centre"])
-        rows["direction"] = within_turn(rows["direction"] + laying.pose.yaw, full_turn)
+        rows["centre"] = placement.transform_points(rows["centre"])
+        rows["direction"] = within_turn(rows["direction"] + placement.pose.yaw, full_turn)
         for name in lengths:
-            rows[name] *= laying.pose.scale
+            rows[name] *= placement.pose.scale
     return rows
 
 

@@ -7,7 +7,6 @@ the rigid maps do not. So the lead over rivals is measured between bent maps, to
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from topomerge.blas import one_blas_thread
 from topomerge.errors import InputError
+from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.matching.poses import PoseHypothesis, distinct_hypotheses, wrapped
 from topomerge.matching.refinement import refine
 from topomerge.registration.bend.bend import Bend, bend
@@ -103,13 +103,13 @@ def candidates(
 
 
 @dataclass(frozen=True)
-class Resort:
+class FallbackProposals:
     """Poses T_ab that are made only where the best pose there is without them is less probable than `below`."""
 
     make: Callable[[], Sequence[Sim3]]
     below: float
 
-    def inverse(self) -> Resort:
+    def inverse(self) -> FallbackProposals:
         """That of the maps the other way round."""
         return replace(self, make=lambda: _inverses(self.make()))
 
@@ -150,7 +150,7 @@ def register(
     b: Map | Prepared,
     *,
     scale: str = "fixed",
-    proposed: Sequence[Sim3] | Resort = (),
+    proposed: Sequence[Sim3] | FallbackProposals = (),
     free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
     searched: bool = True,
     rigid: bool = False,
@@ -162,7 +162,7 @@ def register(
         a, b: topometric maps or occupied cells, or what `prepare` made of them.
         scale: "fixed", or "free" where b's unit may differ (looked for between 0.5 and 2).
         proposed: poses T_ab of matched rooms: their yaws are searched, too, and they are tried beside what the correlation
-            finds; or a resort, whose poses are tried, if at all, after that.
+            finds; or a fallback, whose poses are tried, if at all, after that.
         free: cells of a and of b known to be empty; topometric maps bring their own.
         searched: look for poses by correlation? Else the proposed ones are all there is.
         rigid: give the best rigid pose? Else both maps are bent, too. They are judged as bent all the same: drift is no
@@ -175,22 +175,22 @@ def register(
     check_same(same)
     if scale not in ("fixed", "free"):
         raise InputError(f"scale must be fixed or free, not {scale!r}")
-    clock = _Clock()
+    clock = Stopwatch()
     a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
-    clock("plans")
+    clock.lap("plans")
     if b.order < a.order:  # so that nothing depends on which comes first
-        poses = proposed.inverse() if isinstance(proposed, Resort) else _inverses(proposed)
+        poses = proposed.inverse() if isinstance(proposed, FallbackProposals) else _inverses(proposed)
         swapped = register(b, a, scale=scale, proposed=poses, searched=searched, rigid=rigid, same=same)
         return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
     pair = _Pair(a, b, scale == "free", clock)
-    resort, first = (proposed, ()) if isinstance(proposed, Resort) else (None, proposed)
+    fallback, first = (proposed, ()) if isinstance(proposed, FallbackProposals) else (None, proposed)
     if searched:
         pair.search(first)
     else:
         pair.add(first)
     chance = pair.look(same)
-    if resort is not None and chance < resort.below:
-        pair.add(resort.make())
+    if fallback is not None and chance < fallback.below:
+        pair.add(fallback.make())
         pair.look(same)
     if pair.verdict is None:
         reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
@@ -201,7 +201,7 @@ def register(
 class _Pair:
     """Two maps while they are registered: their hypotheses, ranked, and those that were looked at closely."""
 
-    def __init__(self, a: Prepared, b: Prepared, scaled: bool, clock: _Clock) -> None:
+    def __init__(self, a: Prepared, b: Prepared, scaled: bool, clock: Stopwatch) -> None:
         self.a, self.b, self.scaled, self.clock = a, b, scaled, clock
         self.judge = Judge(a.storeys, b.storeys)
         self.ranked: list[PoseHypothesis] = []
@@ -215,14 +215,14 @@ class _Pair:
 
     def add(self, poses: Sequence[Sim3]) -> None:
         """Add given poses T_ab, moved to where the walls meet."""
-        self.clock("match")
+        self.clock.lap("match")
         proposals = [PoseHypothesis(pose, from_rooms=True) for pose in poses]
         self._rank(refine(self.a.storeys, self.b.storeys, proposals, self.scaled))
 
     def _rank(self, hypotheses: Sequence[PoseHypothesis]) -> None:
-        self.clock("search")
+        self.clock.lap("search")
         self.ranked = rank(hypotheses, self.judge, self.ranked)
-        self.clock("verify")
+        self.clock.lap("verify")
 
     def look(self, same: str) -> float:
         """Look closely at the best hypotheses there are; the probability of the best one."""
@@ -230,13 +230,13 @@ class _Pair:
             return 0.0
         self.looked = candidates(self.a, self.b, self.ranked, self.scaled, self.bent)
         self.verdict = verdict([c.features for c in self.looked], self.looked[0].closely(), same)
-        self.clock("bend")
+        self.clock.lap("bend")
         return self.verdict.each[0]
 
     def registration(self, said: Verdict, rigid: bool) -> Registration:
         """The best hypothesis, finely registered, with what was said of it."""
         bent, rmse = _refined(self.a, self.b, self.looked[0], self.scaled, rigid)
-        self.clock("refine")
+        self.clock.lap("refine")
         believed = _verdict(self.ranked, self.looked, said)
         features = {**believed.features, "rmse": rmse}
         return replace(believed, transform=bent.transform, features=features, bend=None if rigid else bent)
@@ -258,19 +258,6 @@ def _refined(a: Prepared, b: Prepared, best: Candidate, scaled: bool, rigid: boo
     pose = bent.transform  # bending is level: floors and ceilings say how high
     height = aligned.translation[2] + (aligned.scale - pose.scale) * float(b.middle[2])  # there, where scales differ
     return replace(bent, transform=replace(pose, translation=(*pose.translation[:2], height))), best.features["rmse"]
-
-
-class _Clock:
-    """Seconds since the step before."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.before = time.perf_counter()
-
-    def __call__(self, step: str) -> None:
-        now = time.perf_counter()
-        self.seconds[step] = self.seconds.get(step, 0.0) + now - self.before
-        self.before = now
 
 
 def _verdict(ranked: Sequence[PoseHypothesis], looked: Sequence[Candidate], said: Verdict) -> Registration:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from topomerge.errors import InputError
 from topomerge.kernels.bend import blended_moves, interpolated
-from topomerge.types import Array
+from topomerge.types.arrays import Array
 
 INVERSE_ROUNDS = 30
 INVERSE_STEP = 1e-9  # m, a smaller correction ends the search for the place that is moved to a point
@@ -146,6 +146,11 @@ class Deformation:
             if not len(step) or np.abs(step).max() < INVERSE_STEP:
                 break
         return places
+
+    @property
+    def farthest(self) -> float:
+        """m by which bending moves a place of the map at most."""
+        return max(float(np.linalg.norm(f.shifts, axis=-1).max()) for f in self.fields if f is not None)
 
     @property
     def least_growth(self) -> float:

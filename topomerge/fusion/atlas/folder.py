@@ -22,7 +22,6 @@ from filelock import FileLock, Timeout
 
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.solve import AtlasSettings
-from topomerge.fusion.result import similarity
 from topomerge.types import Array, Sim3, between_maps, levelling_of
 
 NEW, NEXT, LOCK, GONE = ".new", ".next", ".lock", "gone.json"
@@ -241,7 +240,7 @@ class Stored:
                 for k in component["maps"]:
                     entry = self.entries[k]
                     lying = between_maps(matrices[k], entry.levelling, into) if k in matrices else None
-                    out[entry.name] = (n, Sim3() if lying is None else similarity(lying))
+                    out[entry.name] = (n, Sim3() if lying is None else Sim3.from_matrix(lying))
         except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
             raise self._damaged() from error
         return out
@@ -290,7 +289,7 @@ def read_finished(folder: Path) -> Stored:
 
 
 def _entry(listed: Mapping[str, Any]) -> Entry:
-    frame = similarity(np.array(listed["frame"], np.float64)) if "frame" in listed else Sim3()
+    frame = Sim3.from_matrix(np.array(listed["frame"], np.float64)) if "frame" in listed else Sim3()
     levelling = levelling_of(listed)
     return Entry(listed["name"], listed["key"], listed["source"], int(listed["rooms"]), int(listed["storeys"]), frame, levelling)
 

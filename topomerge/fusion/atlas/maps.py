@@ -23,8 +23,7 @@ from topomerge.matching.match import checked
 from topomerge.registration.bend.bend import bend_together
 from topomerge.registration.prepared import Prepared, prepare
 from topomerge.registration.refine import surface
-from topomerge.types import Array, Sim3, TopometricMap
-from topomerge.types.deformation import Deformation
+from topomerge.types import Array, Deformation, Sim3, TopometricMap
 
 LOADED_AT_ONCE = 3  # maps in memory, of those that are files
 PREPARED_AT_ONCE = 64  # maps whose plans are in memory

@@ -11,8 +11,7 @@ from topomerge.fusion.atlas.link_evidence import Link
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.pairs import Contradiction
 from topomerge.fusion.fuse import fuse
-from topomerge.types import Sim3, TopometricMap
-from topomerge.types.deformation import Deformation
+from topomerge.types import Deformation, Sim3, TopometricMap
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,7 @@ from topomerge.fusion.pose_graph import Assembler, Assembly, residual
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.registration.bend.bend import NEITHER_BENDS
 from topomerge.registration.posterior import check_same
-from topomerge.types import Array, Sim3, TopometricMap
-from topomerge.types.deformation import Deformation
+from topomerge.types import Array, Deformation, Sim3, TopometricMap
 
 SURE_LINK = 4.0  # log odds of a link, above which no further ones are looked for within its component
 ENOUGH_REGISTRATIONS = 3  # of a map, after which none within its component is made

@@ -13,8 +13,7 @@ from topomerge.registration.bend.graph import Joints, Measurements, Settled, set
 from topomerge.registration.bend.measure import Window, measure, measure_lines
 from topomerge.registration.bend.pieces import PIECE_SIZE, Drift, Pieces
 from topomerge.registration.prepared import Prepared
-from topomerge.types import Array, Sim3
-from topomerge.types.deformation import Deformation
+from topomerge.types import Array, Deformation, Sim3
 
 RIGID_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.05)  # m, m, rad, logarithm of the scale: of a mended pose
 PIECE_PRIOR = (1.0, 1.0, float(np.radians(3.0)), 0.02)
