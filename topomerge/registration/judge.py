@@ -206,7 +206,7 @@ def winner_features(judge: Judge, pose: Sim3) -> dict[str, float]:
     """Further features of a pose: m2, shares, and numbers of squares and of pieces of furniture."""
     walls = np.zeros((0, 6))
     conflict, back = np.zeros(2), pose.inverse()
-    main = np.radians(float(judge.a[0].profile.argmax()) / 2)
+    main = judge.a[0].main_direction
     moved = np.zeros(2)
     for v, w in storeys_at(judge.a, judge.b, pose.translation[2], pose.scale):
         for source, target, move, side in ((w, v, pose, 0), (v, w, back, 1)):

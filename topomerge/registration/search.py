@@ -210,7 +210,7 @@ def search_scaled(
 def scale_candidates(v: PlanFields, w: PlanFields, yaws: Sequence[float]) -> list[tuple[float, float, float]]:
     """(score, yaw, scale) whose wall spacings agree, best first; for each yaw the separate peaks over the scale."""
     logs = np.arange(np.log(TRIED_SCALES[0]), np.log(TRIED_SCALES[1]) + SCALE_STEP, SCALE_STEP)
-    main = np.radians(float(v.profile.argmax()) / 2)
+    main = v.main_direction
     axes = np.array([[np.cos(main), -np.sin(main)], [np.sin(main), np.cos(main)]])  # columns: along and across
     first, second = _sample(v.walls), _sample(w.walls)
     span = np.hypot(*np.ptp(first, axis=0)) + TRIED_SCALES[1] * np.hypot(*np.ptp(second, axis=0))

@@ -50,7 +50,7 @@ class Target:
 
     def __init__(self, fields: PlanFields) -> None:
         self.fields = fields
-        self.main = np.radians(float(fields.profile.argmax()) / 2)
+        self.main = fields.main_direction
         self._rasters = _rasters(fields, self.main)
 
     def gain(self, sigma: float) -> tuple[Array, Array]:

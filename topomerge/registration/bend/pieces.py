@@ -69,7 +69,7 @@ def pieces_of(storeys: Sequence[PlanFields], map: TopometricMap | None = None) -
 
 def _storey_pieces(fields: PlanFields, number: int, rooms: Array | None) -> Pieces:
     walls = fields.walls
-    main = np.radians(float(fields.profile.argmax()) / 2)
+    main = fields.main_direction
     turned = walls @ np.array([[np.cos(main), -np.sin(main)], [np.sin(main), np.cos(main)]])
     room = np.full(len(walls), -1, np.int32) if rooms is None else rooms
     block = np.zeros((len(walls), 2), np.int64)

@@ -65,7 +65,7 @@ def crops(a: Sequence[PlanFields], b: Sequence[PlanFields], pose: Sim3) -> Crops
 
 
 def _of_storeys(v: PlanFields, w: PlanFields, pose: Sim3) -> Crops:
-    main = np.radians(float(v.profile.argmax()) / 2)
+    main = v.main_direction
     axes = np.array([[np.cos(main), np.sin(main)], [-np.sin(main), np.cos(main)]])  # rows: the axes of the raster in a's frame
     low, size = _common_box(v.plan, w.plan, pose, axes)
     if (size < 1).any():
