@@ -30,7 +30,7 @@ from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.turns import Rows
 from topomerge.evaluation.tables import write_section
 from topomerge.fusion.atlas.find import SHORTLIST, ranked, shortlist
-from topomerge.fusion.atlas.neighbours import most_alike, nearest, owners, queries, vectors, votes
+from topomerge.fusion.atlas.partners import most_alike, nearest, owners, queries, vectors, votes
 from topomerge.statistics import interval_text
 
 FIRST = (1, 5, 10)

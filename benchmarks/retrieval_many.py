@@ -26,10 +26,9 @@ from benchmarks.retrieval import FIRST
 from topomerge.embedding.embedders import embedder
 from topomerge.embedding.turns import Rows
 from topomerge.evaluation.tables import write_section
-from topomerge.fusion.atlas.coarse import coarse_log_odds
 from topomerge.fusion.atlas.find import LAID_COARSELY, SHORTLIST, Sighting, ranked, shortlist
 from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.neighbours import nearest, owners, queries, vectors, votes
+from topomerge.fusion.atlas.partners import coarse_log_odds, nearest, owners, queries, vectors, votes
 from topomerge.io.maps import load_map
 from topomerge.statistics import interval_text
 from topomerge.types import Array

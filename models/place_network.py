@@ -9,7 +9,7 @@ import torch
 from topomerge.models.plan_unet import folded
 from torch import Tensor, nn
 
-from topomerge.fusion.evidence.network import CONVOLUTIONS, PLANES
+from topomerge.registration.evidence.network import CONVOLUTIONS, PLANES
 from topomerge.types import Array
 
 

@@ -50,7 +50,7 @@ def test_comments_docstrings_and_layout_keep_the_digest(before, after):
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        ("topomerge.fusion.merge", "fusion/calibration.json"),
+        ("topomerge.fusion.pipeline", "registration/calibration.json"),
         ("topomerge.embedding.engineered", "embedding/engineered.json"),
         ("topomerge.embedding.learned", "embedding/pretrained/embedder.safetensors"),
         (EXTRACT, "extraction/plans/plan_network.npz"),
@@ -119,6 +119,6 @@ def test_a_module_that_does_not_exist(before):
 
 
 def test_nothing_is_imported():
-    code = "import sys; from topomerge.code_digest import code_digest as d; d('topomerge.fusion.merge'); print(*sys.modules)"
+    code = "import sys; from topomerge.code_digest import code_digest as d; d('topomerge.fusion.pipeline'); print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout.split()
-    assert not {"numpy", "numba", "torch", "topomerge.fusion.merge"} & set(loaded)
+    assert not {"numpy", "numba", "torch", "topomerge.fusion.pipeline"} & set(loaded)

@@ -24,6 +24,7 @@ RANKS = {
     "extraction": 3,
     "embedding": 4,
     "matching": 5,
+    "registration": 5.5,
     "fusion": 6,
     "viz": 7,
     "models": 8,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from topomerge.fusion.atlas.find import find as find
     from topomerge.fusion.atlas.result import AtlasResult as AtlasResult
     from topomerge.fusion.atlas.solve import atlas as atlas
-    from topomerge.fusion.merge import merge as merge
+    from topomerge.fusion.pipeline import merge as merge
     from topomerge.fusion.result import MergeResult as MergeResult
     from topomerge.io.exports import save_export as save_export
     from topomerge.io.listing import map_to_json as map_to_json
@@ -61,7 +61,7 @@ _HOMES = {
     "load_embedder": "topomerge.embedding.learned",
     "load_map": "topomerge.io.maps",
     "map_to_json": "topomerge.io.listing",
-    "merge": "topomerge.fusion.merge",
+    "merge": "topomerge.fusion.pipeline",
     "plan_figure": "topomerge.viz.figures",
     "read_chunks": "topomerge.io.points",
     "read_points": "topomerge.io.points",

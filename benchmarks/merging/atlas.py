@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.merging.atlas_maps import ATLAS_CACHE, AtlasSet, load
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import atlas
-from topomerge.fusion.pose_difference import pose_difference
+from topomerge.matching.poses import pose_difference
 
 RIGHT = (0.5, np.radians(5.0))  # m, rad
 SIZES = (2, 4, 8, 16)

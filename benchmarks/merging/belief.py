@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.merging.tables import put
-from topomerge.fusion.verify import BELIEF_VECTOR, BENT_POSE_VECTOR, PLACE_VECTOR
+from topomerge.registration.verify import BELIEF_VECTOR, BENT_POSE_VECTOR, PLACE_VECTOR
 from topomerge.training import merge_belief
 from topomerge.training.belief_floor import captures_left_out, floor_rows
 from topomerge.training.belief_hypotheses import belief_rows, fair, kind_of

@@ -33,10 +33,10 @@ from benchmarks.merging.register import real_pairs
 from benchmarks.merging.tables import RESULTS_CACHE, rows_of
 from benchmarks.real_data import real_data
 from topomerge.code_digest import code_digest
-from topomerge.fusion.bend.bend import bend
-from topomerge.fusion.bend.drift import Drift, sensor_drift
-from topomerge.fusion.prepared import Prepared, prepare
-from topomerge.fusion.registration import register
+from topomerge.registration.bend.bend import bend
+from topomerge.registration.bend.pieces import Drift, sensor_drift
+from topomerge.registration.pipeline import register
+from topomerge.registration.prepared import Prepared, prepare
 from topomerge.training.belief_hypotheses import error, right
 
 Row = dict[str, Any]
@@ -163,7 +163,7 @@ def main(what: str, *words: str) -> None:
     suffix = f"_{split}" if what in ("simulated", "wrong") else ""
     target = RESULTS_CACHE / f"bending_{what}{suffix}.jsonl"
     target.parent.mkdir(parents=True, exist_ok=True)
-    code, earlier = code_digest("topomerge.fusion.bend.bend"), rows_of(target.name)
+    code, earlier = code_digest("topomerge.registration.bend.bend"), rows_of(target.name)
     done = {row["name"] for row in earlier}
     if any(row.get("code") != code for row in earlier):
         print(f"{target}: some of its rows are of another state of the code; delete it to measure them again")

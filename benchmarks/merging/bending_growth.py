@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from topomerge.fusion.bend.bend import bend
-from topomerge.fusion.bend.drift import sensor_drift
-from topomerge.fusion.prepared import prepare
-from topomerge.fusion.registration import register
+from topomerge.registration.bend.bend import bend
+from topomerge.registration.bend.pieces import sensor_drift
+from topomerge.registration.pipeline import register
+from topomerge.registration.prepared import prepare
 from topomerge.types import Array, Sim3, VoxelGrid
 
 EDGE = 0.1  # m

@@ -18,12 +18,12 @@ import numpy as np
 
 from benchmarks.merging.bending_growth import cells_of, storey, waved
 from topomerge.errors import InputError
-from topomerge.fusion.bend import alignment as alignments
-from topomerge.fusion.bend.alignment import Alignment
-from topomerge.fusion.bend.bend import WINDOWS, settle_all
-from topomerge.fusion.bend.drift import sensor_drift
-from topomerge.fusion.bend.graph import OUTLIER, Joints, Measurements, settle
-from topomerge.fusion.prepared import prepare
+from topomerge.registration.bend import alignment as alignments
+from topomerge.registration.bend.alignment import Alignment
+from topomerge.registration.bend.bend import WINDOWS, settle_all
+from topomerge.registration.bend.graph import OUTLIER, Joints, Measurements, settle
+from topomerge.registration.bend.pieces import sensor_drift
+from topomerge.registration.prepared import prepare
 from topomerge.types import Array, Sim3
 
 RUNS = 5

@@ -14,11 +14,11 @@ from topomerge.datasets.real.office_floor import OFFICE_PIXEL
 from benchmarks.merging.bending_measures import conflict
 from benchmarks.merging.cached_pairs import buildings_of
 from benchmarks.merging.strangers import strangers
-from topomerge.fusion.bend.bend import Bend
-from topomerge.fusion.judge import Judge
-from topomerge.fusion.prepared import Prepared
-from topomerge.fusion.registration import Registration
-from topomerge.fusion.verify import plausibility
+from topomerge.registration.bend.bend import Bend
+from topomerge.registration.judge import Judge
+from topomerge.registration.pipeline import Registration
+from topomerge.registration.prepared import Prepared
+from topomerge.registration.verify import plausibility
 from topomerge.training.belief_hypotheses import error, right, together
 from topomerge.types import Array, Sim3
 

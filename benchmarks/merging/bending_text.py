@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from topomerge.fusion.bend.drift import sensor_drift
+from topomerge.registration.bend.pieces import sensor_drift
 
 BENDING_COMMANDS = (
     "`python -m benchmarks.merging.bending simulated 36000 {split}; python -m benchmarks.merging.bending floor 3600; python -m "

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.extraction.extract import extract
-from topomerge.fusion.registration import Registration, register
 from topomerge.io.maps import load_map, save_map
+from topomerge.registration.pipeline import Registration, register
 from topomerge.types import Array, Sim3, TopometricMap
 
 HEIGHT, DOOR, DOOR_HEIGHT, GAP = 2.6, 0.9, 2.05, 0.06  # m; gap: half of a wall's thickness

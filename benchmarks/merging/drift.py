@@ -1,6 +1,6 @@
 """How much maps of each sensor bend: relative shift and turn of places that lie some metres apart.
 
-    python -m benchmarks.merging.drift 24 topomerge/fusion/bend/drift.json
+    python -m benchmarks.merging.drift 24 topomerge/registration/bend/drift.json
 
 Simulated maps of buildings to train on, of which the drift is known at every place, are cut into pieces of 3 m. The drift moves
 each piece by a rigid move. The moves of two pieces carry the point in the middle between them to two places: the distance of

@@ -18,7 +18,7 @@ from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_set
 
 from topomerge.embedding.embedders import embedder
 from topomerge.evaluation.score import FLAT_SENSORS, NEAR_POSE, pose_error, within
-from topomerge.fusion.merge import merge
+from topomerge.fusion.pipeline import merge
 from topomerge.matching.consistency import CONSISTENCY, best_of, candidate_poses, votes
 from topomerge.matching.costs import best_partners, descriptor_costs, similarities
 from topomerge.matching.match import match

@@ -28,13 +28,12 @@ from benchmarks.merging.tables import RESULTS_CACHE, put, table
 from benchmarks.real_data import real_data
 from topomerge.errors import InputError
 from topomerge.evaluation.doubled_walls import doubled_walls
-from topomerge.fusion.bend.bend import bend
-from topomerge.fusion.bend.drift import sensor_drift
 from topomerge.fusion.fuse import fuse
-from topomerge.fusion.prepared import prepare
-from topomerge.fusion.registration import fine
-from topomerge.fusion.resampling import Laying
-from topomerge.types import Sim3, TopometricMap
+from topomerge.registration.bend.bend import bend
+from topomerge.registration.bend.pieces import sensor_drift
+from topomerge.registration.pipeline import fine
+from topomerge.registration.prepared import prepare
+from topomerge.types import Placement, Sim3, TopometricMap
 
 Row = dict[str, Any]
 WAYS = ("rigid", "bent")
@@ -83,7 +82,7 @@ def row_of(maker: BentMaker, name: str, factor: float) -> Row:
         began = time.process_time()
         joined = fuse((a, b), [(0, Sim3()), (1, transform)], bends)
         seconds = time.process_time() - began
-        lay = Laying.of(Sim3(), bends.get(0)).apply, Laying.of(transform, bends.get(1)).apply
+        lay = Placement.of(Sim3(), bends.get(0)).transform_points, Placement.of(transform, bends.get(1)).transform_points
         truth = joined_truth(truth_a, truth_b, right, lay)
         row[way] = {**scores(joined, truth), "doubled": doubled_walls(joined), "rooms": len(joined.rooms), "seconds": seconds}
     return row

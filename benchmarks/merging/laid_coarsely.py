@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.merging.scale_maps import ScaleMap
-from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.memory import Memory, map_key
+from topomerge.fusion.atlas.folder import read_atlas
+from topomerge.fusion.atlas.maps import Maps, Memory, map_key
 from topomerge.fusion.atlas.registration_cache import Journal
-from topomerge.fusion.atlas.stored import read_atlas
 from topomerge.io.maps import load_map
 
 

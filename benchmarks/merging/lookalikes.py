@@ -27,7 +27,7 @@ from topomerge.datasets.pairs.lookalike_places import LOOKALIKES
 from topomerge.datasets.pairs.lookalikes import LookalikeRecipe, build_lookalikes
 
 from topomerge.config import compose
-from topomerge.fusion.registration import register
+from topomerge.registration.pipeline import register
 from topomerge.training.belief_hypotheses import error, right
 
 LOOKALIKE_SETS = {"train": "lookalikes", "test": "lookalikes_heldout"}

@@ -24,8 +24,7 @@ from benchmarks.merging.laid_coarsely import held
 from benchmarks.merging.scale_maps import ScaleMap, cache_of, scale_maps
 from benchmarks.retrieval_many import SHARED
 from topomerge.evaluation.tables import write_section
-from topomerge.fusion.atlas.neighbours import most_alike
-from topomerge.fusion.atlas.partners import COARSE_PARTNERS, LIKELY_PARTNERS, MOST_PARTNERS, partners_of
+from topomerge.fusion.atlas.partners import COARSE_PARTNERS, LIKELY_PARTNERS, MOST_PARTNERS, most_alike, partners_of
 from topomerge.io.maps import load_map
 from topomerge.statistics import interval_text
 

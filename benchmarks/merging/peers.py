@@ -66,7 +66,7 @@ def target_of(what: str) -> Path:
 def ours(given: PeerPair) -> Outcome:
     """From points to the pose: cells, plans, search, verdict."""
     from topomerge.extraction.voxels import voxelise
-    from topomerge.fusion.registration import register
+    from topomerge.registration.pipeline import register
 
     pair, free = given.pair, given.pair.about.get("source") in SCALELESS
     begun = time.process_time()
@@ -83,7 +83,7 @@ def ours(given: PeerPair) -> Outcome:
 def whole(pair: GridPair) -> dict[str, float]:
     """Seconds from two clouds to the joined map and its rooms: extraction of both, and `merge` (joined even where refused)."""
     from topomerge.extraction.extract import extract
-    from topomerge.fusion.merge import merge
+    from topomerge.fusion.pipeline import merge
 
     begun = time.process_time()
     a, b = (extract(cloud(g, f), name=n) for g, f, n in zip((pair.a, pair.b), pair.free, "ab", strict=True))
@@ -99,7 +99,7 @@ def cloud(grid: VoxelGrid, free: VoxelGrid | None = None) -> PointCloud:
 
 def learned(pair: GridPair) -> Outcome:
     """`merge` of the extracted maps: rooms matched by the embedder that ships propose poses, too."""
-    from topomerge.fusion.merge import merge
+    from topomerge.fusion.pipeline import merge
 
     maps = pair.about["evaluation_pair"].maps()  # type: ignore[attr-defined]
     begun = time.process_time()

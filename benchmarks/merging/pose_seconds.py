@@ -24,8 +24,8 @@ from benchmarks.speed.merge_growth import TURNED_POSE, two_maps
 from topomerge.embedding.learned import load_embedder
 from topomerge.evaluation.tables import write_section
 from topomerge.extraction.extract import extract
-from topomerge.fusion.registration import register
 from topomerge.matching.match import match
+from topomerge.registration.pipeline import register
 from topomerge.types import TopometricMap
 
 SIZES_TIMED = (20, 200, 1000)  # rooms of the floor, of which each map shows three quarters

@@ -24,8 +24,8 @@ from topomerge.datasets.real.cached_grids import real_grid_pairs
 
 from benchmarks.merging.cached_pairs import buildings_of, hard_of, pair_files, places_of
 from benchmarks.real_data import real_data
-from topomerge.fusion.registration import Registration, register
 from topomerge.metrics import on_storey
+from topomerge.registration.pipeline import Registration, register
 from topomerge.training.belief_hypotheses import error, kind_of, right
 from topomerge.types import Array, Sim3
 

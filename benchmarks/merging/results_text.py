@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from topomerge.fusion.verify import model
+from topomerge.registration.verify import model
 
 THRESHOLD = float(model()["threshold"])
 COMMANDS = (

@@ -32,12 +32,11 @@ from benchmarks.merging.atlas import RIGHT
 from benchmarks.merging.scale_maps import SCALE_CACHE, ScaleMap, scale_maps
 from topomerge.fusion.atlas import partners, store
 from topomerge.fusion.atlas import solve as solver
-from topomerge.fusion.atlas.assembly import Assembler
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.pose_difference import pose_difference
+from topomerge.fusion.pose_graph import Assembler
 from topomerge.io.maps import load_map
-from topomerge.matching.poses import PoseHypothesis
+from topomerge.matching.poses import PoseHypothesis, pose_difference
 from topomerge.types import Sim3, TopometricMap
 from topomerge.viz.atlas_report import atlas_html
 

@@ -25,8 +25,8 @@ from topomerge.datasets.pairs.grid_pairs import load_grids
 
 from benchmarks.merging.cached_pairs import buildings_of, hard_of, pair_files, places_of
 from benchmarks.merging.register import SCALELESS, real_pairs
-from topomerge.fusion.prepared import Prepared, prepare
-from topomerge.fusion.registration import Registration, register
+from topomerge.registration.pipeline import Registration, register
+from topomerge.registration.prepared import Prepared, prepare
 from topomerge.types import VoxelGrid
 
 Row = dict[str, Any]

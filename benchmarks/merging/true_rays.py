@@ -24,9 +24,9 @@ from topomerge.datasets.pairs.scan_items import draw_difficulty
 from benchmarks.extraction.tables import replace_section
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.fusion.registration import register
 from topomerge.matching.poses import wrapped
 from topomerge.metrics import pose_right
+from topomerge.registration.pipeline import register
 from topomerge.training.belief_hypotheses import RIGHT_POSE
 from topomerge.types import Sim3
 

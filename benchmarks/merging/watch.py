@@ -24,8 +24,7 @@ from topomerge.datasets.pairs.pairs import draw_frames
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.fusion.atlas import solve as solver
-from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.memory import map_key
+from topomerge.fusion.atlas.maps import Maps, map_key
 from topomerge.fusion.atlas.store import add
 from topomerge.fusion.atlas.watch import Reader, Watch
 from topomerge.io.maps import load_map, save_map

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from topomerge.fusion.registration import register
+from topomerge.registration.pipeline import register
 from topomerge.types import Array, Sim3, VoxelGrid
 
 CELL_EDGE, CEILING_CELLS = 0.1, 27  # m, cells from floor to ceiling

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.speed.bench import line
 from topomerge.evaluation.tables import write_section
-from topomerge.fusion.atlas.neighbours import nearest
+from topomerge.fusion.atlas.partners import nearest
 from topomerge.fusion.atlas.rooms_index import RoomsIndex
 from topomerge.types import Array
 

@@ -10,8 +10,8 @@ import pytest
 
 from benchmarks.merging import bending_gtsam
 from topomerge.errors import InputError
-from topomerge.fusion.bend import alignment
-from topomerge.fusion.bend.graph import settle
+from topomerge.registration.bend import alignment
+from topomerge.registration.bend.graph import settle
 
 
 @cache

@@ -7,7 +7,7 @@ import importlib
 import numpy as np
 import pytest
 
-from topomerge.fusion.registration import Registration
+from topomerge.registration.pipeline import Registration
 from topomerge.types import Sim3
 
 worlds = importlib.import_module("benchmarks.merging.box_worlds")

@@ -12,9 +12,9 @@ import pytest
 import topomerge
 from tests.fusion.atlas.atlas_scenes import NAMES, office_map, stranger
 from topomerge.cli.main import main as cli
+from topomerge.fusion.atlas.folder import read_atlas
 from topomerge.fusion.atlas.registration_cache import Journal
 from topomerge.fusion.atlas.solve import solve
-from topomerge.fusion.atlas.stored import read_atlas
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -123,7 +123,7 @@ def test_what_is_stated_of_the_maps_is_heard_and_stays(run: Run, folder: Path) -
 
 def test_three_maps_are_merged(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = Journal(folder / "house", read_atlas(folder / "house").settings)  # of the same maps
-    monkeypatch.setattr("topomerge.fusion.merge.solve", lambda maps, settings, _: solve(maps, settings, made))
+    monkeypatch.setattr("topomerge.fusion.pipeline.solve", lambda maps, settings, _: solve(maps, settings, made))
     status, out, err = run("merge", "west.tmap", "east.tmap", "stranger.tmap", "-o", "merged")
     assert status == 0 and "west.tmap, east.tmap" in out and "stranger.tmap stands apart" in out and err == ""
     merge = json.loads((folder / "merged" / "merge.json").read_text())

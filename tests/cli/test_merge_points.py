@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 
 import topomerge
-from tests.fusion.bend.test_deformation import deformation
 from tests.io.test_moved_points import exact
 from tests.samples import write_e57, write_las
 from tests.scenes import two_rooms
 from tests.scenes_map import building
+from tests.types.test_deformation import deformation
 from topomerge.cli.main import main as cli
 from topomerge.cli.merge_points import point_files
-from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.result import MergeResult
 from topomerge.io.maps import save_map
-from topomerge.types import Array, Sim3, TopometricMap
+from topomerge.types import Array, Deformation, Sim3, TopometricMap
 
 POSE = Sim3(0.4, (480_000.25, 5_400_000.5, 12.125))
 BENDS = {

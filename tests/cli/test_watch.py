@@ -16,7 +16,7 @@ import pytest
 import topomerge as tm
 from tests.cli.processes import Run
 from tests.fusion.atlas.test_watch import room, state
-from topomerge.fusion.atlas.stored import read_atlas
+from topomerge.fusion.atlas.folder import read_atlas
 
 QUICK = ("--settle", "0.05", "--every", "0.05")
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row, posterior_rows, why
-from topomerge.fusion.posterior import POSTERIOR, in_words
-from topomerge.fusion.registration import Registration, register
 from topomerge.matching.poses import PoseHypothesis
+from topomerge.registration.pipeline import Registration, register
+from topomerge.registration.posterior import POSTERIOR, in_words
 from topomerge.types import Sim3
 
 FEATURES = {

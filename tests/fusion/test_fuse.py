@@ -14,9 +14,9 @@ from tests.scenes import two_rooms
 from topomerge.errors import InputError
 from topomerge.extraction.cell_means import cell_middles
 from topomerge.fusion.fuse import _JoinedCells, fuse, rooms_in_common
-from topomerge.fusion.resampling import Laying, laid_means, resampled
-from topomerge.fusion.storey_levels import extruded
-from topomerge.types import Sim3, TopometricMap, VoxelGrid
+from topomerge.fusion.resampling import laid_means, resampled
+from topomerge.registration.storeys import extruded
+from topomerge.types import Placement, Sim3, TopometricMap, VoxelGrid
 
 
 def fused(a: TopometricMap, b: TopometricMap, pose: Sim3) -> TopometricMap:
@@ -165,17 +165,17 @@ def test_the_map_with_more_points_says_where_a_wall_is():
     joined = _JoinedCells(np.zeros(3), 0.1)
     for one in (few, many):
         laid, rows = resampled(one, Sim3(), np.zeros(3), 0.1)
-        joined._add(laid, np.ones(10, np.uint32), *laid_means(one, Laying(Sim3()), rows, laid, np.zeros(3), 0.1))
+        joined._add(laid, np.ones(10, np.uint32), *laid_means(one, Placement(Sim3()), rows, laid, np.zeros(3), 0.1))
     assert np.allclose(joined.means_in_metres()[:, 1], 0.1 * 52.5 / 256, atol=4e-4) and len(joined.codes) == 10
 
 
 def test_a_cell_that_is_only_filled_says_little():
     """The wall stands at y = 0.09 of its cells; laid half a cell on, those beside them are filled, too."""
     grid = VoxelGrid.from_cells(np.array([[4, 0, 0]]), edge=0.1).with_properties(offset=np.array([[128, 230, 128]], np.uint8))
-    laying = Laying(Sim3(np.pi / 4))
-    cells, rows = resampled(grid, laying, np.zeros(3), 0.1)
-    means, points = laid_means(grid, laying, rows, cells, np.zeros(3), 0.1)
-    true = laying.apply(cell_middles(grid))[0]
+    placement = Placement(Sim3(np.pi / 4))
+    cells, rows = resampled(grid, placement, np.zeros(3), 0.1)
+    means, points = laid_means(grid, placement, rows, cells, np.zeros(3), 0.1)
+    true = placement.transform_points(cell_middles(grid))[0]
     inside = (np.floor(true / 0.1).astype(int) == cells).all(axis=1)
     assert len(cells) > 1 and inside.sum() == 1 and points[inside] == 1 and (points[~inside] < 0.05).all()
     assert np.allclose((cells[inside] + means[inside]) * 0.1, true)

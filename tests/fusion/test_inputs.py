@@ -11,9 +11,9 @@ from tests.scenes_map import building, same
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.solve import atlas
 from topomerge.fusion.inputs import check_different, check_pair, check_units, checked_threshold, loaded, pair_warnings
-from topomerge.fusion.merge import merge
-from topomerge.fusion.verify import model
+from topomerge.fusion.pipeline import merge
 from topomerge.io.maps import save_map
+from topomerge.registration.verify import model
 from topomerge.types import PointCloud, TopometricMap
 
 

@@ -11,7 +11,7 @@ import topomerge as tm
 from tests.scenes import two_rooms
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.fusion.fuse import fuse
-from topomerge.fusion.joined_odds import LEAST_COVER, with_part_odds
+from topomerge.fusion.transfer import LEAST_COVER, with_part_odds
 from topomerge.types import Sim3, TopometricMap
 
 

@@ -11,8 +11,6 @@ import pytest
 from tests.fusion.atlas.atlas_scenes import office_map, stranger
 from topomerge.cli.main import main as cli
 from topomerge.errors import InputError
-from topomerge.fusion.evidence.crops import LOOKED, SIDE, Crops
-from topomerge.fusion.evidence.places import Places
 from topomerge.fusion.match_belief import (
     BELIEF_FILE,
     BELIEF_NAMES,
@@ -23,13 +21,15 @@ from topomerge.fusion.match_belief import (
     floor_shared,
     places_of,
 )
-from topomerge.fusion.verify import PLACE_AREA
 from topomerge.io.maps import save_map
 from topomerge.io.weight_files import VARIABLE
 from topomerge.matching.consistency import matches_under
 from topomerge.matching.match import match
 from topomerge.matching.result import Matching
 from topomerge.matching.room_plans import room_plans
+from topomerge.registration.evidence.crops import LOOKED, SIDE, Crops
+from topomerge.registration.evidence.places import Places
+from topomerge.registration.verify import PLACE_AREA
 from topomerge.types import Sim3
 
 

@@ -292,7 +292,7 @@ def test_maps_with_one_room_or_none_are_tried(stranger):
 @pytest.fixture
 def remembered(monkeypatch):
     """Merging makes no registration twice."""
-    monkeypatch.setattr("topomerge.fusion.merge.solve", lambda maps, settings, _: solve(maps, settings, REGISTRATIONS))
+    monkeypatch.setattr("topomerge.fusion.pipeline.solve", lambda maps, settings, _: solve(maps, settings, REGISTRATIONS))
 
 
 def test_three_maps_are_merged_by_an_atlas(tmp_path, remembered):

@@ -9,7 +9,7 @@ import pytest
 from topomerge.datasets.real import office_floor, sources
 
 from topomerge.extraction.extract import extract
-from topomerge.fusion.registration import register
+from topomerge.registration.pipeline import register
 
 
 @pytest.mark.slow  # of simulated maps: test_registration

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.fusion.single_walls import copies
+from topomerge.fusion.resampling import copies
 from topomerge.types import Array
 
 UP = range(0, 26)

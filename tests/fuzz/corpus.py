@@ -57,7 +57,7 @@ def read_bag(path: Path) -> int:
 
 def read_map(path: Path) -> int:
     """Read a map, what `topomerge info` prints of it, and how the maps that it was joined of were bent."""
-    from topomerge.fusion.bend.placement import bends_of
+    from topomerge.fusion.result import bends_of
     from topomerge.io.listing import json_text, map_to_json, map_to_text
     from topomerge.io.maps import load_map
 
@@ -81,7 +81,7 @@ def read_plans(path: Path) -> int:
 
 def read_atlas(path: Path) -> int:
     """Read the listing of an atlas."""
-    from topomerge.fusion.atlas.stored import read_atlas
+    from topomerge.fusion.atlas.folder import read_atlas
 
     return len(read_atlas(path.parent).entries)
 
@@ -121,10 +121,10 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     """Name -> file, in a folder: those of `samples`, and pictures, a map and a folded scene."""
     from PIL import Image
 
-    from tests.fusion.bend.test_deformation import deformation
-    from topomerge.fusion.bend.placement import Placement, with_bends
+    from tests.types.test_deformation import deformation
+    from topomerge.fusion.result import with_bends
     from topomerge.io.maps import save_map
-    from topomerge.types import Sim3
+    from topomerge.types import Placement, Sim3
 
     found = samples.write_all(folder)
     pgm = found["plan.yaml"].with_suffix(".pgm")
@@ -137,7 +137,7 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     found["text.pgm"].write_text("P2\n8 6\n255\n" + " ".join(str(v) for v in np.tile([0, 205, 254], 16)) + "\n")
     found["map.tmap"] = folder / "map.tmap"
     turn = deformation(np.tile([0.1, 0.0, 0.01, 0.0], (4, 1)))
-    save_map(with_bends(building(2, 2), [Placement(1, "b.ply", Sim3(0.3), turn)]), found["map.tmap"])
+    save_map(with_bends(building(2, 2), {1: Placement(Sim3(0.3), turn)}, ["a.ply", "b.ply"]), found["map.tmap"])
     found["plain.npz"] = folder / "plain.npz"
     np.savez(found["plain.npz"], points=samples.box_points(50), poses=np.eye(4)[None], pose_of=np.zeros(50, np.int32))
     return found | write_walks(folder) | write_plans(folder) | write_embedder(folder) | write_atlas(folder)

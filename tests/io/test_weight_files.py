@@ -10,9 +10,9 @@ import pytest
 
 from topomerge.errors import InputError
 from topomerge.extraction.plans.door_classifier import read_classifier
-from topomerge.fusion.verify import model
 from topomerge.io.weight_files import VARIABLE, weights_file
 from topomerge.matching.odds import hypothesis_probability
+from topomerge.registration.verify import model
 
 EVIDENCE = np.array([[30.0, 1.0, 40.0], [3.0, 1.0, 2.0]])
 

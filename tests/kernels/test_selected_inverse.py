@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from topomerge.fusion.bend.graph import _factor, _inverse_of
 from topomerge.kernels.bend import shifted_sums
+from topomerge.registration.bend.graph import _factor, _inverse_of
 
 
 @pytest.mark.parametrize("count", [1, 5, 60, 300])

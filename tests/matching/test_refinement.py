@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tests.fusion.plans_of import MOVE, grid_of, off, office
-from topomerge.fusion.storey_plan import plans
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.refinement import refine, storeys_at
+from topomerge.registration.storeys import plans
 from topomerge.types import Sim3
 
 
@@ -23,3 +23,10 @@ def test_near_poses_end_as_one_and_a_wrong_height_is_left_out():
     assert len(moved) == 1 and moved[0].from_rooms and 0.5 < moved[0].score <= 1
     assert off(moved[0].transform, true, middle)[0] < 0.1
     assert storeys_at(a, b, z) and not storeys_at(a, b, z + 5.0)
+
+
+def test_a_plan_has_the_direction_of_its_walls() -> None:
+    for degrees in (0.0, 20.0, 67.5):
+        (plan,) = plans(grid_of(office().points(), Sim3(np.radians(degrees))))
+        apart = (np.degrees(PlanFields(plan).main_direction) - degrees + 45) % 90 - 45  # along the walls or across
+        assert abs(apart) <= 1.0

@@ -8,7 +8,7 @@ import pytest
 from tests.matching.turned_maps import turned
 from tests.scenes_map import building
 from topomerge import load_embedder
-from topomerge.fusion.merge import merge
+from topomerge.fusion.pipeline import merge
 from topomerge.matching.match import match
 from topomerge.matching.unknown_scale import COARSE_SCALES, odds_at_best_scale
 

@@ -31,12 +31,12 @@ from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
 from topomerge.extraction.plans.plan_network import weights as plan_weights
 from topomerge.extraction.room_odds import room_weights
-from topomerge.fusion.evidence.network import weights as place_weights
 from topomerge.fusion.match_belief import belief_weights
-from topomerge.fusion.verify import model
 from topomerge.io.weight_files import VARIABLE, read_weights_json, weights_file
 from topomerge.matching.odds import odds_weights
 from topomerge.matching.room_matcher import matcher_weights
+from topomerge.registration.evidence.network import weights as place_weights
+from topomerge.registration.verify import model
 from topomerge.training import (
     door_classification,
     place_evidence,

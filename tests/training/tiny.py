@@ -19,10 +19,10 @@ from topomerge.extraction.elevations.elevation import ALONG, BANDS, DEPTHS, FACE
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.room_features import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
-from topomerge.fusion.evidence.crops import LOOKED, SIDE
 from topomerge.fusion.match_belief import BELIEVED_METHODS
 from topomerge.io import archive
 from topomerge.matching.odds import hypothesis_features
+from topomerge.registration.evidence.crops import LOOKED, SIDE
 from topomerge.training.feature_scale import PairFeatures
 from topomerge.training.match_belief import MatchRows
 from topomerge.training.match_odds import Evidence

@@ -8,11 +8,10 @@ import numpy as np
 
 import topomerge as tm
 from tests.fusion.plans_of import MOVE, office, part
-from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.fuse import fuse, rooms_in_common
-from topomerge.fusion.registration import Registration
 from topomerge.fusion.result import MergeResult, RoomMatch
-from topomerge.types import Array, Sim3
+from topomerge.registration.pipeline import Registration
+from topomerge.types import Array, Deformation, Sim3
 
 POSE = MOVE.inverse()
 SWAY = 0.4  # m, by which the second half is bowed to either side

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.fusion.bend.test_deformation import deformation
 from tests.scenes_map import building
+from tests.types.test_deformation import deformation
 from tests.viz import test_report as report
 from tests.viz.bent_merge import SWAY, bent_merge
-from topomerge.fusion.bend.placement import Placement
-from topomerge.fusion.result import MergeResult
+from topomerge.fusion.result import MergeResult, Placement
 from topomerge.types import Sim3
 from topomerge.viz.bend_plan import PieceShifts, arrow_factor, arrows, bend_table, bent_path
 from topomerge.viz.merge_report import merge_html
@@ -92,7 +91,7 @@ def test_arrows_stand_on_their_storey_and_are_not_too_many() -> None:
 
 
 def test_the_table_names_the_largest(merged: MergeResult) -> None:
-    places = [Placement(0, "a.ply", Sim3()), Placement(1, "b.ply", Sim3(), merged.bends[1])]
+    places = [Placement(Sim3()), Placement(Sim3(), merged.bends[1])]
     words = re.sub("<[^>]*>", "|", bend_table(places, ("a", "b"), ("a", None)))
     shifts = PieceShifts.of(merged.bends[1])
     room = int(shifts.room[shifts.length.argmax()])

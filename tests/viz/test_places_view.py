@@ -11,8 +11,8 @@ from PIL import Image
 
 import topomerge as tm
 from tests.fusion.plans_of import office
-from topomerge.fusion.evidence.crops import LOOKED, PARTS, SIDE, Crops
-from topomerge.fusion.evidence.places import Places
+from topomerge.registration.evidence.crops import LOOKED, PARTS, SIDE, Crops
+from topomerge.registration.evidence.places import Places
 from topomerge.viz.merge_plan import laid_alike
 from topomerge.viz.places_view import (
     AGAINST,

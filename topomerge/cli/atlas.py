@@ -26,8 +26,8 @@ from topomerge.cli.options import (
 from topomerge.errors import InputError
 
 if TYPE_CHECKING:
+    from topomerge.fusion.atlas.partners import Workers
     from topomerge.fusion.atlas.result import AtlasResult
-    from topomerge.fusion.atlas.workers import Workers
 
 
 ROOMS_SHOWN = 8  # pairs of rooms of a map that `find` prints
@@ -46,8 +46,8 @@ def atlas_command(args: argparse.Namespace) -> int:
 
 
 def _add(args: argparse.Namespace) -> int:
+    from topomerge.fusion.atlas.folder import check_folder
     from topomerge.fusion.atlas.store import add
-    from topomerge.fusion.atlas.stored import check_folder
     from topomerge.viz.atlas_report import atlas_html
 
     if not args.items:
@@ -62,7 +62,7 @@ def _add(args: argparse.Namespace) -> int:
 
 def _workers(args: argparse.Namespace) -> Workers | None:
     """Who registers pairs: None is this process."""
-    from topomerge.fusion.atlas.workers import cluster, processes
+    from topomerge.fusion.atlas.partners import cluster, processes
 
     if args.cluster and args.jobs > 1:
         raise InputError("--cluster and --jobs: give one of them; the workers of a cluster are its own")
@@ -70,8 +70,8 @@ def _workers(args: argparse.Namespace) -> Workers | None:
 
 
 def _remove(args: argparse.Namespace) -> int:
+    from topomerge.fusion.atlas.folder import read_atlas
     from topomerge.fusion.atlas.store import remove
-    from topomerge.fusion.atlas.stored import read_atlas
     from topomerge.viz.atlas_report import atlas_html
 
     if not args.items:
@@ -113,7 +113,7 @@ def _report(result: AtlasResult, args: argparse.Namespace) -> int:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from topomerge.fusion.atlas.stored import read_atlas
+    from topomerge.fusion.atlas.folder import read_atlas
 
     if args.items:
         raise InputError(f"{args.items[0]}: list takes the folder only")

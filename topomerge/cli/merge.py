@@ -81,7 +81,7 @@ def _check_choices(args: argparse.Namespace) -> None:
         InputError: the line begins with the option.
     """
     from topomerge.fusion.inputs import check_poses
-    from topomerge.fusion.thesis.fpfh import check_open3d
+    from topomerge.registration.surfaces import check_open3d
 
     check_cloud_options(args.inputs, args)
     check_descriptor(args)

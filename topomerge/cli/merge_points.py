@@ -84,7 +84,7 @@ def _write(result: MergeResult, k: int, path: Path, args: argparse.Namespace) ->
         own_frame, progress = place.pose == Sim3() and is_level(levelling), bars.task("points")
 
         def move(points: np.ndarray) -> np.ndarray:
-            moved: np.ndarray = place.apply(points if is_level(levelling) else transformed(levelling, points))
+            moved: np.ndarray = place.transform_points(points if is_level(levelling) else transformed(levelling, points))
             return moved
 
         done = save_moved(args.inputs[k], path, move, _middle(result, k), same_frame=own_frame, progress=progress, **options)

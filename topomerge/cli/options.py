@@ -168,7 +168,7 @@ ATLAS_OPTIONS = (
         help="also try the poses that matched rooms propose; takes twice as long (default: walls only)",
     ),
 )
-SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of fusion/bend/drift.json
+SENSORS = ("tls", "lidar", "depth", "tablet", "laser2d", "drawing")  # those of registration/bend/drift.json
 CONTEXT_STEPS = option("--k", type=count, default=0, metavar="K", help="steps of context around each room (default 0)")
 CLOUD_OPTIONS = (
     option("--voxel-size", type=above_zero, metavar="E", help="edge length of the cells of a cloud, m (default 0.1)"),

@@ -99,7 +99,7 @@ def _rerun_log(args: argparse.Namespace) -> RerunLog | None:
 
 
 def _summary(watch: Watch) -> str:
-    from topomerge.fusion.atlas.stored import check_folder
+    from topomerge.fusion.atlas.folder import check_folder
 
     counts, held = watch.counts, len(check_folder(watch.atlas).entries)
     parts = [f"{counts[what]} {what}" for what in ("added", "replaced", "unreadable") if counts[what]] or ["nothing new"]

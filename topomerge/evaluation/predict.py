@@ -22,14 +22,14 @@ from topomerge.errors import InputError
 from topomerge.evaluation.describe import Inputs, Maps, described, trained
 from topomerge.evaluation.settings import Evaluation, Variant, variants
 from topomerge.fusion.match_belief import believed_matches
-from topomerge.fusion.merge import merge
-from topomerge.fusion.registration import Registration, register
+from topomerge.fusion.pipeline import merge
 from topomerge.fusion.result import RoomMatch
-from topomerge.fusion.verify import model
 from topomerge.io import archive
 from topomerge.io.listing import plain
 from topomerge.matching.costs import descriptor_costs
 from topomerge.matching.match import match
+from topomerge.registration.pipeline import Registration, register
+from topomerge.registration.verify import model
 from topomerge.types import Array
 
 WALLS_ALONE = "walls alone"  # way of merging

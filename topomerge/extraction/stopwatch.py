@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 Progress = Callable[[float, str], None]  # share of the work that is done, what is being done
 
 
 class Stopwatch:
-    """Measures steps that follow one another: each ends where the next one begins."""
+    """Measures steps: such as follow one another (`begin`, `end`; or `lap`), and such as come again and again (`measure`)."""
 
     def __init__(self, progress: Progress | None = None) -> None:
         self.seconds: dict[str, float] = {}
         self.progress = progress
         self._step: str | None = None
-        self._began = 0.0
+        self.started = self._lap = self._began = time.perf_counter()
 
     def begin(self, step: str, done: float) -> None:
         """A step begins, at which this share of all work is done."""
@@ -30,6 +31,19 @@ class Stopwatch:
             self.seconds[self._step] = round(time.perf_counter() - self._began, 4)
         self._step = None
         return self.seconds
+
+    def lap(self, step: str) -> None:
+        """Add the seconds since the last lap, or since the stopwatch was made, to a step."""
+        now = time.perf_counter()
+        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._lap
+        self._lap = now
+
+    @contextmanager
+    def measure(self, step: str) -> Iterator[None]:
+        """Add the seconds of a block to a step."""
+        began = time.perf_counter()
+        yield
+        self.seconds[step] = self.seconds.get(step, 0.0) + time.perf_counter() - began
 
     def part(self, begin: float, end: float) -> Progress | None:
         """News from within a step that takes the work from one share done to another."""

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from topomerge.fusion.posterior import POSTERIOR, WORDS, evidence_limit, in_words
-from topomerge.fusion.registration import Registration
 from topomerge.matching.poses import PoseHypothesis
+from topomerge.registration.pipeline import Registration
+from topomerge.registration.posterior import POSTERIOR, WORDS, evidence_limit, in_words
 
 Row = tuple[str, str, str]  # evidence, value, meaning
 

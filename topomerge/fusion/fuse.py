@@ -24,17 +24,22 @@ from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
-from topomerge.fusion.bend.deformation import Deformation
-from topomerge.fusion.joined_doors import laid_floor, laid_part, with_doors
-from topomerge.fusion.joined_odds import with_part_odds
-from topomerge.fusion.joined_windows import laid_fixtures, laid_windows, with_joined_fixtures, with_joined_windows
-from topomerge.fusion.resampling import Laying, decoded, encoded, laid_means, resampled
-from topomerge.fusion.single_walls import copies
-from topomerge.fusion.storey_levels import extruded
+from topomerge.fusion.resampling import copies, decoded, encoded, laid_means, resampled
+from topomerge.fusion.transfer import (
+    laid_fixtures,
+    laid_floor,
+    laid_part,
+    laid_windows,
+    with_doors,
+    with_joined_fixtures,
+    with_joined_windows,
+    with_part_odds,
+)
 from topomerge.kernels.voxelise import OFFSET_STEPS
 from topomerge.matching.consistency import matches_under
 from topomerge.matching.room_plans import room_plans
-from topomerge.types import JOINED, LEVELLED, Array, Sim3, TopometricMap, VoxelGrid, is_level
+from topomerge.registration.storeys import extruded
+from topomerge.types import JOINED, LEVELLED, Array, Deformation, Placement, Sim3, TopometricMap, VoxelGrid, is_level
 
 ALIKE_EDGES = 0.8  # ratio of edge lengths: cells of another map that are not smaller than that keep those of the first
 PROVENANCE_BITS = 32  # maps that one bit set tells apart
@@ -70,14 +75,14 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
         )
     cells = _JoinedCells(maps[poses[0][0]].grid.origin, _edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
-    layings = [Laying.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
+    placements = [Placement.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
     windows, fixtures, laid = [], [], []
     for n in order:
         map = maps[poses[n][0]]
-        cells.add_map(map, layings[n], int(first_bits[n]), parts[n].assumed and n != order[0])
-        windows.append(laid_windows(map, layings[n]))
-        fixtures.append(laid_fixtures(map, layings[n]))
-        laid.append(laid_part(map, layings[n]))
+        cells.add_map(map, placements[n], int(first_bits[n]), parts[n].assumed and n != order[0])
+        windows.append(laid_windows(map, placements[n]))
+        fixtures.append(laid_fixtures(map, placements[n]))
+        laid.append(laid_part(map, placements[n]))
     name = JOINED.join(maps[k].source or "map" for k, _ in poses)
     rooms = [part.rooms for part in laid]
     joined = _extracted(cells, min(part.neighbours for part in parts), name, rooms)
@@ -129,16 +134,16 @@ class _JoinedCells:
         self.means: Array = np.zeros((0, 3))
         self.points: Array = np.zeros(0)
 
-    def add_map(self, map: TopometricMap, laying: Laying, first_bit: int, assumed: bool) -> None:
+    def add_map(self, map: TopometricMap, placement: Placement, first_bit: int, assumed: bool) -> None:
         """Add a map; of one whose heights were assumed only what no other saw."""
         provenance = np.ones(len(map.grid), np.uint32) if map.provenance is None else map.provenance.astype(np.uint32)
-        cells, rows = resampled(map.grid, laying, self.origin, self.edge)
+        cells, rows = resampled(map.grid, placement, self.origin, self.edge)
         provenance = provenance[rows] << np.uint32(first_bit)
-        means, points = laid_means(map.grid, laying, rows, cells, self.origin, self.edge)
+        means, points = laid_means(map.grid, placement, rows, cells, self.origin, self.edge)
         if assumed and len(cells):
             added = self._contains(cells) | ~(self._surveyed(cells) | self._seen_through(cells))
             cells, provenance, means, points = cells[added], provenance[added], means[added], points[added]
-        free_cells = None if map.free is None else resampled(map.free, laying, self.origin, 2 * self.edge)[0]
+        free_cells = None if map.free is None else resampled(map.free, placement, self.origin, 2 * self.edge)[0]
         if free_cells is not None and len(self.free_codes) and len(cells):
             occupied = decoded(self.codes)
             copy_of = copies((occupied, decoded(self.free_codes)), (cells, free_cells), self.edge)
@@ -238,9 +243,11 @@ def rooms_in_common(
     """
     if not len(a.rooms) or not len(b.rooms):
         return np.zeros((0, 2), np.int64), np.zeros(0)
-    to, moved = Laying.of(Sim3(), bends[0]), Laying.of(transform, bends[1])
+    to, moved = Placement.of(Sim3(), bends[0]), Placement.of(transform, bends[1])
     bent = to.bend is not None or moved.bend is not None
-    return matches_under(transform, (room_plans(a), room_plans(b)), (lambda p: to.undo(moved.apply(p))) if bent else None)
+    return matches_under(
+        transform, (room_plans(a), room_plans(b)), (lambda p: to.invert_points(moved.transform_points(p))) if bent else None
+    )
 
 
 def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3, bend: Deformation | None = None) -> Array:
@@ -251,7 +258,7 @@ def room_of_rooms(part: TopometricMap, joined: TopometricMap, pose: Sim3, bend: 
         bend: of the part, in its own frame, before it is posed; None: rigid.
     """
     rooms = np.full(len(part.rooms), -1, np.int64)
-    floor, part_room = laid_floor(part, Laying.of(pose, bend))
+    floor, part_room = laid_floor(part, Placement.of(pose, bend))
     joined_room = rooms_at(joined, floor)
     for i in range(len(part.rooms)):
         votes = joined_room[part_room == i]

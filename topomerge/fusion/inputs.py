@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.fusion.posterior import threshold_of
-from topomerge.fusion.verify import model
 from topomerge.io.maps import load_map
+from topomerge.registration.posterior import threshold_of
+from topomerge.registration.verify import model
 from topomerge.types import TopometricMap
 
 MERGE_SCALES = ("fixed", "free")

@@ -12,15 +12,15 @@ from dataclasses import replace
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.fusion.evidence.places import MOST_ODDS, Places, places
-from topomerge.fusion.storey_plan import plans
-from topomerge.fusion.verify import PLACE_AREA
 from topomerge.io.weight_files import read_weights_json
 from topomerge.matching.consistency import common_floor
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.matching.result import Matching
 from topomerge.matching.room_plans import room_plans
 from topomerge.numpy_nn import sigmoid
+from topomerge.registration.evidence.places import MOST_ODDS, Places, places
+from topomerge.registration.storeys import plans
+from topomerge.registration.verify import PLACE_AREA
 from topomerge.types import Array, TopometricMap
 
 BELIEF_FILE = "match_belief.json"

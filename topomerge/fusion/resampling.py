@@ -6,112 +6,57 @@ map lies in it. So no cell is lost, and a turned or bent floor or wall gets no h
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from topomerge.extraction.cell_means import cell_middles
-from topomerge.fusion.bend.deformation import BETWEEN_STOREYS, Deformation
+from topomerge.kernels import copies as kernel
 from topomerge.kernels import morton
+from topomerge.kernels.lookup import build
 from topomerge.kernels.resample import filled
-from topomerge.types import Array, Sim3, VoxelGrid
+from topomerge.types import Array, Placement, Sim3, VoxelGrid
+from topomerge.types.deformation import BETWEEN_STOREYS, Deformation
 
 RESAMPLED_AT_ONCE = 200_000  # cells
 SLACK = 0.02  # of a bent cell, by which neighbours overlap: each is taken as linear by itself
-TELLABLE = 0.2  # of a cell, by which bending must move a place of a map
 JACOBIAN_STEP = 0.02  # m
 FILLED_WEIGHT = 0.01  # of the points of a cell where they only fill a neighbour of the cell that they lie in
 CODE_OFFSET = 1 << 20  # cells are counted from there, as Morton codes hold no negative ones
+COPY_REACH = 0.25  # m between a wall and its copy, at most
+AROUND = 8  # cells about the walls, of which free ones are asked for
+Seen = tuple[Array, Array]
 
 
-@dataclass(frozen=True, eq=False)
-class Laying:
-    """How a map is laid into the frame of another one: bent in its own, then posed.
-
-    Args:
-        pose: of the map in the other frame.
-        bend: None: rigid.
-    """
-
-    pose: Sim3
-    bend: Deformation | None = None
-
-    @staticmethod
-    def of(pose: Sim3, bend: Deformation | None, edge: float = 0.0) -> Laying:
-        """Bent only if the deformation moves anything, or, where cells have an `edge` of so many m, if they can tell:
-        resampling thickens walls, and what a stiff map gives way by is less than that."""
-        if bend is None or not len(bend) or not bend.moves.any():
-            return Laying(pose)
-        farthest = max(float(np.linalg.norm(f.shifts, axis=-1).max()) for f in bend.fields if f is not None)
-        return Laying(pose, bend if farthest > TELLABLE * edge else None)
-
-    def apply(self, points: Array) -> Array:
-        """Points (n, 3) of the map in the other frame."""
-        return self.pose.apply(points if self.bend is None else self.bend.apply(points))
-
-    def undo(self, points: Array) -> Array:
-        """The places (n, 3) of the map that are laid on points (n, 3) of the other frame."""
-        back = self.pose.inverse().apply(points)
-        return back if self.bend is None else self.bend.undo(back)
-
-    def linear(self, places: Array, grid: VoxelGrid) -> tuple[Array, Array]:
-        """Where bending moves the middles (n, 3) of cells of a grid, and the bending about them as `kernels.resample` wants it:
-        (n, 8), or (0, 8) where nothing is bent."""
-        if self.bend is None:
-            return places, np.zeros((0, 8))
-        bent = self.bend.apply(places)
-        steps = np.eye(3) * JACOBIAN_STEP
-        x, y, z = ((self.bend.apply(places + step) - bent)[:, :2] / JACOBIAN_STEP for step in steps)
-        area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
-        back = np.column_stack([y[:, 1], -y[:, 0], -x[:, 1], x[:, 0]]) / area[:, None]
-        lean = np.column_stack([(back[:, 2 * k : 2 * k + 2] * z).sum(axis=1) for k in (0, 1)])
-        return bent, np.column_stack([(bent - grid.origin)[:, :2] / grid.edge, back, lean])
-
-    @property
-    def stretch(self) -> float:
-        """By what factor a length in the plane grows at most, the scale of the pose apart."""
-        steep = 0.0
-        for field in self.bend.fields if self.bend is not None else ():
-            if field is not None:
-                both = [np.linalg.norm(np.diff(field.shifts, axis=k), axis=-1).max(initial=0.0) for k in (0, 1)]
-                steep = max(steep, float(max(both)) / field.step)
-        return 1.0 + 1.4143 * steep
-
-    def slant(self, edge: float) -> float:
-        """m in the plane by which the ends of a cell as high as `edge` part from its middle, between storeys that move apart."""
-        if self.bend is None or len(self.bend.floors) < 2:
-            return 0.0
-        farthest = max(float(np.linalg.norm(f.shifts, axis=-1).max()) for f in self.bend.fields if f is not None)
-        return 2 * farthest * min(edge / (2 * BETWEEN_STOREYS), 1.0)
-
-
-def resampled(grid: VoxelGrid, laying: Laying | Sim3, origin: Array, edge: float) -> tuple[Array, Array]:
+def resampled(grid: VoxelGrid, placement: Placement | Sim3, origin: Array, edge: float) -> tuple[Array, Array]:
     """Cells (n, 3) int64 of a lattice that the moved cells of a grid fill, and the row (n,) of one that does.
 
     Args:
-        laying: of the grid in the frame of the lattice.
+        placement: of the grid in the frame of the lattice.
         origin: (3,) m, corner of the lattice's cell (0, 0, 0); cells may be negative.
         edge: of the lattice's cells, m.
     """
-    laying = Laying(laying) if isinstance(laying, Sim3) else laying
+    placement = Placement(placement) if isinstance(placement, Sim3) else placement
     offset = (grid.origin - origin) / edge
     aligned = abs(grid.edge - edge) < 1e-9 and np.allclose(offset, np.round(offset), atol=1e-6)
-    if aligned and laying.bend is None and laying.pose == Sim3():
+    if aligned and placement.bend is None and placement.pose == Sim3():
         return grid.cells + np.round(offset).astype(np.int64), np.arange(len(grid))
     if not len(grid):
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
-    parts = [_filled(grid, slice(n, n + RESAMPLED_AT_ONCE), laying, origin, edge) for n in range(0, len(grid), RESAMPLED_AT_ONCE)]
+    parts = [
+        _filled(grid, slice(n, n + RESAMPLED_AT_ONCE), placement, origin, edge) for n in range(0, len(grid), RESAMPLED_AT_ONCE)
+    ]
     cells, rows = (np.concatenate(p) for p in zip(*parts, strict=True))
     _, first = np.unique(encoded(cells), return_index=True)
     return cells[first], rows[first]
 
 
-def _filled(grid: VoxelGrid, chosen: slice, laying: Laying, origin: Array, edge: float) -> tuple[Array, Array]:
+def _filled(grid: VoxelGrid, chosen: slice, placement: Placement, origin: Array, edge: float) -> tuple[Array, Array]:
     """`resampled` of some cells; cells may come twice."""
-    pose, ratio = laying.pose, laying.pose.scale * grid.edge / edge
-    wide = ratio * laying.stretch * np.sqrt(0.5) + pose.scale * laying.slant(grid.edge) / edge
+    pose, ratio = placement.pose, placement.pose.scale * grid.edge / edge
+    wide = ratio * _find_stretch(placement.bend) * np.sqrt(0.5) + pose.scale * _find_slant(placement.bend, grid.edge) / edge
     places = grid.centroids(grid.cells[chosen])
-    bent, local = laying.linear(places, grid)
+    bent, local = _linearise(placement.bend, places, grid)
     holding = np.floor((pose.apply(bent) - origin) / edge).astype(np.int64)  # the cells that the middles lie in
     back = pose.inverse().matrix
     matrix = np.column_stack([back[:3, :3] * edge, back[:3, :3] @ origin + back[:3, 3] - grid.origin]) / grid.edge
@@ -120,7 +65,40 @@ def _filled(grid: VoxelGrid, chosen: slice, laying: Laying, origin: Array, edge:
     return np.concatenate([cells, holding]), np.concatenate([rows, np.arange(len(holding))]) + chosen.start
 
 
-def laid_means(grid: VoxelGrid, laying: Laying, rows: Array, cells: Array, origin: Array, edge: float) -> tuple[Array, Array]:
+def _linearise(bend: Deformation | None, places: Array, grid: VoxelGrid) -> tuple[Array, Array]:
+    """Where bending moves the middles (n, 3) of cells of a grid, and the bending about them as `kernels.resample` wants it:
+    (n, 8), or (0, 8) where nothing is bent."""
+    if bend is None:
+        return places, np.zeros((0, 8))
+    bent = bend.apply(places)
+    steps = np.eye(3) * JACOBIAN_STEP
+    x, y, z = ((bend.apply(places + step) - bent)[:, :2] / JACOBIAN_STEP for step in steps)
+    area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
+    back = np.column_stack([y[:, 1], -y[:, 0], -x[:, 1], x[:, 0]]) / area[:, None]
+    lean = np.column_stack([(back[:, 2 * k : 2 * k + 2] * z).sum(axis=1) for k in (0, 1)])
+    return bent, np.column_stack([(bent - grid.origin)[:, :2] / grid.edge, back, lean])
+
+
+def _find_stretch(bend: Deformation | None) -> float:
+    """By what factor a length in the plane grows at most, the scale of the pose apart."""
+    steep = 0.0
+    for field in bend.fields if bend is not None else ():
+        if field is not None:
+            both = [np.linalg.norm(np.diff(field.shifts, axis=k), axis=-1).max(initial=0.0) for k in (0, 1)]
+            steep = max(steep, float(max(both)) / field.step)
+    return 1.0 + 1.4143 * steep
+
+
+def _find_slant(bend: Deformation | None, edge: float) -> float:
+    """m in the plane by which the ends of a cell as high as `edge` part from its middle, between storeys that move apart."""
+    if bend is None or len(bend.floors) < 2:
+        return 0.0
+    return 2 * bend.farthest * min(edge / (2 * BETWEEN_STOREYS), 1.0)
+
+
+def laid_means(
+    grid: VoxelGrid, placement: Placement, rows: Array, cells: Array, origin: Array, edge: float
+) -> tuple[Array, Array]:
     """(n, 3) 0..1 where in the cells of a lattice the points of moved cells lie on average, and (n,) how many points say so.
 
     The mean of a moved cell that fills a neighbour, too, lies outside of that: there its nearest place in the cell is taken, and
@@ -131,7 +109,7 @@ def laid_means(grid: VoxelGrid, laying: Laying, rows: Array, cells: Array, origi
     """
     if "offset" not in grid.properties:
         return np.full((len(cells), 3), 0.5), np.zeros(len(cells))
-    within = (laying.apply(cell_middles(grid))[rows] - origin) / edge - cells
+    within = (placement.transform_points(cell_middles(grid))[rows] - origin) / edge - cells
     inside = np.clip(within, 0, 1)
     points = np.asarray(grid.properties.get("count", np.ones(len(grid))), np.float64)[rows]
     return inside, points * np.where((inside == within).all(axis=1), 1.0, FILLED_WEIGHT)
@@ -146,3 +124,31 @@ def decoded(codes: Array) -> Array:
     """(n, 3) int64, the cells of `encoded`."""
     cells: Array = morton.decode(codes).astype(np.int64) - CODE_OFFSET
     return cells
+
+
+def copies(first: Seen, second: Seen, edge: float) -> Array:
+    """(n,) int64 row of the cell of the first map's wall of which each cell of the second map is a copy, -1 none.
+
+    Args:
+        first, second: cells (n, 3) of one lattice that a map shows, and the free cells (m, 3), twice as long, of the lattice on
+            the same corner.
+        edge: m, of a cell.
+    """
+    reach = int(COPY_REACH / edge + 1e-6)
+    flat = range(-reach, reach + 1)
+    beside = [(x, y) for x, y in product(flat, flat) if 0 < np.hypot(x, y) * edge <= COPY_REACH + 1e-6]
+    if not beside:
+        return np.full(len(second[0]), -1, np.int64)
+    offsets = np.array(sorted(beside, key=lambda o: (o[0] ** 2 + o[1] ** 2, o)), np.int64)
+    low = 2 * ((np.minimum(first[0].min(axis=0), second[0].min(axis=0)) - AROUND) // 2)
+    high = np.maximum(first[0].max(axis=0), second[0].max(axis=0)) + AROUND + 1 - low
+    tables = [_table(cells - low, high) for cells in (first[0], second[0])]
+    tables += [_table(cells - low // 2, high // 2 + 1) for cells in (first[1], second[1])]
+    return kernel.copied(np.ascontiguousarray(second[0] - low), offsets, *tables)
+
+
+def _table(cells: Array, size: Array) -> tuple[Array, Array]:
+    """`kernels.lookup` of those cells that lie in a volume of so many cells."""
+    inside = ((cells >= 0) & (cells < size)).all(axis=1)
+    x, y, z = size.tolist()
+    return build(np.ascontiguousarray(cells[inside]), (x, y, z))

@@ -2,28 +2,154 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from topomerge.fusion.atlas.contradictions import contradiction_to_json
-from topomerge.fusion.bend.deformation import Deformation
-from topomerge.fusion.bend.placement import Placement, bend_to_json, placements, with_bends
-from topomerge.fusion.evidence.places import Places
-from topomerge.fusion.registration import Registration
+from topomerge.errors import InputError
+from topomerge.fusion.atlas.pairs import contradiction_to_json
 from topomerge.io.listing import plain
 from topomerge.matching.listing import map_to_entry
-from topomerge.types import Array, Sim3, TopometricMap, between_files
+from topomerge.registration.evidence.places import Places
+from topomerge.registration.pipeline import Registration
+from topomerge.types import Array, Deformation, Placement, Sim3, TopometricMap, between_files
 from topomerge.writers import WRITERS
 
 if TYPE_CHECKING:
     from topomerge.fusion.atlas.result import AtlasResult
 
+BEND_PARAMETER = "bend"  # of a joined map: how the maps that it was joined of were bent
+AROUND = np.array([(1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0)]) / 2  # m: places that stand for a room without a floor
 MERGE_FORMAT = 1
 MERGE_STEPS = ("read", "extract", "embed", "match", "fuse")
+
+
+@dataclass(frozen=True, eq=False)
+class RoomMoves:
+    """By how much bending moves each of the R rooms of a map, in the map's own frame.
+
+    Args:
+        centre: (R, 2) m, the middle of each room's floor.
+        shift: (R, 2) m, of that middle.
+        turn: (R,) rad.
+        covariance: (R, 3, 3) of shift and turn, m and rad: the mean of those of the room's pieces, which is not below that of
+            their mean; nan where nothing says how sure they are.
+    """
+
+    centre: Array
+    shift: Array
+    turn: Array
+    covariance: Array
+
+
+def room_moves(map: TopometricMap, bend: Deformation) -> RoomMoves:
+    """The rigid move that fits the bending of each room's floor best (least squares)."""
+    count = len(map.rooms)
+    inside = map.navigable_room >= 0
+    room, places = map.navigable_room[inside], map.navigable.centroids(map.navigable.cells[inside])
+    bare = np.setdiff1d(np.arange(count), room)
+    room = np.concatenate([room, np.repeat(bare, len(AROUND))])
+    places = np.concatenate([places, (map.rooms["centroid"][bare][:, None] + AROUND).reshape(-1, 3)])
+    number = np.maximum(np.bincount(room, minlength=count), 1)[:, None]
+
+    def mean(values: Array) -> Array:
+        return np.column_stack([np.bincount(room, v, count) for v in values.T]) / number
+
+    before, after = places[:, :2], bend.apply(places)[:, :2]
+    centre, there = mean(before), mean(after)
+    p, q = before - centre[room], after - there[room]
+    dot, cross = mean(np.column_stack([(p * q).sum(axis=1), p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]])).T
+    covariance = np.full((count, 3, 3), np.nan)
+    for i in np.unique(bend.room[bend.room >= 0]):
+        of_room = bend.covariance[bend.room == i]
+        of_room = of_room[np.isfinite(of_room).all(axis=(1, 2))]
+        if i < count and len(of_room):
+            covariance[i] = of_room.mean(axis=0)
+    return RoomMoves(centre, there - centre, np.arctan2(cross, dot), covariance)
+
+
+def bend_to_json(map: TopometricMap, placement: Placement) -> dict[str, Any]:
+    """How a map was bent, as plain values: the pieces in its own frame, and each room in the joined one (docs/outputs.md)."""
+    assert placement.bend is not None
+    moves, pose = room_moves(map, placement.bend), placement.pose
+    turning = np.eye(3)
+    turning[:2, :2] = pose.matrix[:2, :2]
+    shifts = moves.shift @ turning[:2, :2].T
+    rooms = []
+    for i, turn in enumerate(moves.turn.tolist()):
+        about = Sim3(turn).apply(np.array([[*moves.centre[i], 0.0]]))[0]
+        x, y = (moves.centre[i] + moves.shift[i] - about[:2]).tolist()
+        covariance = turning @ moves.covariance[i] @ turning.T
+        rooms.append(
+            {
+                "room": i,
+                "transform": (pose @ Sim3(turn, (x, y, 0.0))).matrix.tolist(),
+                "shift_m": shifts[i].tolist(),
+                "length_m": float(np.hypot(*shifts[i])),
+                "turn_deg": float(np.degrees(turn)),
+                "covariance": covariance.tolist() if np.isfinite(covariance).all() else None,
+            }
+        )
+    return {**placement.bend.to_json(), "rooms": rooms}
+
+
+def with_bends(joined: TopometricMap, placements: Mapping[int, Placement], sources: Sequence[str]) -> TopometricMap:
+    """Let the joined map remember how the maps it was joined of were bent; as it is where all are rigid.
+
+    Args:
+        placements: k -> where map k lies in the joined frame.
+        sources: of all maps.
+    """
+    bent = [
+        {"map": k, "source": sources[k], "transform": p.pose.matrix.tolist(), "deformation": p.bend.to_json()}
+        for k, p in placements.items()
+        if p.bend is not None
+    ]
+    return replace(joined, parameters={**joined.parameters, BEND_PARAMETER: bent}) if bent else joined
+
+
+def bends_of(joined: TopometricMap) -> dict[int, Placement]:
+    """Read how the maps that a map was joined of were bent: what `with_bends` put there, also after `save_map` and `load_map`.
+
+    Returns:
+        One for each bent map, by its number; none of a map that was extracted, or joined of rigid ones.
+
+    Raises:
+        InputError: something else stands there.
+    """
+    listed = joined.parameters.get(BEND_PARAMETER, ())
+    try:
+        if not isinstance(listed, list | tuple):
+            raise ValueError("no list")
+        return dict(_placement(entry) for entry in listed)
+    except InputError as error:
+        raise InputError(f"{joined.source or 'map'}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:100]
+        raise InputError(f"{joined.source or 'map'}: damaged bending ({reason}); merge the maps again") from error
+
+
+def _placement(entry: Mapping[str, Any]) -> tuple[int, Placement]:
+    number, source = entry["map"], entry["source"]
+    if not isinstance(number, int) or isinstance(number, bool) or number < 0 or not isinstance(source, str):
+        raise ValueError(f"map {number!r}")
+    pose = Sim3.from_matrix(np.array(entry["transform"], np.float64))
+    return number, Placement(pose, Deformation.from_json(entry["deformation"]))
+
+
+def placements(transforms: Mapping[int, Sim3], bends: Mapping[int, Deformation]) -> dict[int, Placement]:
+    """Place each map that has a transform, and the first one, ascending.
+
+    Args:
+        transforms: k -> T_0k.
+        bends: k -> how map k is bent; rigid ones are left out.
+    """
+    poses = {0: Sim3(), **transforms}
+    bent = {k: bend for k, bend in bends.items() if len(bend)}
+    return {k: Placement(poses[k], bent.get(k)) for k in sorted(poses)}
 
 
 @dataclass(frozen=True)
@@ -83,7 +209,7 @@ class MergeResult:
         if self.status not in ("merged", "abstained"):
             raise ValueError(f"status must be merged or abstained, not {self.status!r}")
         if self.map is not None:  # whoever has only the joined map can bend what it was joined of, too
-            object.__setattr__(self, "map", with_bends(self.map, list(self.placements.values())))
+            object.__setattr__(self, "map", with_bends(self.map, self.placements, [m.source for m in self.maps]))
 
     @property
     def merged(self) -> bool:
@@ -93,7 +219,7 @@ class MergeResult:
     @property
     def placements(self) -> dict[int, Placement]:
         """k -> where the points of map k lie in the joined frame, of every map that is part of it; none where nothing is."""
-        return {p.map: p for p in placements(self.maps, self.transforms, self.bends)} if self.transforms else {}
+        return placements(self.transforms, self.bends) if self.transforms else {}
 
     @property
     def file_transforms(self) -> dict[int, Array]:

@@ -109,6 +109,11 @@ class PlanFields:
         """(360,) how sharply the walls line up along each direction, in steps of half a degree over half a turn."""
         return direction_profile(self.walls, self.plan.edge)
 
+    @property
+    def main_direction(self) -> float:
+        """rad in [0, pi): the direction along which the walls line up most sharply."""
+        return float(np.radians(float(self.profile.argmax()) * DIRECTION_STEP))
+
 
 def distance_to(mask: Array, edge: float) -> Array:
     """(nx, ny) float32 m from the middle of each column to the nearest masked one, at most `DISTANCE_CAP`."""

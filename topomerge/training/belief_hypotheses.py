@@ -16,18 +16,17 @@ import numpy as np
 from topomerge.datasets.core.derived import derive, read_derived
 from topomerge.datasets.pairs.grid_drawings import build_drawings
 from topomerge.datasets.pairs.grid_pairs import GridPair, GridRecipe, build_grids, load_grids
-from topomerge.fusion.candidates import candidate, repeats, rivals
-from topomerge.fusion.evidence.crops import CROP_ARRAYS, Crops
-from topomerge.fusion.evidence.network import place_log_odds, read_weights
-from topomerge.fusion.evidence.network import weights as place_weights
-from topomerge.fusion.evidence.places import Places
-from topomerge.fusion.judge import Judge
-from topomerge.fusion.prepared import prepare
-from topomerge.fusion.scale import search_scaled
-from topomerge.fusion.search import search
-from topomerge.fusion.verify import rank
 from topomerge.matching.poses import wrapped
 from topomerge.metrics import pose_right
+from topomerge.registration.evidence.crops import CROP_ARRAYS, Crops
+from topomerge.registration.evidence.network import place_log_odds, read_weights
+from topomerge.registration.evidence.network import weights as place_weights
+from topomerge.registration.evidence.places import Places
+from topomerge.registration.judge import Judge
+from topomerge.registration.pipeline import candidate, repeats, rivals
+from topomerge.registration.prepared import prepare
+from topomerge.registration.search import search, search_scaled
+from topomerge.registration.verify import rank
 from topomerge.training.task_settings import MergeBelief, PlaceEvidence
 from topomerge.training.tasks import weights_of
 from topomerge.types import Array, Sim3

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from topomerge.fusion.posterior import KINDS, PRIORS, SAME_PLAN, WRONG
 from topomerge.numpy_nn import softmax
+from topomerge.registration.posterior import KINDS, PRIORS, SAME_PLAN, WRONG
 from topomerge.training.belief_hypotheses import kind_of
 from topomerge.types import Array
 

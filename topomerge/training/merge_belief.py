@@ -16,8 +16,9 @@ import numpy as np
 
 from topomerge.datasets.pairs.evaluation_pair import sim3_of
 from topomerge.errors import InputError
-from topomerge.fusion.posterior import threshold_of
-from topomerge.fusion.verify import (
+from topomerge.matching.poses import PoseHypothesis, distinct_hypotheses
+from topomerge.registration.posterior import threshold_of
+from topomerge.registration.verify import (
     BASIN,
     BELIEF_VECTOR,
     BENT_POSE_VECTOR,
@@ -32,7 +33,6 @@ from topomerge.fusion.verify import (
     plan_vector,
     vector,
 )
-from topomerge.matching.poses import PoseHypothesis, distinct_hypotheses
 from topomerge.training.belief_floor import floor_rows
 from topomerge.training.belief_hypotheses import belief_rows, fair, kind_of
 from topomerge.training.belief_lookalikes import lookalike_rows, lookalike_scores

@@ -20,9 +20,9 @@ from torch.nn import functional
 from topomerge.datasets.core.derived import read_derived
 from topomerge.datasets.pairs.lookalikes import build_lookalikes
 from topomerge.errors import InputError
-from topomerge.fusion.evidence.network import UPPER_PLANES, network_log_odds, planes, read_weights
 from topomerge.io import archive
 from topomerge.models.place_network import PlaceNetwork, exported_weights
+from topomerge.registration.evidence.network import UPPER_PLANES, network_log_odds, planes, read_weights
 from topomerge.training.belief_hypotheses import fair, half_of, hypothesis_files, judged_files
 from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import NetworkJob, run_network

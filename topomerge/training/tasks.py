@@ -54,9 +54,9 @@ TASKS = {
     "room_odds": Task("room_odds", "RoomOdds", "topomerge.extraction", "room_odds.json", 0.5, "scan_settings"),
     "feature_scale": Task("feature_scale", "FeatureScale", "topomerge.embedding", "engineered.json", 0.3),
     "match_odds": Task("match_odds", "MatchOdds", "topomerge.matching", "odds.json", 0.3),
-    "place_evidence": Task("place_evidence", "PlaceEvidence", "topomerge.fusion.evidence", "place_network.npz", 4.0),
+    "place_evidence": Task("place_evidence", "PlaceEvidence", "topomerge.registration.evidence", "place_network.npz", 4.0),
     "match_belief": Task("match_belief", "MatchBelief", "topomerge.fusion", "match_belief.json", 0.3),
-    "merge_belief": Task("merge_belief", "MergeBelief", "topomerge.fusion", "calibration.json", 4.0),
+    "merge_belief": Task("merge_belief", "MergeBelief", "topomerge.registration", "calibration.json", 4.0),
     "embedding": Task("embedding", "", "topomerge.embedding.pretrained", "embedder.safetensors", 0.6),
     "room_matcher": Task("room_matcher", "RoomMatching", "topomerge.matching", "room_matcher.npz", 0.3),
 }

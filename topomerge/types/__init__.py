@@ -6,6 +6,7 @@ points of map b into the frame of map a. A room label of -1 means "no room".
 
 from topomerge.types.arrays import Array
 from topomerge.types.cloud import PointCloud, TrueRoom
+from topomerge.types.deformation import Deformation
 from topomerge.types.grid import VoxelGrid
 from topomerge.types.levelling import (
     LEVELLED,
@@ -16,6 +17,7 @@ from topomerge.types.levelling import (
     levelling_of,
     transformed,
 )
+from topomerge.types.placement import Placement
 from topomerge.types.similarity import Sim3
 from topomerge.types.some_rooms import confident, of_rooms
 from topomerge.types.topometric_map import (
@@ -48,6 +50,8 @@ __all__ = [
     "STOREY_DTYPE",
     "WINDOW_DTYPE",
     "Array",
+    "Deformation",
+    "Placement",
     "PointCloud",
     "Sim3",
     "TopometricMap",

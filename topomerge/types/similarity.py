@@ -8,6 +8,8 @@ import numpy as np
 
 from topomerge.types.arrays import Array, require
 
+ROUNDING = 1e-6  # by which a matrix may miss a similarity that keeps the vertical, times the size of its numbers
+
 
 @dataclass(frozen=True)
 class Sim3:
@@ -20,6 +22,21 @@ class Sim3:
     def __post_init__(self) -> None:
         values = (self.yaw, *self.translation, self.scale)
         require(all(np.isfinite(v) for v in values) and self.scale > 0, f"not a similarity: {values}")
+
+    @staticmethod
+    def from_matrix(matrix: Array) -> Sim3:
+        """Read the similarity of a (4, 4) matrix.
+
+        Raises:
+            ValueError: it is none that keeps the vertical.
+        """
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or matrix[2, 2] <= 0:
+            raise ValueError("a transform that is none")
+        x, y, z = matrix[:3, 3].tolist()
+        pose = Sim3(float(np.arctan2(matrix[1, 0], matrix[0, 0])), (x, y, z), float(matrix[2, 2]))
+        if not np.allclose(pose.matrix, matrix, rtol=0, atol=ROUNDING * max(pose.scale, 1.0)):
+            raise ValueError("a transform that is none")
+        return pose
 
     @property
     def matrix(self) -> Array:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.tiles import tile_map, tiles
+from topomerge.fusion.atlas.store import tile_map, tiles
 from topomerge.fusion.explanation import chance
 from topomerge.types import Array, Sim3, TopometricMap
 from topomerge.viz.markup import Markup, element, join

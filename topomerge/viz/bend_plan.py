@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.fusion.bend.deformation import Deformation
-from topomerge.fusion.bend.placement import Placement
-from topomerge.types import Array
+from topomerge.types import Array, Deformation, Placement
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.sheet import Sheet
 from topomerge.viz.tables import room_link

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from topomerge.fusion.bend.deformation import Deformation
-from topomerge.types import Array, Sim3, TopometricMap
+from topomerge.types import Array, Deformation, Sim3, TopometricMap
 from topomerge.viz.bend_plan import CUT_HEIGHT, PieceShifts, arrow_factor, arrows, bend_controls, bend_words, bent_path
 from topomerge.viz.markup import Markup, element
 from topomerge.viz.outline import room_outlines, wall_outline

@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.fusion.bend.placement import placements
 from topomerge.fusion.explanation import chance, evidence_rows, hypothesis_row, posterior_rows
 from topomerge.fusion.fuse import room_of_rooms
-from topomerge.fusion.registration import Registration
-from topomerge.fusion.result import MergeResult, merge_to_json
+from topomerge.fusion.result import MergeResult, merge_to_json, placements
 from topomerge.io.atomic import replacing
 from topomerge.io.listing import json_text
 from topomerge.io.maps import save_map
 from topomerge.io.palette import room_colours
 from topomerge.io.rooms_ply import save_rooms_ply
+from topomerge.registration.pipeline import Registration
 from topomerge.types import Array, Sim3
 from topomerge.viz.atlas_report import atlas_html
 from topomerge.viz.bend_plan import bend_table
@@ -105,9 +104,11 @@ def merge_html(result: MergeResult) -> str:
 
 def _bends(result: MergeResult) -> list[Markup]:
     """Of many maps: a table of how each was bent."""
-    where = list(result.placements.values()) if result.bends else []
-    names = [f"{p.map}: {Path(p.source).name or 'map'}" for p in where]
-    return [section("How the maps were bent", bend_table(where, names, [None] * len(where)), "bent")] if where else []
+    where = result.placements if result.bends else {}
+    names = [f"{k}: {Path(result.maps[k].source).name or 'map'}" for k in where]
+    return (
+        [section("How the maps were bent", bend_table(list(where.values()), names, [None] * len(where)), "bent")] if where else []
+    )
 
 
 def _verdict(result: MergeResult) -> Markup:
@@ -223,7 +224,7 @@ def _over(result: MergeResult, drawn: tuple[Drawn, Drawn], pose: Sim3) -> Markup
         words = "The best pose found for map b; it is not believed. " + words
     parts = [element("p", words, class_="note"), blend_view(a, b, drawn, pose, result.bends)]
     if result.bends:
-        where = placements(result.maps, {1: pose}, result.bends)
+        where = list(placements({1: pose}, result.bends).values())
         parts.append(element("div", element("h3", "How the maps were bent"), bend_table(where, "ab", "ab"), class_="more"))
     return section("Overlay", join(parts), "over")
 

@@ -9,11 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topomerge.fusion.evidence.crops import PARTS
-from topomerge.fusion.evidence.places import MOST_ODDS, Places
-from topomerge.fusion.joined_doors import laid_floor
-from topomerge.fusion.resampling import Laying
-from topomerge.types import Array, Sim3, TopometricMap
+from topomerge.fusion.transfer import laid_floor
+from topomerge.registration.evidence.crops import PARTS
+from topomerge.registration.evidence.places import MOST_ODDS, Places
+from topomerge.types import Array, Placement, Sim3, TopometricMap
 from topomerge.viz.markup import Markup, element, join
 from topomerge.viz.merge_plan import Drawn
 from topomerge.viz.report import plan_view, section
@@ -48,7 +47,7 @@ def places_section(a: TopometricMap, drawn: Drawn, places: Places) -> Markup:
 
 def rooms_of(map: TopometricMap, places: Places) -> Array:
     """(k,) room of a map in which each place is, -1 none."""
-    floor, room = laid_floor(map, Laying.of(Sim3(), None))
+    floor, room = laid_floor(map, Placement.of(Sim3(), None))
     inside = room >= 0
     if not inside.any() or not len(places):
         return np.full(len(places), -1, np.int64)

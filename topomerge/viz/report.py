@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from topomerge import __version__
-from topomerge.fusion.bend.placement import BEND_PARAMETER
+from topomerge.fusion.result import BEND_PARAMETER
 from topomerge.io.atomic import replacing
 from topomerge.types import Array, TopometricMap
 from topomerge.viz.markup import Markup, element, join, json_data

@@ -15,7 +15,7 @@ from tests.extraction.elevations.recesses import CUPBOARD, NICHE, niche_and_cupb
 from tests.scenes import two_rooms
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.fixtures import fixtures_in_map
-from topomerge.fusion.atlas.tiles import tile_map
+from topomerge.fusion.atlas.store import tile_map
 from topomerge.structure.plan_structure import plan_structure
 from topomerge.types import Sim3, TopometricMap, confident, of_rooms
 from topomerge.viz.report import report_html

@@ -7,11 +7,11 @@ import pytest
 
 import topomerge as tm
 from tests.fusion.atlas.altered import FRAMES, ROOM, office_parts
-from topomerge.fusion.atlas.atlas_json import contradiction_to_json
-from topomerge.fusion.atlas.contradictions import Conflict, find_conflicts, rooms_near, sum_places
-from topomerge.fusion.merge import merge
-from topomerge.fusion.pose_difference import pose_difference
-from topomerge.fusion.prepared import prepare
+from topomerge.fusion.atlas.pairs import Conflict, find_conflicts, rooms_near, sum_places
+from topomerge.fusion.atlas.store import contradiction_to_json
+from topomerge.fusion.pipeline import merge
+from topomerge.matching.poses import pose_difference
+from topomerge.registration.prepared import prepare
 from topomerge.types import Sim3
 
 NAMES = ("west", "south", "east")

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tests.fusion.atlas.votes import LIMIT, TRUE, WRONG, Pair, Votes, between, claim, odds
-from topomerge.fusion.atlas.assembly import HEAVIEST_WALLS, Assembler
 from topomerge.fusion.atlas.link_evidence import CLOSING_GAIN, Link, across
-from topomerge.fusion.atlas.pose_graph import residual
+from topomerge.fusion.pose_graph import HEAVIEST_WALLS, Assembler, residual
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 

@@ -17,9 +17,9 @@ from topomerge.embedding.turns import TurnedRows
 from topomerge.errors import InputError
 from topomerge.fusion.atlas import find as finding
 from topomerge.fusion.atlas.find import find, laid, ranked
-from topomerge.fusion.atlas.room_rows import ROOMS_FILE
+from topomerge.fusion.atlas.folder import read_atlas
+from topomerge.fusion.atlas.rooms_index import ROOMS_FILE
 from topomerge.fusion.atlas.store import add, remove
-from topomerge.fusion.atlas.stored import read_atlas
 from topomerge.io import archive
 from topomerge.viz.atlas_report import atlas_html
 

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topomerge.fusion.atlas.assembly import Assembler, Assembly
-from topomerge.fusion.atlas.map_sets import sets_of_maps
 from topomerge.fusion.atlas.pairs import Check
+from topomerge.fusion.pose_graph import Assembler, Assembly, sets_of_maps
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 

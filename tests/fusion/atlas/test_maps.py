@@ -8,8 +8,7 @@ import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map, stranger
 from topomerge.fusion.atlas import maps as atlas_maps
-from topomerge.fusion.atlas import memory
-from topomerge.fusion.atlas.memory import map_key
+from topomerge.fusion.atlas.maps import map_key
 
 
 @pytest.mark.longer
@@ -23,7 +22,7 @@ def test_keys_tell_maps_by_what_they_hold():
 @pytest.mark.longer
 def test_areas_are_remembered_of_maps_whose_plans_are_not(monkeypatch):
     prepared, prepare = [], atlas_maps.prepare
-    monkeypatch.setattr(memory, "PREPARED_AT_ONCE", 1)
+    monkeypatch.setattr(atlas_maps, "PREPARED_AT_ONCE", 1)
     monkeypatch.setattr(atlas_maps, "prepare", lambda map: prepared.append(map.source) or prepare(map))
     maps = atlas_maps.Maps([office_map(0), stranger()])
     areas = [maps.area(k) for k in (0, 1, 0, 1)]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from topomerge.embedding.turns import TurnedRows
-from topomerge.fusion.atlas import neighbours
-from topomerge.fusion.atlas.neighbours import most_alike, nearest, owners, queries, vectors, votes
+from topomerge.fusion.atlas import partners as neighbours
+from topomerge.fusion.atlas.partners import most_alike, nearest, owners, queries, vectors, votes
 from topomerge.types import Array
 
 

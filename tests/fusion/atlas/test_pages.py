@@ -18,11 +18,10 @@ import topomerge as tm
 from tests.fusion.atlas.test_watch import room
 from tests.viz.chromium import Page
 from topomerge.fusion.atlas import store
-from topomerge.fusion.atlas.maps import MapFiles, Maps
-from topomerge.fusion.atlas.memory import map_key
+from topomerge.fusion.atlas.folder import read_atlas
+from topomerge.fusion.atlas.maps import MapFiles, Maps, map_key
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.store import add, remove
-from topomerge.fusion.atlas.stored import read_atlas
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
 

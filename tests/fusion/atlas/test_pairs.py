@@ -10,11 +10,10 @@ import pytest
 
 from tests.fusion.atlas.atlas_scenes import office_map, truth
 from topomerge.fusion.atlas import pairs
-from topomerge.fusion.atlas.contradictions import Conflict
 from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.pairs import Checks, alike, hypotheses, place, score_pose
-from topomerge.fusion.registration import Registration
+from topomerge.fusion.atlas.pairs import Checks, Conflict, alike, hypotheses, place, score_pose
 from topomerge.matching.poses import PoseHypothesis
+from topomerge.registration.pipeline import Registration
 from topomerge.types import Sim3, TopometricMap
 
 

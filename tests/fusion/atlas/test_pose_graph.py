@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.fusion.atlas.pose_graph import Measured, optimise, residual
-from topomerge.fusion.pose_difference import pose_difference
+from topomerge.fusion.pose_graph import Measured, optimise, residual
+from topomerge.matching.poses import pose_difference
 from topomerge.types import Sim3
 
 PLACE = np.array([[4.0, 3.0, 0.5], [8.0, 3.0, 0.5], [0.0, 3.0, 0.5], [4.0, 6.0, 0.5], [4.0, 0.0, 0.5]])

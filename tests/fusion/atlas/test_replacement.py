@@ -13,8 +13,8 @@ from tests.fusion.atlas.atlas_scenes import FRAMES, office_map, stranger, truth
 from tests.fusion.atlas.test_watch import seen
 from tests.fusion.plans_of import office
 from topomerge.extraction.extract import extract
-from topomerge.fusion.atlas.replacement import Longer, longer_version, replaced
-from topomerge.fusion.atlas.stored import Entry, Stored, read_atlas
+from topomerge.fusion.atlas.folder import Entry, Stored, read_atlas
+from topomerge.fusion.atlas.watch import Longer, longer_version, replaced
 from topomerge.types import Sim3
 
 

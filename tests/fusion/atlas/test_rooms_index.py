@@ -16,11 +16,9 @@ from topomerge.errors import InputError
 from topomerge.fusion.atlas import find as finding
 from topomerge.fusion.atlas import rooms_index as indexing
 from topomerge.fusion.atlas.find import Sighting, find, ranked
-from topomerge.fusion.atlas.index_check import check_graph
-from topomerge.fusion.atlas.neighbours import nearest
-from topomerge.fusion.atlas.room_rows import ROOMS_FILE, embedder_signature, signed
-from topomerge.fusion.atlas.rooms_index import INDEX_FILE, LINKS, RoomsIndex
-from topomerge.fusion.atlas.stored import read_atlas
+from topomerge.fusion.atlas.folder import read_atlas
+from topomerge.fusion.atlas.partners import nearest
+from topomerge.fusion.atlas.rooms_index import INDEX_FILE, LINKS, ROOMS_FILE, RoomsIndex, check_graph, embedder_signature, signed
 from topomerge.io import archive
 from topomerge.types import Array
 

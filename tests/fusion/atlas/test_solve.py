@@ -10,13 +10,10 @@ import pytest
 import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import FRAMES, NAMES, REGISTRATIONS, office_map, stranger, truth
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.coarse import coarse_log_odds
-from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.memory import LOADED_AT_ONCE, map_key
-from topomerge.fusion.atlas.partners import COARSE_PARTNERS, partners_of
+from topomerge.fusion.atlas.maps import LOADED_AT_ONCE, Maps, map_key
+from topomerge.fusion.atlas.partners import COARSE_PARTNERS, coarse_log_odds, partners_of
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.pose_difference import pose_difference
-from topomerge.matching.poses import PoseHypothesis
+from topomerge.matching.poses import PoseHypothesis, pose_difference
 from topomerge.types import Sim3, TopometricMap
 
 SHIFTED = Sim3(0.0, (4.5, 0.0, 0.0))  # by a room

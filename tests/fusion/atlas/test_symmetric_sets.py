@@ -11,7 +11,7 @@ import topomerge as tm
 from tests.fusion.atlas.arenas import Arena, arena_maps
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import RegistrationsByPair
-from topomerge.fusion.merge import merge
+from topomerge.fusion.pipeline import merge
 from topomerge.types import Sim3
 
 SYMMETRIC = [

@@ -17,11 +17,10 @@ import topomerge as tm
 from tests.fusion.atlas.test_watch import room
 from tests.scenes_map import building
 from tests.viz.chromium import Page
-from topomerge.fusion.atlas import tiles as tiles_module
+from topomerge.fusion.atlas import store as tiles_module
 from topomerge.fusion.atlas.maps import Maps
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.store import add, remove
-from topomerge.fusion.atlas.tiles import nearest_rooms, tile_map, tiles
+from topomerge.fusion.atlas.store import add, nearest_rooms, remove, tile_map, tiles
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3, TopometricMap
 from topomerge.viz.serve import serve

@@ -19,12 +19,10 @@ from tests.fusion.atlas.atlas_scenes import NAMES, office_map, truth
 from tests.scenes import Scene
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.memory import map_key
-from topomerge.fusion.atlas.sources import SOURCES_FILE, read_sources, stamp_of
+from topomerge.fusion.atlas.folder import read_atlas
+from topomerge.fusion.atlas.maps import Maps, map_key
 from topomerge.fusion.atlas.store import add, remove
-from topomerge.fusion.atlas.stored import read_atlas
-from topomerge.fusion.atlas.watch import Reader, Watch, changes
+from topomerge.fusion.atlas.watch import SOURCES_FILE, Reader, Watch, changes, read_sources, stamp_of
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3

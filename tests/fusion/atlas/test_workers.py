@@ -18,10 +18,11 @@ import pytest
 import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import NAMES, office_map
 from topomerge.errors import InputError
-from topomerge.fusion.atlas import memory, workers
+from topomerge.fusion.atlas import maps as memory
+from topomerge.fusion.atlas import partners as workers
+from topomerge.fusion.atlas.partners import CoarseTask, lay_coarsely, register_pair
 from topomerge.fusion.atlas.registration_cache import JOURNAL_FILE, Journal
 from topomerge.fusion.atlas.store import add
-from topomerge.fusion.atlas.workers import CoarseTask, lay_coarsely, register_pair
 from topomerge.io.maps import load_map
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import TopometricMap

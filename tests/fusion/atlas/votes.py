@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.fusion.atlas.contradictions import Conflict
-from topomerge.fusion.atlas.pairs import Check
+from topomerge.fusion.atlas.pairs import Check, Conflict
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Sim3
 

@@ -22,12 +22,10 @@ from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.embedders import embedder as make_embedder
 from topomerge.embedding.turns import Rows, TurnedRows, moved_alike, way_between
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.coarse import coarse_log_odds
+from topomerge.fusion.atlas.folder import Stored, read_atlas
 from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.neighbours import VOTE_SHARPNESS, nearest, owners, queries, votes
-from topomerge.fusion.atlas.room_rows import RoomRows, embedder_signature
-from topomerge.fusion.atlas.rooms_index import rooms_index
-from topomerge.fusion.atlas.stored import Stored, read_atlas
+from topomerge.fusion.atlas.partners import VOTE_SHARPNESS, coarse_log_odds, nearest, owners, queries, votes
+from topomerge.fusion.atlas.rooms_index import RoomRows, embedder_signature, rooms_index
 from topomerge.matching.match import checked
 from topomerge.types import Array, TopometricMap
 

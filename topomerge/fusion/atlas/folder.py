@@ -11,17 +11,23 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from filelock import FileLock, Timeout
 
 from topomerge.errors import InputError
+from topomerge.fusion.atlas.solve import AtlasSettings
+from topomerge.types import Array, Sim3, between_maps, levelling_of
 
 NEW, NEXT, LOCK, GONE = ".new", ".next", ".lock", "gone.json"
 LOCK_POLL = 0.1  # s between two looks at a lock that another process holds
 log = logging.getLogger(__name__)
+ATLAS_FORMAT = 1
 
 
 @contextmanager
@@ -136,3 +142,183 @@ def link_or_copy(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:
         shutil.copyfile(source, target)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A map of the atlas.
+
+    Args:
+        key: hash of its content (`map_key`).
+        source: the file that it came from.
+        frame: its pose in the frame of the map that it replaced, for good.
+        levelling: (4, 4) that takes points of its file into its frame (`levelling_of`).
+    """
+
+    name: str
+    key: str
+    source: str
+    rooms: int
+    storeys: int
+    frame: Sim3 = field(default_factory=Sim3)
+    levelling: Array = field(default_factory=lambda: np.eye(4), compare=False)
+
+    @property
+    def file(self) -> str:
+        """Where its copy is, in the atlas."""
+        return f"maps/{self.name}.tmap"
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """What atlas.json says.
+
+    Args:
+        listing: all of it; None of an atlas that is not there yet.
+    """
+
+    folder: Path
+    entries: tuple[Entry, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=lambda: asdict(AtlasSettings()))
+    listing: Mapping[str, Any] | None = None
+
+    def files(self) -> list[str]:
+        """All that belongs to the atlas but atlas.json."""
+        kinds, components = ("map", "ply", "page", "tiles"), (self.listing or {}).get("components", [])
+        return [e.file for e in self.entries] + [name for component in components for name in files_of(component, kinds)]
+
+    def named(self, key: str) -> str | None:
+        """The name of the map with this content, None if there is none."""
+        return next((e.name for e in self.entries if e.key == key), None)
+
+    @property
+    def complete(self) -> bool:
+        """Was everything registered that could change where maps lie?"""
+        registered = (self.listing or {}).get("registered")
+        return not isinstance(registered, dict) or registered.get("complete", True) is not False
+
+    def linked(self) -> list[tuple[int, int]]:
+        """Pairs of maps, by their numbers, that hold the components together.
+
+        Raises:
+            InputError: atlas.json is damaged.
+        """
+        try:
+            pairs = [(int(i), int(j)) for i, j in (link["maps"] for link in (self.listing or {}).get("links", []))]
+            if any(not 0 <= k < len(self.entries) for pair in pairs for k in pair):
+                raise IndexError(pairs)
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+            raise self._damaged() from error
+        return pairs
+
+    def lying(self) -> dict[tuple[str, str], Sim3]:
+        """T_ij of the pairs that hold the components together, as they lie now, by the keys of both maps.
+
+        Raises:
+            InputError: atlas.json is damaged.
+        """
+        poses = self.poses()
+        pairs = ((self.entries[i], self.entries[j]) for i, j in self.linked())
+        there = ((a, b) for a, b in pairs if a.name in poses and b.name in poses)
+        return {(a.key, b.key): poses[a.name][1].inverse() @ poses[b.name][1] for a, b in there}
+
+    def _damaged(self) -> InputError:
+        return InputError(f"{self.folder / 'atlas.json'}: damaged; make the atlas again from its maps")
+
+    def poses(self) -> dict[str, tuple[int, Sim3]]:
+        """Name of each map -> its component and its pose there.
+
+        Raises:
+            InputError: atlas.json is damaged.
+        """
+        listing = self.listing or {}
+        try:
+            matrices = {int(k): np.array(t["matrix"], np.float64) for k, t in listing.get("transforms", {}).items()}
+            out = {}
+            for n, component in enumerate(listing.get("components", [])):
+                into = self.entries[component["maps"][0]].levelling
+                for k in component["maps"]:
+                    entry = self.entries[k]
+                    lying = between_maps(matrices[k], entry.levelling, into) if k in matrices else None
+                    out[entry.name] = (n, Sim3() if lying is None else Sim3.from_matrix(lying))
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+            raise self._damaged() from error
+        return out
+
+
+def read_atlas(folder: str | Path) -> Stored:
+    """What an atlas holds; a change that was interrupted is finished first.
+
+    Raises:
+        InputError: no such folder, no atlas, or damaged.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; make an atlas with `topomerge atlas add {folder} MAP ...`")
+    finished(folder)
+    return read_finished(folder)
+
+
+def read_finished(folder: Path) -> Stored:
+    """As `read_atlas`, of a folder in which no change was interrupted.
+
+    Raises:
+        InputError: no atlas, or damaged.
+    """
+    path = folder / "atlas.json"
+    if not path.exists():
+        raise InputError(f"{folder}: is no atlas (atlas.json is missing); `topomerge atlas add` makes one in a new folder")
+    try:
+        listing = json.loads(path.read_text(encoding="utf-8"))
+        if listing["format"] != ATLAS_FORMAT:
+            written = f"is of format {listing['format']!r}, this topomerge reads format {ATLAS_FORMAT}"
+            raise InputError(f"{path}: {written}; update topomerge")
+        entries = tuple(map(_entry, listing["maps"]))
+        settings = {name: listing["settings"].get(name, usual) for name, usual in asdict(AtlasSettings()).items()}
+        if any(Path(e.file).parent != Path("maps") or not isinstance(e.key, str) for e in entries):
+            raise ValueError("a map lies elsewhere")
+        stored = Stored(folder, entries, settings, listing)
+        if any(Path(name).is_absolute() or ".." in Path(name).parts for name in stored.files()):
+            raise ValueError("a file lies elsewhere")
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:120]
+        raise InputError(f"{path}: damaged ({reason}); make the atlas again from the maps in {folder / 'maps'}") from error
+    return stored
+
+
+def _entry(listed: Mapping[str, Any]) -> Entry:
+    frame = Sim3.from_matrix(np.array(listed["frame"], np.float64)) if "frame" in listed else Sim3()
+    levelling = levelling_of(listed)
+    return Entry(listed["name"], listed["key"], listed["source"], int(listed["rooms"]), int(listed["storeys"]), frame, levelling)
+
+
+def files_of(component: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
+    """The files of some kinds that a component of the listing names."""
+    named = [component[kind] for kind in kinds if kind in component]
+    return [name for one in named for name in ([one] if isinstance(one, str) else one)]
+
+
+def check_folder(folder: str | Path) -> Stored:
+    """What an atlas holds, of a new one nothing.
+
+    Raises:
+        InputError: a file, or a folder with other things in it.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; give the name of a folder")
+    if folder.is_dir():
+        finished(folder)
+    return held_by(folder)
+
+
+def held_by(folder: Path) -> Stored:
+    """As `check_folder`, of a folder in which no change was interrupted.
+
+    Raises:
+        InputError: a folder with other things in it.
+    """
+    there = folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir())
+    return read_finished(folder) if there else Stored(folder)

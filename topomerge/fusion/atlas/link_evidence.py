@@ -21,8 +21,7 @@ from itertools import product
 
 import numpy as np
 
-from topomerge.fusion.atlas.contradictions import sum_places
-from topomerge.fusion.atlas.pairs import DRIFT_LIMITS, Check, Checks, alike
+from topomerge.fusion.atlas.pairs import DRIFT_LIMITS, Check, Checks, alike, sum_places
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.types import Array, Sim3
 

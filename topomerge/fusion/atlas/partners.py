@@ -1,22 +1,244 @@
-"""Which maps of an atlas each is registered with: all others where they are few, else those on which it lies best, coarsely, of
-those that its rooms look most like."""
+"""Which maps of a set each is registered with: all others where they are few, else those on which it lies best, coarsely, of
+those that its rooms look most like. Pairs can be laid coarsely, and registered, by workers."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from topomerge.fusion.atlas.coarse import coarse_key, coarse_log_odds
-from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.atlas.neighbours import most_alike
-from topomerge.fusion.atlas.workers import CoarseTask, Workers, lay_coarsely
+from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.turns import QUARTERS, Rows, TurnedRows
+from topomerge.errors import InputError
+from topomerge.fusion.atlas.maps import Maps, Memory
+from topomerge.fusion.atlas.pairs import hypotheses
 from topomerge.fusion.inputs import FEW_MAPS
+from topomerge.matching.poses import PoseHypothesis
+from topomerge.registration.judge import Judge
+from topomerge.registration.search import search, search_scaled
+from topomerge.registration.verify import rank
+from topomerge.types import Array, Sim3
 
+VOTE_SHARPNESS = 25.0  # that a cosine is multiplied with: a room that is more alike by .1 gets twelve times the vote
+ROOM_NEIGHBOURS = 64  # rooms of the atlas that each room votes for, at each turn
+QUERIES_AT_ONCE, VECTORS_AT_ONCE = 256, 1 << 15  # that are compared at once, so that memory stays bounded: 32 MB
+NO_POSE = -30.0  # log odds where nothing can be laid on each other
+CONNECTING = 20  # s that a cluster may take to answer
+TRIES = 4  # of a pair, whose worker may die of something else
+
+Workers = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
+"""Calls a function with each task: the numbers of the tasks and what came out, as they end."""
 COARSE_PARTNERS = 40  # maps that a map's rooms look most like, on which it is laid coarsely
 MOST_PARTNERS = 5  # of these and of those that name it, the ones on which it lies best
 LIKELY_PARTNERS = 2  # that its rooms look most like, however it lies: drift spoils a coarse pose
+
+
+def vectors(rows: Rows, turns: int = 0) -> Array:
+    """(R, D), or (R, 4 D) of turned rows, in single precision and of length 1: the rooms of a map that is turned so often."""
+    flat = rows.flat(turns) if isinstance(rows, TurnedRows) else rows
+    out: Array = (flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+    return out
+
+
+def queries(rows: Rows) -> Array:
+    """(T, R, ·) `vectors` of a map at each turn, T of 4 of turned rows and else 1."""
+    return np.stack([vectors(rows, k) for k in range(QUARTERS if isinstance(rows, TurnedRows) else 1)])
+
+
+def nearest(table: Array, asked: Array, count: int = ROOM_NEIGHBOURS, but: tuple[int, int] = (0, 0)) -> tuple[Array, Array]:
+    """Rows of a table (N, D) that are most alike to each of (Q, D), and their cosines: (Q, n) each, n of count and N the less.
+
+    Exact, by products of matrices; most alike first, of equal ones the first.
+
+    Args:
+        but: first and last + 1 of rows that come after all others: those of the map that is asked for.
+    """
+    parts = [_nearest(table, asked[k : k + QUERIES_AT_ONCE], count, but) for k in range(0, len(asked), QUERIES_AT_ONCE)]
+    return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+
+def _nearest(table: Array, asked: Array, count: int, but: tuple[int, int]) -> tuple[Array, Array]:
+    rooms: Array = np.zeros((len(asked), 0), np.int64)
+    cosine: Array = np.zeros((len(asked), 0), np.float32)
+    for first in range(0, len(table), VECTORS_AT_ONCE):
+        block = asked @ table[first : first + VECTORS_AT_ONCE].T
+        block[:, max(but[0] - first, 0) : max(but[1] - first, 0)] = -2.0
+        best = _highest(block, count)
+        rooms = np.concatenate([rooms, best + first], axis=1)
+        cosine = np.concatenate([cosine, np.take_along_axis(block, best, axis=1)], axis=1)
+        best = _highest(cosine, count)
+        rooms, cosine = (np.take_along_axis(values, best, axis=1) for values in (rooms, cosine))
+    return rooms, cosine
+
+
+def _highest(values: Array, count: int) -> Array:
+    """Places of the highest values of each row, highest first."""
+    if count < values.shape[1]:
+        best = np.sort(np.argpartition(-values, count - 1, axis=1)[:, :count], axis=1)
+    else:
+        best = np.broadcast_to(np.arange(values.shape[1]), values.shape)
+    order = np.argsort(-np.take_along_axis(values, best, axis=1), axis=1, kind="stable")
+    return np.take_along_axis(best, order, axis=1)
+
+
+def votes(rooms: Array, cosine: Array, turns: int, owner: Array, maps: int) -> Array:
+    """(maps,) of the votes of a map's rooms; each has one, shared among its neighbours by how alike they are.
+
+    Args:
+        rooms: (turns * R, n) neighbours of `queries`, one turn after the other.
+        cosine: of them.
+        owner: (N,) map of each row of the table; -1: of none that counts.
+        maps: their number. A map gets the votes at the turn that gives it the most.
+    """
+    whose = owner[rooms].reshape(turns, -1, rooms.shape[1])
+    weight = np.where(whose >= 0, np.exp(VOTE_SHARPNESS * (cosine.reshape(whose.shape).astype(float) - 1)), 0.0)
+    share = weight / np.maximum(weight.sum(axis=(0, 2), keepdims=True), 1e-300)
+    out: Array = np.max([np.bincount(w[w >= 0], s[w >= 0], maps) for w, s in zip(whose, share, strict=True)], axis=0)
+    return out
+
+
+def owners(counts: Sequence[int]) -> Array:
+    """(N,) map of each room, of maps with so many rooms."""
+    return np.repeat(np.arange(len(counts)), counts)
+
+
+def most_alike(rows: Sequence[Rows], number: int) -> Iterator[tuple[int, ...]]:
+    """For each map those of the others that its rooms look most like, at most `number`, most alike first; exact.
+
+    None for a map without rooms, and none that has no room among the neighbours.
+    """
+    table = np.concatenate([vectors(of) for of in rows if len(of)] or [np.zeros((0, 1), np.float32)])
+    counts = [len(of) for of in rows]
+    owner, last = owners(counts), np.cumsum(counts).tolist()
+    for k, of in enumerate(rows):
+        if not counts[k]:
+            yield ()
+            continue
+        asked = queries(of)
+        rooms, cosine = nearest(table, asked.reshape(-1, asked.shape[2]), but=(last[k] - counts[k], last[k]))
+        score = votes(rooms, cosine, len(asked), np.where(owner == k, -1, owner), len(rows))
+        best = np.argsort(-score, kind="stable")[:number].tolist()
+        yield tuple(m for m in best if score[m] > 0)
+
+
+def coarse_key(maps: Maps, i: int, j: int) -> tuple[str, str]:
+    """Under which `Memory.coarse` holds two maps."""
+    return min(maps.keys[i], maps.keys[j]), max(maps.keys[i], maps.keys[j])
+
+
+def coarse_log_odds(maps: Maps, i: int, j: int, scale: str = "fixed") -> float:
+    """Log odds that the best rigid pose of two maps is right, seen by itself; what is in `Memory.coarse` is not made again.
+
+    Drift lowers them: of a real floor some right pairs have -7, as strangers of few rooms have.
+    """
+    pair, coarse = coarse_key(maps, i, j), maps.memory.coarse
+    if pair not in coarse:
+        first, second = sorted((maps.prepared(i), maps.prepared(j)), key=lambda m: m.order)
+        hypotheses = (search_scaled if scale == "free" else search)(first.storeys, second.storeys)
+        ranked = rank(hypotheses, Judge(first.storeys, second.storeys))
+        coarse[pair] = ranked[0].score if ranked else NO_POSE
+    return coarse[pair]
+
+
+@dataclass(frozen=True)
+class CoarseTask:
+    """Maps that shall be laid coarsely on the first of them.
+
+    Args:
+        files: `.tmap` files, that every worker can read.
+        keys: of the maps.
+        scale: as of `atlas`.
+    """
+
+    files: tuple[Path, ...]
+    keys: tuple[str, ...]
+    scale: str
+
+
+@dataclass(frozen=True)
+class PairTask:
+    """Two maps that shall be registered.
+
+    Args:
+        files, keys: as of `CoarseTask`.
+        embedder: of rooms, a name or what can be sent to another process; None where only geometry shall propose poses.
+        scale, same: as of `atlas`.
+        proposed: poses T_ij that are tried, too.
+    """
+
+    files: tuple[Path, Path]
+    keys: tuple[str, str]
+    embedder: str | Descriptor | None
+    scale: str
+    same: str
+    proposed: tuple[Sim3, ...] = ()
+
+
+@cache
+def _memory() -> Memory:
+    """Of this process: a map that comes in many pairs is prepared once."""
+    return Memory()
+
+
+def lay_coarsely(task: CoarseTask) -> tuple[float, ...]:
+    """How likely each map but the first lies on the first one (`coarse.coarse_log_odds`)."""
+    memory = _memory()
+    memory.coarse = {}  # what an earlier task found may be of another scale
+    maps = Maps(task.files, None, memory, task.keys)
+    return tuple(coarse_log_odds(maps, 0, k, task.scale) for k in range(1, len(maps)))
+
+
+def register_pair(task: PairTask) -> tuple[PoseHypothesis, ...]:
+    """Where the second map may lie in the first one (`pairs.hypotheses`)."""
+    return hypotheses(Maps(task.files, task.embedder, _memory(), task.keys), 0, 1, task.scale, task.same, task.proposed)
+
+
+def processes(jobs: int) -> Workers:
+    """So many processes of this machine."""
+    from joblib import Parallel, delayed
+
+    def run(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        parallel = Parallel(min(jobs, len(tasks)), return_as="generator_unordered", batch_size=1)
+        yield from parallel(delayed(_numbered)(work, k, task) for k, task in enumerate(tasks))
+
+    return run
+
+
+def _numbered(work: Callable[[Any], Any], number: int, task: Any) -> tuple[int, Any]:
+    return number, work(task)
+
+
+def cluster(address: str) -> Workers:
+    """The workers of a Dask scheduler, e.g. ``tcp://host:8786``. Pairs of a worker that dies are given to another one.
+
+    Raises:
+        InputError: Dask is missing, or nobody answers there.
+    """
+    try:
+        from distributed import Client, as_completed
+    except ImportError as error:
+        raise InputError("--cluster: needs Dask: pip install 'topomerge[cluster]'") from error
+
+    def run(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        try:
+            client = Client(address, timeout=CONNECTING, set_as_default=False)
+        except (OSError, ValueError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(
+                f"--cluster {address}: no scheduler answers there ({reason}); start one with `dask scheduler`"
+            ) from error
+        with client:
+            futures = client.map(work, tasks, pure=False, retries=TRIES)
+            number = {future.key: k for k, future in enumerate(futures)}
+            for future in as_completed(futures, loop=client.loop):
+                yield number[future.key], future.result()
+
+    return run
 
 
 def partners_of(
@@ -68,8 +290,8 @@ def _laid(maps: Maps, named: list[list[int]], scale: str, end: float) -> tuple[d
     that look most alike first, if time may end."""
     ranks: dict[tuple[int, int], int] = {}
     for k, of in enumerate(named):
-        for rank, m in enumerate(of):
-            ranks[_pair(k, m)] = min(rank, ranks.get(_pair(k, m), rank))
+        for place, m in enumerate(of):
+            ranks[_pair(k, m)] = min(place, ranks.get(_pair(k, m), place))
     odds: dict[tuple[int, int], float] = {}
     for i, j in sorted(ranks, key=lambda pair: ranks[pair] if np.isfinite(end) else 0) if len(maps) > 2 else ():
         if time.perf_counter() >= end:

@@ -14,9 +14,9 @@ from typing import Any
 
 from topomerge import __version__
 from topomerge.fusion.atlas.solve import RegistrationsByPair
-from topomerge.fusion.verify import model
 from topomerge.io.listing import plain
 from topomerge.matching.poses import PoseHypothesis
+from topomerge.registration.verify import model
 from topomerge.types import Sim3
 
 PAIRS_FILE, PAIRS_FORMAT = "pairs.json", 1

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.contradictions import Contradiction
 from topomerge.fusion.atlas.link_evidence import Link
 from topomerge.fusion.atlas.maps import Maps
-from topomerge.fusion.bend.deformation import Deformation
+from topomerge.fusion.atlas.pairs import Contradiction
 from topomerge.fusion.fuse import fuse
-from topomerge.types import Sim3, TopometricMap
+from topomerge.types import Deformation, Sim3, TopometricMap
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,9 @@ Maps that are added to the atlas are added to the index; when half of its rooms 
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -16,18 +17,203 @@ from typing import Any
 
 import numpy as np
 
+from topomerge.embedding.embedders import DEFAULT
+from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.turns import Rows, TurnedRows, numbers
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.index_check import check_graph
-from topomerge.fusion.atlas.neighbours import ROOM_NEIGHBOURS, owners
-from topomerge.fusion.atlas.room_rows import ADVICE, RoomRows, check_made_for, signed
-from topomerge.fusion.atlas.stored import Stored
+from topomerge.fusion.atlas.folder import Entry, Stored
+from topomerge.fusion.atlas.partners import ROOM_NEIGHBOURS, owners, vectors
 from topomerge.io import archive
+from topomerge.io.maps import load_map
+from topomerge.matching.match import checked
 from topomerge.types import Array
 
+INDEX_HEAD, GRAPH_HEAD = (
+    64,
+    40,
+)  # bytes: of the file, and of the graph: rooms, links, links at the lowest level, levels, first room
+KINDS = b"i\x17\x0e\x0f"  # inner product, eight bits a number, keys of 64 bits, links of 32 bits
+NODE = 10  # bytes of a room's key and level
+HIGHEST_LEVEL = 64
+LISTS_AT_ONCE = 1 << 14
+ROOMS_FILE, ROOMS_KIND = "rooms.npz", "file of rooms"
+ADVICE = "delete it, it is made again"
 INDEX_FILE = "rooms_index.npz"
 INDEX_FROM = 100_000  # rooms of an atlas, below which all are compared: that takes 1.5 ms a room and turn
 LINKS = 16  # of a room to others
 ADDING, SEARCHING = 64, 128  # rooms looked at on the way when one is added and when one is looked up
+
+
+def check_graph(graph: bytes, count: int, size: int, links: int) -> None:
+    """Does a graph hold vectors (count, size), and does every link lead to one of them?
+
+    Args:
+        links: most of a room at each level; at the lowest twice as many.
+
+    Raises:
+        ValueError: it does not.
+    """
+    whole = np.frombuffer(graph, np.uint8)
+    start = 8 + count * size
+    if len(whole) < start + INDEX_HEAD + GRAPH_HEAD + 2 * count or tuple(_at(whole, [0], 2)[0]) != (count, size):
+        raise ValueError("cut off, or of other vectors")
+    head = graph[start : start + INDEX_HEAD]
+    if head[:7] != b"usearch" or head[13:17] != KINDS:
+        raise ValueError("of another version; update topomerge or usearch")
+    if tuple(np.frombuffer(head[17:41], np.uint64)) != (count, 0, size) or head[41]:
+        raise ValueError("rooms are missing")
+    start += INDEX_HEAD
+    levels = np.frombuffer(graph[start + GRAPH_HEAD : start + GRAPH_HEAD + 2 * count], np.int16).astype(np.int64)
+    rooms, upper, lowest, highest, first = (int(n) for n in np.frombuffer(graph[start : start + GRAPH_HEAD], np.uint64))
+    if not count or (rooms, upper, lowest) != (count, links, 2 * links) or first >= count:
+        raise ValueError("its head is wrong")
+    if levels.min() < 0 or levels.max() > HIGHEST_LEVEL or levels[first] != highest or highest != levels.max():
+        raise ValueError("its levels are wrong")
+    sizes = NODE + 4 * (1 + lowest) + levels * 4 * (1 + upper)
+    ends = start + GRAPH_HEAD + 2 * count + np.cumsum(sizes)
+    if ends[-1] != len(whole):
+        raise ValueError("cut off")
+    nodes = ends - sizes
+    keys = _at(whole, nodes, 2)
+    if (keys[:, 1] != 0).any() or len(np.unique(keys[:, 0])) < count or keys[:, 0].max() >= count:
+        raise ValueError("keys are wrong")
+    if not np.array_equal(_at(whole, nodes + NODE - 4, 1)[:, 0] >> 16, levels):
+        raise ValueError("its levels are wrong")
+    _check_links(whole, nodes + NODE, lowest, np.ones(count, bool))
+    for level in range(1, highest + 1):
+        at = nodes[levels >= level] + NODE + 4 * (1 + lowest) + (level - 1) * 4 * (1 + upper)
+        _check_links(whole, at, upper, levels >= level)
+
+
+def _check_links(whole: Array, places: Array, most: int, there: Array) -> None:
+    """Lists at these bytes, each the number of links and then so many rooms, which must be `there` at this level."""
+    for k in range(0, len(places), LISTS_AT_ONCE):
+        lists = _at(whole, places[k : k + LISTS_AT_ONCE], 1 + most)
+        to = lists[:, 1:][np.arange(most) < lists[:, :1]]
+        if lists[:, 0].max() > most or to.max(initial=0) >= len(there) or not there[to].all():
+            raise ValueError("links lead nowhere")
+
+
+def _at(whole: Array, places: Array | list[int], count: int) -> Array:
+    """(n, count) whole numbers of 32 bits that begin at these bytes."""
+    at = np.asarray(places)[:, None] + np.arange(4 * count)
+    return np.ascontiguousarray(whole[at]).view("<u4").astype(np.int64)
+
+
+class RoomRows:
+    """Rows of all maps of an atlas. Those that the file of rooms lacks are reckoned and added to it.
+
+    Args:
+        stored: the atlas.
+        describe: its embedder.
+        signature: of the embedder.
+        like: rows of another map by the same embedder.
+
+    Raises:
+        InputError: the file is damaged, or of another embedder or atlas.
+    """
+
+    def __init__(self, stored: Stored, describe: Descriptor, signature: str, like: Rows) -> None:
+        self.path, self.entries, self._like = stored.folder / ROOMS_FILE, stored.entries, numbers(like).shape[1:]
+        self._arrays: Mapping[str, Array] | None = None  # None: they stay in the file
+        written = archive.names(self.path, ROOMS_KIND) if self.path.exists() else []
+        if written:
+            embedder = archive.read(self.path, ROOMS_KIND, ["embedder"])
+            check_made_for(self.path, embedder, signature, {e.key for e in stored.entries}, written)
+        if {e.key for e in stored.entries} | {"embedder"} != {name.removesuffix(".places") for name in written}:
+            self._arrays = self._completed(stored, describe, written)
+            with suppress(InputError):  # an atlas that may only be read is looked through all the same
+                archive.write({"embedder": signed(signature), **self._arrays}, self.path)
+
+    def _completed(self, stored: Stored, describe: Descriptor, written: Collection[str]) -> dict[str, Array]:
+        """What is written of the maps of the atlas, and what is missing."""
+        arrays = archive.read(self.path, ROOMS_KIND, _of_maps(self.entries)) if written else {}
+        made: dict[str, Array] = {}
+        for entry in self.entries:
+            places = f"{entry.key}.places"
+            if entry.key in arrays:
+                made |= {name: arrays[name] for name in (entry.key, places) if name in arrays}
+            else:
+                rows = checked(describe, load_map(stored.folder / entry.file))
+                made[entry.key] = numbers(rows).astype(np.float32)
+                made |= {places: rows.places} if isinstance(rows, TurnedRows) else {}
+        return made
+
+    def of(self, maps: Sequence[int]) -> list[Rows]:
+        """Rows of some maps, by their numbers in the atlas.
+
+        Raises:
+            InputError: the file is damaged, or does not fit a map.
+        """
+        entries = [self.entries[k] for k in maps]
+        arrays = self._read(entries)
+        return [self._rows(arrays, entry, float) for entry in entries]
+
+    def vectors(self, maps: Sequence[int]) -> Array:
+        """(N, D) `neighbours.vectors` of all rooms of some maps, one map after the other.
+
+        Raises:
+            InputError: the file is damaged, or does not fit a map.
+        """
+        entries = [self.entries[k] for k in maps if self.entries[k].rooms]
+        arrays = self._read(entries)
+        each = [vectors(self._rows(arrays, entry, np.float32)) for entry in entries]
+        return np.concatenate(each or [np.zeros((0, int(np.prod(self._like))), np.float32)])
+
+    def _read(self, entries: Sequence[Entry]) -> Mapping[str, Array]:
+        return archive.read(self.path, ROOMS_KIND, _of_maps(entries)) if self._arrays is None else self._arrays
+
+    def _rows(self, arrays: Mapping[str, Array], entry: Entry, number: type) -> Rows:
+        """What was written of a map."""
+        of, places = arrays.get(entry.key, np.zeros(0)), arrays.get(f"{entry.key}.places")
+        fits = of.ndim == (2 if places is None else 3) and len(of if places is None else places) == len(of) == entry.rooms
+        fits &= not entry.rooms or of.shape[1:] == self._like
+        if not fits or not np.isfinite(of).all() or not (places is None or np.isfinite(places).all()):
+            raise InputError(f"{self.path}: does not fit the map {entry.name}; {ADVICE}")
+        return of.astype(number) if places is None else TurnedRows(of.astype(number), places)
+
+
+def _of_maps(entries: Iterable[Entry]) -> set[str]:
+    """Names of the arrays of some maps."""
+    return {name for e in entries for name in (e.key, f"{e.key}.places")}
+
+
+def check_made_for(
+    path: Path, arrays: Mapping[str, Array], signature: str, keys: Collection[str], written: Iterable[str]
+) -> None:
+    """Is a file of this embedder, and for some of the maps with these keys?
+
+    Args:
+        arrays: of the file, `embedder` among them.
+        written: keys of the maps that it is for.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not np.array_equal(arrays.get("embedder", np.zeros(0)), signed(signature)):
+        raise InputError(f"{path}: holds rows of another embedder; {ADVICE}")
+    if not set(keys) & set(written):
+        raise InputError(f"{path}: is of another atlas; {ADVICE}")
+
+
+def signed(signature: str) -> Array:
+    """A signature as an array."""
+    return np.frombuffer(signature.encode(), np.uint8)
+
+
+def embedder_signature(name: str) -> str:
+    """What tells rows of one embedder from those of another."""
+    from topomerge.embedding.weights import SETTINGS_FILE, embedder_folder
+
+    if name == DEFAULT:
+        from importlib import resources
+
+        settings = resources.files("topomerge.embedding").joinpath("pretrained", SETTINGS_FILE).read_bytes()
+    elif Path(name).is_dir():
+        settings = (embedder_folder(name) / SETTINGS_FILE).read_bytes()
+    else:
+        settings = name.encode()
+    return hashlib.sha256(settings).hexdigest()
 
 
 @dataclass(eq=False)

@@ -16,22 +16,17 @@ import numpy as np
 
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.assembly import Assembler, Assembly
-from topomerge.fusion.atlas.contradictions import Contradiction, conflict_columns, locate_contradiction
 from topomerge.fusion.atlas.link_evidence import Link
-from topomerge.fusion.atlas.maps import Maps, bent_together
-from topomerge.fusion.atlas.memory import Facts, Memory
-from topomerge.fusion.atlas.pairs import Checks, hypotheses
-from topomerge.fusion.atlas.partners import partners_of
-from topomerge.fusion.atlas.pose_graph import residual
+from topomerge.fusion.atlas.maps import Facts, Maps, Memory, bent_together
+from topomerge.fusion.atlas.pairs import Checks, Contradiction, conflict_columns, hypotheses, locate_contradiction
+from topomerge.fusion.atlas.partners import PairTask, Workers, partners_of, register_pair
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.workers import PairTask, Workers, register_pair
-from topomerge.fusion.bend.bend import NEITHER_BENDS
-from topomerge.fusion.bend.deformation import Deformation
 from topomerge.fusion.inputs import check_cells, check_list, check_scale, check_units, link_threshold, without_rooms
-from topomerge.fusion.posterior import check_same
+from topomerge.fusion.pose_graph import Assembler, Assembly, residual
 from topomerge.matching.poses import PoseHypothesis
-from topomerge.types import Array, Sim3, TopometricMap
+from topomerge.registration.bend.bend import NEITHER_BENDS
+from topomerge.registration.posterior import check_same
+from topomerge.types import Array, Deformation, Sim3, TopometricMap
 
 SURE_LINK = 4.0  # log odds of a link, above which no further ones are looked for within its component
 ENOUGH_REGISTRATIONS = 3  # of a map, after which none within its component is made

@@ -27,25 +27,154 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.spatial import cKDTree
+
+from topomerge import __version__
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.atlas_json import atlas_to_json, component_to_json, shown_of
-from topomerge.fusion.atlas.folder import changing, link_or_copy
-from topomerge.fusion.atlas.maps import MapFiles, Maps
-from topomerge.fusion.atlas.memory import Memory, map_key
+from topomerge.fusion.atlas.folder import (
+    ATLAS_FORMAT,
+    Entry,
+    Stored,
+    changing,
+    check_folder,
+    files_of,
+    held_by,
+    link_or_copy,
+    read_atlas,
+)
+from topomerge.fusion.atlas.link_evidence import Link
+from topomerge.fusion.atlas.maps import MapFiles, Maps, Memory, map_key
+from topomerge.fusion.atlas.pairs import contradiction_to_json
+from topomerge.fusion.atlas.partners import Workers
 from topomerge.fusion.atlas.registration_cache import JOURNAL_FILE, PAIRS_FILE, Journal, registrations_to_json
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import AtlasSettings, Pace, Proposed, solve
-from topomerge.fusion.atlas.stored import Entry, Stored, check_folder, files_of, held_by, read_atlas
-from topomerge.fusion.atlas.tiles import tiles
-from topomerge.fusion.atlas.workers import Workers
-from topomerge.io.listing import json_text
+from topomerge.fusion.result import transform_to_json
+from topomerge.io.listing import json_text, plain
 from topomerge.io.maps import save_map
 from topomerge.io.rooms_ply import save_rooms_ply
-from topomerge.types import Sim3, TopometricMap
+from topomerge.types import LEVELLED, Array, Sim3, TopometricMap, between_files, is_level
 
+TILE_CELLS = 1_000_000  # cells of a tile, at most, but for a single room
+NEAREST_BY = 0.5  # m: the raster in which the nearest room is looked for
 Report = Callable[..., str]  # (atlas, joined maps, title, stamp=…, pages=…), of one of them (…, component=…, stamp=…) -> HTML
 JOINED_ON_ONE_PAGE = 4  # joined maps; of more each has a page of its own
 STAMP_FILE = "report_stamp.css"
+
+
+def component_to_json(atlas: AtlasResult, stored: Stored, n: int) -> dict[str, Any]:
+    """What atlas.json says of a component, but for its files."""
+    members = atlas.components[n]
+    digest = hashlib.sha256(__version__.encode())
+    for k in members:
+        digest.update(stored.entries[k].key.encode() + atlas.transforms[k].matrix.tobytes())
+    return {
+        "maps": list(members),
+        "names": [stored.entries[k].name for k in members],
+        "probability": round(atlas.probability(n), 4),
+        "made_of": digest.hexdigest()[:16],
+    }
+
+
+def atlas_to_json(atlas: AtlasResult, stored: Stored, components: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """atlas.json, see docs/outputs.md."""
+    into = {k: members[0] for members in atlas.components for k in members}
+    moved = sorted(k for k, first in into.items() if k != first or atlas.transforms[k] != Sim3())
+    lying = {k: between_files(atlas.transforms[k], stored.entries[k].levelling, stored.entries[into[k]].levelling) for k in moved}
+    poses = {str(k): transform_to_json(atlas.transforms[k], atlas.residuals[k], lying[k], into[k]) for k in moved}
+    maps = [
+        {"name": e.name, "file": e.file, "key": e.key, "source": e.source, "rooms": e.rooms, "storeys": e.storeys}
+        | ({} if e.frame == Sim3() else {"frame": e.frame.matrix.tolist()})
+        | ({} if is_level(e.levelling) else {LEVELLED: e.levelling.tolist()})
+        for e in stored.entries
+    ]
+    listing = {
+        "format": ATLAS_FORMAT,
+        "status": atlas.status,
+        "reason": atlas.words(),
+        "settings": dict(stored.settings),
+        "maps": maps,
+        "components": components,
+        "transforms": poses,
+        "links": [_link(link) | {"probability": round(link.probability, 4)} for link in atlas.links],
+        "thrown_out": [_link(link) | {"against": link.against} for link in atlas.rejected],
+        "contradictions": [contradiction_to_json(c) for c in atlas.contradictions],
+        "registered": {"pairs": atlas.registered[0], "of": atlas.registered[1], "complete": atlas.complete},
+        "seconds": round(atlas.seconds, 3),
+    }
+    plain_listing: dict[str, Any] = plain(listing)
+    return plain_listing
+
+
+def _link(link: Link) -> dict[str, Any]:
+    return {"maps": link.maps, "by_itself": round(link.hypothesis.probability, 4)}
+
+
+def shown_of(atlas: AtlasResult, n: int, component: Mapping[str, Any], title: str) -> str:
+    """A hash of all that the page of a component shows."""
+    members = set(atlas.components[n])
+    links = [x for x in (*atlas.links, *atlas.rejected) if members & {*x.maps}]
+    named = [[atlas.names[k] for k in (*x.maps, *(x.against or ()))] for x in links]
+    odds = [[repr(x.hypothesis.probability), repr(x.log_odds)] for x in links]
+    missed = [repr(atlas.residuals.get(k)) for k in sorted(members)]
+    differing = [contradiction_to_json(c) for c in atlas.contradictions if members & {*c.maps}]
+    content = [title, n, component["maps"], component["names"], component["made_of"], missed, named, odds, differing]
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def tiles(map: TopometricMap) -> list[Array]:
+    """The rooms of each tile, ascending; every room is in one. A map without rooms is one tile."""
+    size = np.bincount(nearest_rooms(map), minlength=len(map.rooms)) if len(map.rooms) else np.zeros(0, np.int64)
+    parts, small = [np.arange(len(map.rooms))], []
+    while parts:
+        rooms = parts.pop()
+        if len(rooms) < 2 or size[rooms].sum() <= TILE_CELLS:
+            small.append(rooms)
+            continue
+        middle = map.rooms["centroid"][rooms, :2]
+        order = np.argsort(middle[:, np.argmax(np.ptp(middle, axis=0))], kind="stable")
+        below = np.cumsum(size[rooms][order])
+        half = int(np.clip(np.searchsorted(below, below[-1] / 2), 1, len(rooms) - 1))
+        parts += [np.sort(rooms[order[half:]]), np.sort(rooms[order[:half]])]
+    return small
+
+
+def nearest_rooms(map: TopometricMap) -> Array:
+    """(n,) room of each occupied cell; of those without one that of the nearest cell with one, from above. 0 where none has."""
+    owner = map.room.astype(np.int64)
+    inside = owner >= 0
+    if inside.all() or not inside.any():
+        return np.maximum(owner, 0)
+    step = max(round(NEAREST_BY / map.grid.edge), 1)
+    squares, first = np.unique(map.grid.cells[inside, :2] // step, axis=0, return_index=True)
+    others, square = np.unique(map.grid.cells[~inside, :2] // step, axis=0, return_inverse=True)
+    near = cKDTree(squares).query(others)[1][square.ravel()]
+    owner[~inside] = owner[inside][first][near]
+    return owner
+
+
+def tile_map(map: TopometricMap, rooms: Sequence[int] | Array) -> TopometricMap:
+    """The map with nothing but what belongs to some of its rooms, which keep their numbers."""
+    mine = np.zeros(max(len(map.rooms), 1), bool)
+    mine[np.asarray(rooms, np.int64)] = True
+    mine |= not len(map.rooms)
+    cells, floor = mine[nearest_rooms(map)], (map.navigable_room >= 0) & mine[np.maximum(map.navigable_room, 0)]
+    assert map.navigable_area is not None
+    return replace(
+        map,
+        grid=map.grid.subset(cells),
+        room=map.room[cells],
+        provenance=None if map.provenance is None else map.provenance[cells],
+        navigable=map.navigable.subset(floor),
+        navigable_room=map.navigable_room[floor],
+        navigable_area=map.navigable_area[floor],
+        edges=map.edges[mine[map.edges["rooms"]].any(axis=1)] if len(map.edges) else map.edges,
+        narrows=map.narrows[mine[map.areas["room"][map.narrows["rooms"]]].any(axis=1)] if len(map.narrows) else map.narrows,
+        windows=map.windows[mine[map.windows["rooms"][:, 0]]] if len(map.windows) else map.windows,
+        fixtures=map.fixtures[mine[map.fixtures["room"]]] if len(map.fixtures) else map.fixtures,
+        free=None,
+    )
 
 
 @dataclass(frozen=True)

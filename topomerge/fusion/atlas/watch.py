@@ -6,30 +6,173 @@ Maps and what is noted of their files are written in one change of the atlas: wh
 
 from __future__ import annotations
 
+import hashlib
+import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from topomerge.errors import InputError
-from topomerge.fusion.atlas.folder import changing
-from topomerge.fusion.atlas.memory import Memory
-from topomerge.fusion.atlas.replacement import Longer, longer_version, replaced
+from topomerge.fusion.atlas.folder import Entry, Stored, changing, check_folder, held_by
+from topomerge.fusion.atlas.maps import Memory
 from topomerge.fusion.atlas.result import AtlasResult
-from topomerge.fusion.atlas.sources import SOURCES_FILE, Source, beside_clouds, digest_of, read_sources, sources_to_json, stamp_of
+from topomerge.fusion.atlas.solve import Proposed
 from topomerge.fusion.atlas.store import Change, Report, change, entry_of
-from topomerge.fusion.atlas.stored import Stored, check_folder, held_by
-from topomerge.fusion.inputs import check_cells, check_units
+from topomerge.fusion.fuse import rooms_in_common
+from topomerge.fusion.inputs import check_cells, check_units, link_threshold
+from topomerge.io.listing import json_text
 from topomerge.io.maps import load_map
 from topomerge.io.points import PICTURES, suffixes
-from topomerge.types import TopometricMap
+from topomerge.registration.pipeline import register
+from topomerge.types import Sim3, TopometricMap
 
+SOURCES_FILE, SOURCES_FORMAT = "watch.json", 1
+TRUTH = '{"format":1,"building":'  # that truth.json of `simulate` begins with, but for blanks
+HASHED_AT_ONCE = 1 << 20  # bytes
+LONGER = 0.8  # of a map's rooms, that a longer version of it has at least
 MAPS_AT_ONCE, SECONDS_AT_ONCE = 8, 10.0  # that are read before they are written: a stop costs no more
 SECONDS_TO_ANSWER = 5.0  # of registering, before it is said where new maps lie; the rest follows when nothing new is there
 SECONDS_BETWEEN = 60.0  # … before that is written, and new files are looked for
 NAMED_AT_MOST = 6  # maps, in a line
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file, or a folder of scans, that was read.
+
+    Args:
+        stamp: hash of the sizes and times of its files, and of the options that they were read with.
+        digest: hash of their contents, and of the options that they were read with.
+        map: name of the map that it gave; empty where it gave none.
+        error: why it gave none.
+    """
+
+    stamp: str
+    digest: str
+    map: str = ""
+    error: str = ""
+
+
+def read_sources(folder: Path) -> dict[str, Source]:
+    """Path -> what it gave; nothing where the file is missing, damaged or of another format."""
+    try:
+        listing = json.loads((folder / SOURCES_FILE).read_text(encoding="utf-8"))
+        if listing["format"] != SOURCES_FORMAT:
+            return {}
+        return {str(path): _source(listed) for path, listed in listing["files"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def _source(listed: Mapping[str, Any]) -> Source:
+    words = [listed[name] for name in ("stamp", "digest", "map", "error")]
+    if not all(isinstance(word, str) for word in words):
+        raise ValueError("no source")
+    return Source(*words)
+
+
+def sources_to_json(sources: Mapping[str, Source]) -> str:
+    """What `read_sources` reads."""
+    return json_text({"format": SOURCES_FORMAT, "files": {path: asdict(sources[path]) for path in sorted(sources)}})
+
+
+def beside_clouds(folder: Path) -> tuple[str, ...]:
+    """The files that `simulate` wrote beside its clouds, if its truth.json is in the folder."""
+    try:
+        with (folder / "truth.json").open("rb") as file:
+            start = "".join(file.read(200).decode(errors="replace").split())
+    except OSError:
+        return ()
+    return ("truth.json", "plan.png") if start.startswith(TRUTH) else ()
+
+
+def stamp_of(path: Path, options: str) -> str:
+    """Hash of the names, sizes and times of change of a file, or of all files of a folder, and of the options that it is read
+    with; empty where it is gone."""
+    try:
+        of = [(str(p.relative_to(path)), p.stat().st_size, p.stat().st_mtime_ns) for p in files_of(path)]
+    except OSError:
+        return ""
+    return hashlib.sha256(repr((of, options)).encode()).hexdigest()[:16] if of else ""
+
+
+def digest_of(path: Path, options: str) -> str:
+    """Hash of the content of a file, or of all files of a folder, and of the options that it is read with.
+
+    Raises:
+        OSError: it can't be read.
+    """
+    digest = hashlib.sha256(f"{options}\0{path.suffix.lower()}\0".encode())
+    for file in files_of(path):
+        digest.update(f"{file.relative_to(path)}\0{file.stat().st_size}\0".encode())
+        with file.open("rb") as stream:
+            while block := stream.read(HASHED_AT_ONCE):
+                digest.update(block)
+    return digest.hexdigest()[:32]
+
+
+def files_of(path: Path) -> list[Path]:
+    """The file itself, or all files in a folder, in their order; without hidden ones."""
+    if not path.is_dir():
+        return [path]
+    inside = (p for p in path.rglob("*") if not any(part.startswith(".") for part in p.relative_to(path).parts))
+    return sorted(p for p in inside if p.is_file())
+
+
+@dataclass(frozen=True)
+class Longer:
+    """A longer version of a map.
+
+    Args:
+        name: of the map in the atlas.
+        pose: of the new map in the frame of the one before.
+        rooms: of the one before that the new one has, too.
+        of: rooms of the one before.
+    """
+
+    name: str
+    pose: Sim3
+    rooms: int
+    of: int
+
+
+def longer_version(name: str, old: TopometricMap, new: TopometricMap, stored: Stored) -> Longer | None:
+    """Where a new map lies in the one before, if it is a longer version of it: if their registration is believed as a link of the
+    atlas would be, and the new map has most rooms of the one before.
+
+    Args:
+        name: of the old map in the atlas.
+    """
+    registration = register(old, new, scale=stored.settings["scale"], same=stored.settings["same"])
+    if registration.transform is None or registration.probability < link_threshold(stored.settings["threshold"]):
+        return None
+    pairs, _ = rooms_in_common(old, new, registration.transform)
+    rooms = len(np.unique(pairs[:, 0]))
+    if rooms < LONGER * len(old.rooms):
+        return None
+    return Longer(name, registration.transform, rooms, len(old.rooms))
+
+
+def replaced(stored: Stored, longer: Longer, new: Entry) -> tuple[Stored, Proposed]:
+    """An atlas in which the new map stands where the one before stood, and where it may lie in those that were linked with it.
+
+    Args:
+        new: entry of the new map, under any name.
+    """
+    old = next(e for e in stored.entries if e.name == longer.name)
+    entry = replace(new, name=old.name, frame=old.frame @ longer.pose)
+    proposed = {}
+    for (a, b), pose in stored.lying().items():
+        if a == old.key:
+            proposed[new.key, b] = longer.pose.inverse() @ pose
+        elif b == old.key:
+            proposed[a, new.key] = pose @ longer.pose
+    return replace(stored, entries=tuple(entry if e is old else e for e in stored.entries)), proposed
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,200 @@
+"""What the maps know that were joined -> the joined map: doors, windows, fixtures, and who was in the rooms (method 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from topomerge.extraction.distinct_doors import LEVEL_KINDS, distinct_doors, rooms_at
+from topomerge.extraction.elevations.fixtures import fixtures_in_map
+from topomerge.extraction.elevations.windows import in_map, same_windows
+from topomerge.extraction.plans.part_rooms import PartRooms
+from topomerge.types import EDGE_DTYPE, FIXTURE_DTYPE, WINDOW_DTYPE, Array, Placement, TopometricMap
+from topomerge.types.arrays import within_turn
+
+DOOR_SIDE = 1.0  # m around a door in which floor says which rooms it joins
+LEAST_FLOOR = 5  # cells of it, from which a map saw that side of a door
+ONE_DOOR = 1.2  # m: doors of two maps that are this close are one
+SEEN_BY_A_PART = ("centre", "lower", "upper", "direction", "width", "height", "kind", "open", "half")  # of a door
+LEAST_COVER = 0.3  # of a joined room's floor, from which on a part knows who was in it
+
+
+class LaidPart(NamedTuple):
+    """What of a part is needed once it is joined: its rooms, and its doors and openings as they lie in the joined map, EDGE_DTYPE
+    with the part's rooms."""
+
+    rooms: PartRooms
+    doors: Array
+
+
+def laid_part(part: TopometricMap, placement: Placement) -> LaidPart:
+    """A part as it lies in the joined map."""
+    doors = part.edges[np.isin(part.edges["kind"], LEVEL_KINDS)].copy()
+    for name in ("centre", "lower", "upper"):
+        doors[name] = placement.transform_points(doors[name])
+    doors["direction"] = (doors["direction"] + placement.pose.yaw) % np.pi
+    for name in ("width", "height"):
+        doors[name] *= placement.pose.scale
+    area = (placement.pose.scale * part.navigable.edge) ** 2
+    return LaidPart(PartRooms(*laid_floor(part, placement), part.rooms["entered"], area), doors)
+
+
+def with_doors(joined: TopometricMap, parts: Iterable[LaidPart]) -> TopometricMap:
+    """The joined map with those doors and openings of its parts that it lacks, without those that its parts deny, and each as the
+    part saw it that is surest of it.
+
+    Args:
+        parts: as they lie in it.
+    """
+    laid = [_LaidFloor.of(part, joined) for part in parts]
+    level = np.isin(joined.edges["kind"], LEVEL_KINDS)
+    edges = joined.edges[[not level[k] or _confirmed(edge, laid) for k, edge in enumerate(joined.edges)]]
+    edges = _as_seen(edges, np.concatenate([np.zeros(0, EDGE_DTYPE), *(part.doors for part in laid)]))
+    for part in laid:
+        new = [door for door in part.doors if not _is_there(edges, door)]
+        edges = np.concatenate([edges, np.array(new, EDGE_DTYPE)])
+    return distinct_doors(replace(joined, edges=edges[np.lexsort((*edges["centre"].T[::-1], *edges["rooms"].T[::-1]))]))
+
+
+def laid_floor(part: TopometricMap, placement: Placement) -> tuple[Array, Array]:
+    """(k, 3) m in the joined map, and (k,) their rooms in the part: the floor of its rooms."""
+    inside = part.navigable_room >= 0
+    return placement.transform_points(part.navigable.centroids(part.navigable.cells[inside])), part.navigable_room[inside]
+
+
+@dataclass(frozen=True, eq=False)
+class _LaidFloor:
+    """What a part says of doors, in the joined map.
+
+    Args:
+        floor: tree of the floor of its rooms, (k, 3) m.
+        room: (k,) room of the joined map there, -1 none.
+        centres: (E, 3) m of its doors and openings.
+        doors: EDGE_DTYPE, those of them that lie between two rooms of the joined map.
+    """
+
+    floor: cKDTree
+    room: Array
+    centres: Array
+    doors: Array
+
+    @classmethod
+    def of(cls, part: LaidPart, joined: TopometricMap) -> _LaidFloor:
+        part_room, doors = part.rooms.room, part.doors.copy()
+        room, tree = rooms_at(joined, part.rooms.places), cKDTree(part.rooms.places)
+        pairs = np.full((len(doors), 2), -1, np.int64)
+        for k, near in enumerate(tree.query_ball_point(doors["centre"], DOOR_SIDE)):
+            there, own = room[near], part_room[near]
+            for side, number in enumerate(doors["rooms"][k]):
+                votes = there[(own == number) & (there >= 0)]
+                pairs[k, side] = np.bincount(votes).argmax() if len(votes) else -1
+        between = (pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
+        doors["rooms"] = np.sort(pairs, axis=1)
+        return cls(tree, room, doors["centre"], doors[between])
+
+    def saw_both_sides(self, edge: Array) -> bool:
+        """Has it floor on both sides of an edge of the joined map?"""
+        near = self.room[self.floor.query_ball_point(edge["centre"], DOOR_SIDE)]
+        return all(int((near == room).sum()) >= LEAST_FLOOR for room in edge["rooms"])
+
+
+def _confirmed(edge: Array, parts: Sequence[_LaidFloor]) -> bool:
+    """Has a part a door there, or did none see both sides?"""
+    at = np.concatenate([part.centres for part in parts])
+    if (np.linalg.norm(at - edge["centre"], axis=1) < ONE_DOOR).any():
+        return True
+    return not any(part.saw_both_sides(edge) for part in parts)
+
+
+def _as_seen(edges: Array, doors: Array) -> Array:
+    """Doors of the joined map as the surest of the parts' doors that are the same has them; its sureness is the higher one."""
+    edges = edges.copy()
+    for edge in edges:
+        if edge["kind"] not in LEVEL_KINDS:
+            continue
+        near = (doors["rooms"] == np.sort(edge["rooms"])).all(axis=1)
+        near &= np.linalg.norm(doors["centre"] - edge["centre"], axis=1) <= ONE_DOOR
+        if near.any():
+            surest = doors[near][doors["confidence"][near].argmax()]
+            for name in SEEN_BY_A_PART:
+                edge[name] = surest[name]
+            edge["confidence"] = max(edge["confidence"], surest["confidence"])
+    return edges
+
+
+def _is_there(edges: Array, door: Array) -> bool:
+    """Is a door among edges, between the same rooms and near enough?"""
+    same = (np.sort(edges["rooms"], axis=1) == door["rooms"]).all(axis=1)
+    apart = np.linalg.norm(edges["centre"][same] - door["centre"], axis=1)
+    return bool((apart <= max(ONE_DOOR, float(door["width"]) / 2)).any())
+
+
+def with_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> TopometricMap:
+    """The joined map with the probability that each room was entered, and with what was only glimpsed, as its parts say: that of
+    the part in which somebody was most likely there; as the joined map has it where no part has enough of its floor."""
+    if not len(joined.rooms):
+        return joined
+    count = len(joined.rooms)
+    inside = joined.navigable_room >= 0
+    area = np.bincount(joined.navigable_room[inside], minlength=count) * joined.navigable.edge**2
+    entered = np.full(count, -1.0)
+    for part in parts:
+        room = rooms_at(joined, part.places)
+        there = room >= 0
+        places = np.bincount(room[there], minlength=count)
+        mean = np.bincount(room[there], part.entered[part.room[there]], count) / np.maximum(places, 1)
+        entered = np.where(places * part.area >= LEAST_COVER * area, np.maximum(entered, mean), entered)
+    rooms = joined.rooms.copy()
+    rooms["entered"] = np.where(entered >= 0, entered, rooms["entered"])
+    rooms["glimpsed"] = rooms["entered"] < 0.5
+    return replace(joined, rooms=rooms)
+
+
+def laid_windows(part: TopometricMap, placement: Placement) -> Array:
+    """(W,) WINDOW_DTYPE of a part in the joined map, without rooms."""
+    windows = _laid(part.windows, placement, ("width", "sill", "head"), np.pi)
+    windows["rooms"] = -1
+    return windows
+
+
+def laid_fixtures(part: TopometricMap, placement: Placement) -> Array:
+    """(F,) FIXTURE_DTYPE of a part in the joined map, without a room."""
+    fixtures = _laid(part.fixtures, placement, ("width", "depth", "bottom", "top"), 2 * np.pi)
+    fixtures["room"] = -1
+    return fixtures
+
+
+def _laid(rows: Array, placement: Placement, lengths: Sequence[str], full_turn: float) -> Array:
+    """Rows with `centre` and `direction` in the joined map, the columns of lengths at its scale."""
+    rows = rows.copy()
+    if len(rows):
+        rows["centre"] = placement.transform_points(rows["centre"])
+        rows["direction"] = within_turn(rows["direction"] + placement.pose.yaw, full_turn)
+        for name in lengths:
+            rows[name] *= placement.pose.scale
+    return rows
+
+
+def with_joined_windows(joined: TopometricMap, parts: Sequence[Array]) -> TopometricMap:
+    """The joined map with the windows of its parts, each once: as the part saw it that is the surest of it.
+
+    Args:
+        parts: WINDOW_DTYPE of `laid_windows`.
+    """
+    windows = np.concatenate([np.zeros(0, WINDOW_DTYPE), *parts])
+    first = [int(group[0]) for group in same_windows(windows)]
+    return replace(joined, windows=in_map(joined, windows[first]))
+
+
+def with_joined_fixtures(joined: TopometricMap, parts: Sequence[Array]) -> TopometricMap:
+    """The joined map, which has its windows, with the niches and cupboards of its parts, each once.
+
+    Args:
+        parts: FIXTURE_DTYPE of `laid_fixtures`.
+    """
+    rows = np.concatenate([np.zeros(0, FIXTURE_DTYPE), *parts])
+    return replace(joined, fixtures=fixtures_in_map(joined, rows))

@@ -1,0 +1,304 @@
+"""Registration of two whole maps by their geometry: search, verify, refine (method 4; no rooms, no learning).
+
+The best few hypotheses are examined closely: both maps are bent onto each other under each, and ranked again by what they show
+then. Drift makes a right pose look worse than it is, and a wrong one hardly better than it was: bending tells them apart where
+the rigid maps do not. So the lead over rivals is measured between bent maps, too."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from topomerge.blas import one_blas_thread
+from topomerge.errors import InputError
+from topomerge.extraction.stopwatch import Stopwatch
+from topomerge.matching.poses import PoseHypothesis, distinct_hypotheses, wrapped
+from topomerge.matching.refinement import refine
+from topomerge.registration.bend.bend import Bend, bend
+from topomerge.registration.evidence.places import Places, places
+from topomerge.registration.judge import Judge, winner_features
+from topomerge.registration.posterior import check_same
+from topomerge.registration.prepared import Map, Prepared, prepare
+from topomerge.registration.refine import refine_pose
+from topomerge.registration.search import search, search_scaled
+from topomerge.registration.verify import BASIN, MARGIN_CAP, Verdict, bent_score, model, quality_lag, rank, verdict
+from topomerge.types import Sim3, VoxelGrid
+
+AS_GOOD = 1.5  # log odds: less is no lead
+CLOSELY = 3  # hypotheses that are bent at most, the best ones; and one more that no ratio speaks against
+RIGID_FEATURES = {"strain": 0.0, "bent": 0.0, "farthest": 0.0, "doubted": 0.0, "bent_pieces": 0.0, "rmse": float("nan")}
+log = logging.getLogger(__name__)
+ALTERNATIVES = 10
+DRIFTED = (0.5, np.radians(3.0))  # m, rad: a refinement that moves the middle by more has lost its way
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A hypothesis, and both maps bent onto each other under it.
+
+    Args:
+        hypothesis: before bending.
+        bend: near its pose.
+        judge: of the bent maps.
+        places: what both maps show, one place after another.
+        features: of `Judge` and `Bend`, and of the places.
+        score: log odds that it is right, seen by itself.
+    """
+
+    hypothesis: PoseHypothesis
+    bend: Bend
+    judge: Judge
+    places: Places
+    features: dict[str, float]
+    score: float
+
+    def closely(self) -> dict[str, float]:
+        """What is asked of the best one only (`winner_features`), and all other features."""
+        return {**self.features, **winner_features(self.judge, self.bend.transform)}
+
+
+def repeats(ranked: Sequence[PoseHypothesis]) -> int:
+    """How many other places of the maps ratios speak for nearly as well: of a building that repeats itself, more."""
+    return int((quality_lag(ranked)[1:] < AS_GOOD).sum())
+
+
+def candidate(a: Prepared, b: Prepared, hypothesis: PoseHypothesis, scaled: bool) -> Candidate:
+    """Both maps bent near the pose T_ab of a hypothesis, and what they show then."""
+    bent = bend(a, b, hypothesis.transform, scaled=scaled)
+    storeys = bent.storeys(b.storeys)
+    judge = Judge(a.storeys, storeys)
+    seen = places(a.storeys, storeys, bent.transform)
+    features = {**judge(bent.transform), **RIGID_FEATURES, **bent.features, **seen.features}
+    return Candidate(hypothesis, bent, judge, seen, features, bent_score(features))
+
+
+def rivals(ranked: Sequence[PoseHypothesis]) -> list[int]:
+    """Which of ranked hypotheses to look at closely: the first, those next to it that are not far behind, and the one that ratios
+    speak for most, of those that explain enough: a shift along a row of rooms explains less, but is no worse."""
+    near = [k for k, h in enumerate(ranked[:CLOSELY]) if h.score >= ranked[0].score - MARGIN_CAP]
+    lag = quality_lag(ranked)
+    rest = [k for k in range(1, len(ranked)) if k not in near and lag[k] < MARGIN_CAP / 2]
+    return near + sorted(rest, key=lambda k: lag[k])[:1]
+
+
+def candidates(
+    a: Prepared, b: Prepared, ranked: Sequence[PoseHypothesis], scaled: bool, bent: dict[int, Candidate] | None = None
+) -> list[Candidate]:
+    """The hypotheses worth it, each with the maps bent, best first; those that end in one pose once.
+
+    Args:
+        bent: id of a hypothesis -> what was made of it before; new ones are added.
+    """
+    bent = {} if bent is None else bent
+    near = [ranked[k] for k in rivals(ranked)]
+    bent |= {id(h): candidate(a, b, h, scaled) for h in near if id(h) not in bent}
+    looked = sorted((bent[id(h)] for h in near), key=lambda c: -c.score)
+    looked[0].features["repeats"] = float(repeats(ranked))  # asked of the best one only
+    moved = [replace(c.hypothesis, transform=c.bend.transform) for c in looked]
+    single = {id(h) for h in distinct_hypotheses(moved, np.append(b.storeys[0].middle, 0.0), BASIN)}
+    return [c for c, h in zip(looked, moved, strict=True) if id(h) in single]
+
+
+@dataclass(frozen=True)
+class FallbackProposals:
+    """Poses T_ab that are made only where the best pose there is without them is less probable than `below`."""
+
+    make: Callable[[], Sequence[Sim3]]
+    below: float
+
+    def inverse(self) -> FallbackProposals:
+        """That of the maps the other way round."""
+        return replace(self, make=lambda: _inverses(self.make()))
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Where map b lies in the frame of map a, and whether to believe it.
+
+    Args:
+        transform: T_ab of the best hypothesis, believed or not; None where there was none.
+        probability: that it is right, calibrated on simulated pairs; 0 without a hypothesis.
+        accepted: is the probability above the threshold of the calibration?
+        features: what it was judged by (`Judge`, `winner_features`), with ``margin`` and ``rmse`` (m).
+        alternatives: the hypotheses, best first, their scores the log odds of each seen by itself (`verify.rank`); the first one
+            is the best before its fine registration.
+        reason: in words.
+        seconds: step -> s.
+        bend: how the maps are bent onto each other under the transform; None where a rigid pose was asked for.
+        posterior: probability of this place and of each named alternative (`fusion.posterior`); they sum to 1.
+        places: what both maps show of each place that they share under it, and how much that speaks for it.
+    """
+
+    transform: Sim3 | None
+    probability: float
+    accepted: bool
+    features: dict[str, float] = field(default_factory=dict)
+    alternatives: tuple[PoseHypothesis, ...] = ()
+    reason: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+    bend: Bend | None = None
+    places: Places | None = None
+    posterior: dict[str, float] = field(default_factory=dict)
+
+
+@one_blas_thread
+def register(
+    a: Map | Prepared,
+    b: Map | Prepared,
+    *,
+    scale: str = "fixed",
+    proposed: Sequence[Sim3] | FallbackProposals = (),
+    free: tuple[VoxelGrid | None, VoxelGrid | None] = (None, None),
+    searched: bool = True,
+    rigid: bool = False,
+    same: str = "nothing",
+) -> Registration:
+    """The pose of map b in map a's frame. `register(b, a)` gives its inverse.
+
+    Args:
+        a, b: topometric maps or occupied cells, or what `prepare` made of them.
+        scale: "fixed", or "free" where b's unit may differ (looked for between 0.5 and 2).
+        proposed: poses T_ab of matched rooms: their yaws are searched, too, and they are tried beside what the correlation
+            finds; or a fallback, whose poses are tried, if at all, after that.
+        free: cells of a and of b known to be empty; topometric maps bring their own.
+        searched: look for poses by correlation? Else the proposed ones are all there is.
+        rigid: give the best rigid pose? Else both maps are bent, too. They are judged as bent all the same: drift is no
+            contradiction.
+        same: "nothing", "building" or "storey": both maps are known to be of one (`posterior.SAME`).
+
+    Raises:
+        InputError: an empty map, or another word for the scale or for what is known.
+    """
+    check_same(same)
+    if scale not in ("fixed", "free"):
+        raise InputError(f"scale must be fixed or free, not {scale!r}")
+    clock = Stopwatch()
+    a, b = (m if isinstance(m, Prepared) else prepare(m, f) for m, f in zip((a, b), free, strict=True))
+    clock.lap("plans")
+    if b.order < a.order:  # so that nothing depends on which comes first
+        poses = proposed.inverse() if isinstance(proposed, FallbackProposals) else _inverses(proposed)
+        swapped = register(b, a, scale=scale, proposed=poses, searched=searched, rigid=rigid, same=same)
+        return replace(_inverse(swapped), seconds={**swapped.seconds, **clock.seconds})
+    pair = _Pair(a, b, scale == "free", clock)
+    fallback, first = (proposed, ()) if isinstance(proposed, FallbackProposals) else (None, proposed)
+    if searched:
+        pair.search(first)
+    else:
+        pair.add(first)
+    chance = pair.look(same)
+    if fallback is not None and chance < fallback.below:
+        pair.add(fallback.make())
+        pair.look(same)
+    if pair.verdict is None:
+        reason = "the maps show no walls that could be compared" if searched else "no two matched rooms could be aligned"
+        return Registration(None, 0.0, False, reason=reason, seconds=clock.seconds)
+    return replace(pair.registration(pair.verdict, rigid), seconds=clock.seconds)
+
+
+class _Pair:
+    """Two maps while they are registered: their hypotheses, ranked, and those that were looked at closely."""
+
+    def __init__(self, a: Prepared, b: Prepared, scaled: bool, clock: Stopwatch) -> None:
+        self.a, self.b, self.scaled, self.clock = a, b, scaled, clock
+        self.judge = Judge(a.storeys, b.storeys)
+        self.ranked: list[PoseHypothesis] = []
+        self.looked: list[Candidate] = []
+        self.bent: dict[int, Candidate] = {}
+        self.verdict: Verdict | None = None
+
+    def search(self, poses: Sequence[Sim3]) -> None:
+        """Add hypotheses of the correlation, and of given poses T_ab."""
+        self._rank((search_scaled if self.scaled else search)(self.a.storeys, self.b.storeys, poses))
+
+    def add(self, poses: Sequence[Sim3]) -> None:
+        """Add given poses T_ab, moved to where the walls meet."""
+        self.clock.lap("match")
+        proposals = [PoseHypothesis(pose, from_rooms=True) for pose in poses]
+        self._rank(refine(self.a.storeys, self.b.storeys, proposals, self.scaled))
+
+    def _rank(self, hypotheses: Sequence[PoseHypothesis]) -> None:
+        self.clock.lap("search")
+        self.ranked = rank(hypotheses, self.judge, self.ranked)
+        self.clock.lap("verify")
+
+    def look(self, same: str) -> float:
+        """Look closely at the best hypotheses there are; the probability of the best one."""
+        if not self.ranked:
+            return 0.0
+        self.looked = candidates(self.a, self.b, self.ranked, self.scaled, self.bent)
+        self.verdict = verdict([c.features for c in self.looked], self.looked[0].closely(), same)
+        self.clock.lap("bend")
+        return self.verdict.each[0]
+
+    def registration(self, said: Verdict, rigid: bool) -> Registration:
+        """The best hypothesis, finely registered, with what was said of it."""
+        bent, rmse = _refined(self.a, self.b, self.looked[0], self.scaled, rigid)
+        self.clock.lap("refine")
+        believed = _verdict(self.ranked, self.looked, said)
+        features = {**believed.features, "rmse": rmse}
+        return replace(believed, transform=bent.transform, features=features, bend=None if rigid else bent)
+
+
+def _inverses(poses: Sequence[Sim3]) -> list[Sim3]:
+    return [pose.inverse() for pose in poses]
+
+
+def _refined(a: Prepared, b: Prepared, best: Candidate, scaled: bool, rigid: bool) -> tuple[Bend, float]:
+    """The bending of the best candidate with its pose by surfaces (all of it where the maps stay rigid, else its height), and the
+    root mean square distance of the surfaces, m. A slice has no planes, and stays as it is."""
+    bent = best.bend
+    if any(v.plan.sliced for v in (*a.storeys, *b.storeys)):
+        return bent, best.features["rmse"]
+    aligned, misfit = fine(a, b, best.hypothesis.transform, scaled)
+    if rigid or bent.reason:
+        return replace(bent, transform=aligned), misfit
+    pose = bent.transform  # bending is level: floors and ceilings say how high
+    height = aligned.translation[2] + (aligned.scale - pose.scale) * float(b.middle[2])  # there, where scales differ
+    return replace(bent, transform=replace(pose, translation=(*pose.translation[:2], height))), best.features["rmse"]
+
+
+def _verdict(ranked: Sequence[PoseHypothesis], looked: Sequence[Candidate], said: Verdict) -> Registration:
+    """The best of the candidates, with its probability and the reason in words."""
+    best, chance = looked[0], said.each[0]
+    margin = min(best.score - looked[1].score, MARGIN_CAP) if len(looked) > 1 else MARGIN_CAP
+    features = {**said.features, "rigid_conflict_share": best.hypothesis.features["conflict_share"], "margin": margin}
+    accepted = chance >= model()["threshold"]
+    share = 100 * features["conflict_share"]
+    reason = (
+        f"{'believed' if accepted else 'not believed'}: {features['walls']:.0f} m2 of walls agree, {features['free']:.0f} m2 of "
+        f"free floor seen by both, {share:.1f} % of the walls stand on free floor of the other map"
+    )
+    closely = {id(c.hypothesis) for c in looked}
+    others = [replace(c.hypothesis, score=c.score, probability=p) for c, p in zip(looked, said.each, strict=True)]
+    last = others[-1].score  # of those that were not looked at closely, the lag behind the best one is all that is known
+    for h in ranked:
+        if id(h) not in closely:
+            lag = max(ranked[0].score - h.score, best.score - last)
+            others.append(replace(h, score=best.score - lag, probability=float(chance * np.exp(-lag))))
+    pose, alternatives = best.bend.transform, tuple(others[:ALTERNATIVES])
+    return Registration(pose, chance, accepted, features, alternatives, reason, places=best.places, posterior=said.posterior)
+
+
+def fine(a: Prepared, b: Prepared, start: Sim3, scaled: bool = False) -> tuple[Sim3, float]:
+    """Point-to-plane refinement of T_ab, unless it runs away, and the root mean square distance of the surfaces, m."""
+    moved = refine_pose(a.surface, b.surface, start, scaled)
+    shift = float(np.linalg.norm(moved.pose.apply(b.middle[None]) - start.apply(b.middle[None])))
+    turn = abs(wrapped(moved.pose.yaw - start.yaw))
+    if not np.isfinite(moved.rmse) or shift > DRIFTED[0] or turn > DRIFTED[1]:
+        log.debug("refinement moved %.2f m, %.1f degrees: left out", shift, np.degrees(turn))
+        return start, float("nan")
+    return moved.pose, moved.rmse
+
+
+def _inverse(registration: Registration) -> Registration:
+    """The same registration seen from the other map."""
+    others = tuple(replace(h, transform=h.transform.inverse()) for h in registration.alternatives)
+    transform = None if registration.transform is None else registration.transform.inverse()
+    bent = registration.bend and registration.bend.inverse()
+    seen = registration.places
+    if seen is not None and registration.transform is not None:
+        seen = seen.inverse(registration.transform)
+    return replace(registration, transform=transform, alternatives=others, bend=bent, places=seen)

@@ -1,0 +1,95 @@
+"""What registration and bending need of a map, made when it is first needed and once only."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from topomerge.extraction.cell_means import cell_middles
+from topomerge.matching.plan_fields import PlanFields
+from topomerge.registration.bend.measure import Target, WallLines, samples, wall_lines
+from topomerge.registration.bend.pieces import Pieces, map_sensor, pieces_of
+from topomerge.registration.refine import Surface, surface
+from topomerge.registration.storeys import plans
+from topomerge.types import Array, TopometricMap, VoxelGrid
+
+Map = TopometricMap | VoxelGrid
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What is drawn from a map; the map itself may be loaded again when it is needed.
+
+    Args:
+        load: gives the map, topometric or occupied cells.
+        storeys: their plans, lowest first.
+        order: larger maps come first; among equal ones the order is arbitrary, but always the same.
+        middle: (3,) of its cells, m.
+        sensor: what it was measured by, as far as one can say.
+        make_surface: its points and normals, for the fine registration.
+    """
+
+    load: Callable[[], Map]
+    storeys: tuple[PlanFields, ...]
+    order: tuple[int, str]
+    middle: Array
+    sensor: str
+    make_surface: Callable[[], Surface]
+
+    @property
+    def surface(self) -> Surface:
+        """Its points and normals."""
+        return self.make_surface()
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """The pieces that it is bent by."""
+        map = self.load()
+        return pieces_of(self.storeys, map if isinstance(map, TopometricMap) else None)
+
+    @cached_property
+    def samples(self) -> tuple[Array, Array]:
+        """The walls by which each piece is registered."""
+        return samples(self.pieces)
+
+    @cached_property
+    def lines(self) -> tuple[WallLines, ...]:
+        """The walls of each storey as lines."""
+        middles = cell_middles(grid_of(self.load()))
+        return tuple(wall_lines(s, middles) for s in self.storeys)
+
+    @cached_property
+    def targets(self) -> tuple[Target, ...]:
+        """The storeys, for pieces of other maps to be registered on."""
+        return tuple(Target(s) for s in self.storeys)
+
+
+def prepare(map: Map, free: VoxelGrid | None = None) -> Prepared:
+    """Plans of a map, with what is drawn from them when it is first needed.
+
+    Args:
+        free: cells known to be empty; a topometric map brings its own.
+
+    Raises:
+        InputError: an empty map.
+    """
+    storeys = tuple(PlanFields(p) for p in plans(map, free))
+    grid = grid_of(map)
+    make_surface = cache(lambda: surface(grid))
+    return Prepared(lambda: map, storeys, registration_order(map), cell_middles(grid).mean(axis=0), map_sensor(map), make_surface)
+
+
+def grid_of(map: Map) -> VoxelGrid:
+    """The occupied cells of a map."""
+    return map.grid if isinstance(map, TopometricMap) else map
+
+
+def registration_order(map: Map) -> tuple[int, str]:
+    """Larger maps come first; among equal ones the order is arbitrary, but always the same."""
+    grid = grid_of(map)
+    digest = hashlib.sha256(np.ascontiguousarray(grid.cells).tobytes() + grid.origin.tobytes()).hexdigest()
+    return -len(grid), digest
