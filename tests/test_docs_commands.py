@@ -58,7 +58,12 @@ def take(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     if words[0] == "evaluate.py":
         from topomerge.config import compose
         from topomerge.evaluation.settings import Evaluation
+        from topomerge.evaluation.tasks import MODULES, read_settings
 
+        task = next((w.removeprefix("task=") for w in words if w.startswith("task=")), "")
+        if task in MODULES:
+            read_settings(task, words[1:])
+            return
         compose("evaluate", Evaluation, [w for w in words[1:] if not w.startswith("task=")])
         return
     assert words[0] == "-m", words
@@ -117,9 +122,9 @@ def test_there_are_commands() -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "-m benchmarks.merging.nowhere test",
-        "-m benchmarks.merging.register test 1000 what",
-        "-m benchmarks.extraction.run --sets all",
+        "-m benchmarks.peers.nowhere test",
+        "-m benchmarks.peers.run whole 9 what",
+        "evaluate.py task=rooms data.sets=all",
         "evaluate.py data=heldout nothing=1",
         "evaluate.py data=heldout only=[engineered,shapedna surface]",
     ],
