@@ -159,8 +159,8 @@ def draw_pair(kind: str, seed: int) -> tuple[tuple[Array, Sim3], tuple[Array, Si
     world = furnish_row(draw_world(rng, ROW_ROOMS, width), width, kind, rng)
     start = int(rng.integers(1, 3))
     starts = (start, start + ROOMS_SEEN + (-2 if kind == "row-overlap" else 1))
-    first, second = (scan_part(world, width, k, rng) for k in starts)
-    return first, second
+    one, other = (scan_part(world, width, k, rng) for k in starts)
+    return one, other
 
 
 def furnish_row(world: World, width: float, kind: str, rng: np.random.Generator) -> World:

@@ -24,7 +24,7 @@ from topomerge.datasets.simulation.floor_truth import judge
 from topomerge.evaluation.cases import BUILDING_KINDS
 from topomerge.evaluation.markdown import write_share, write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data, measure_missing
+from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.metrics import match_places
 from topomerge.types import Array, TopometricMap
@@ -54,21 +54,19 @@ def draw_cases(development: bool) -> list[Case]:
     ]
 
 
-def list_cases(settings: TaskSettings) -> list[Case]:
-    """List the cases of a set."""
-    cases = [case for case in draw_cases(settings.data.set == "dev") if settings.data.only in case.name]
-    return cases[: settings.data.limit or None]
-
-
 def list_inputs(settings: TaskSettings) -> list[str]:
     """Names of the scans."""
-    return [case.key for case in list_cases(settings)]
+    return [case.key for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
 def measure(settings: TaskSettings, say: Say) -> list[Row]:
     """Measure each scan by the plan alone, and by plan and walls."""
     scans, data = Path(settings.cache) / "scans", find_optional_data()
-    items = {f"{case.key} {how}": (case, how, scans, data) for case in list_cases(settings) for how in SHOWN_BY}
+    items = {
+        f"{case.key} {how}": (case, how, scans, data)
+        for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)
+        for how in SHOWN_BY
+    }
     path = Path(settings.cache) / "evaluation" / "doors.jsonl"
     return measure_missing(path, items, measure_case, say, settings, code_digest(*MAKERS, __name__))
 

@@ -69,7 +69,7 @@ def positives(rows: Sequence[Row]) -> list[Row]:
 def source_of(row: Row) -> str:
     """Where a simulated pair is from, in words."""
     words = {"procedural": "procedural buildings", "campus": "schools (real plans)", "r2v": "flats (real plans)"}
-    return words.get(row["source"], str(row["source"]))
+    return words.get(str(row["source"]), str(row["source"]))
 
 
 def describe_pairs(rows: Sequence[Row]) -> str:

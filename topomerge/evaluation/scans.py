@@ -163,8 +163,8 @@ def make_scan(case: Case, data: Path | None) -> Scan:
             about.write_text(IPA_ABOUT.format(image=(data / IPA / f"{case.building}.png").resolve(), cell=IPA_CELL))
             return raised(case, about, _ipa_plan(case.building, data))
     if case.source == "gdc":
-        folder = data / GDC / case.building
-        return raised(case, folder / f"{case.building}.yaml", folder / "locations.yaml")
+        floor = data / GDC / case.building
+        return raised(case, floor / f"{case.building}.yaml", floor / "locations.yaml")
     if case.source == "home":
         path = data / HOMES_FOLDER / f"{case.building}.json"
         cloud = read_points(path)

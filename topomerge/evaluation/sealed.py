@@ -3,8 +3,8 @@
 ``python -m topomerge.evaluation.sealed [--jobs 2]`` measures rooms and merges on the sealed set (`datasets/plans/sealed.py`),
 which nothing else can read, and appends a block to ``docs/results/sealed.md``: date, version,
 command, figures. What stands there is never written again. About 25 minutes on two cores: 110 pairs of grids (a quarter of
-which must not merge), 40 scans of procedural buildings, and the sealed plans and grids of real buildings, if TOPOMERGE_DATA is set.
-``--public s3dis=FOLDER`` adds the sealed buildings of a published set. A version is measured once; ``--again`` does it once
+which must not merge), 40 scans of procedural buildings, and the sealed plans and grids of real buildings, if TOPOMERGE_DATA is
+set. ``--public s3dis=FOLDER`` adds the sealed buildings of a published set. A version is measured once; ``--again`` does it once
 more, and the block says so.
 
 ``--small`` runs two or three items of training seeds, to try the way; it writes to ``--page`` only.

@@ -242,3 +242,8 @@ def find_optional_data() -> Path | None:
     """Find the folder of the real data; None where TOPOMERGE_DATA is not set."""
     folder = os.environ.get("TOPOMERGE_DATA", "")
     return Path(folder) if folder else None
+
+
+def limit_cases(cases: Sequence[Any], settings: TaskSettings) -> list[Any]:
+    """Limit cases to those whose name is asked for, and to so many."""
+    return [case for case in cases if settings.data.only in case.name][: settings.data.limit or None]

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from topomerge.evaluation.cases import dev
 from topomerge.evaluation.markdown import write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data
+from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data, limit_cases
 from topomerge.extraction.extract import extract
 from topomerge.structure.face_points import FACE_HEIGHTS
 from topomerge.types import Array, TopometricMap
@@ -71,21 +71,15 @@ def draw_cases(development: bool) -> list[Case]:
     return [Case("walls", "procedural", kind, sensor, VALIDATION + i, rooms=10) for i, (kind, sensor) in enumerate(KINDS)]
 
 
-def list_cases(settings: TaskSettings) -> list[Case]:
-    """List the cases of a set."""
-    cases = [case for case in draw_cases(settings.data.set == "dev") if settings.data.only in case.name]
-    return cases[: settings.data.limit or None]
-
-
 def list_inputs(settings: TaskSettings) -> list[str]:
     """Names of the scans."""
-    return [case.key for case in list_cases(settings)]
+    return [case.key for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
 def measure(settings: TaskSettings, say: Say) -> list[Row]:
     """Measure the walls of each scan."""
     rows = []
-    for case in list_cases(settings):
+    for case in limit_cases(draw_cases(settings.data.set == "dev"), settings):
         scan = load_scan(case, Path(settings.cache) / "scans", find_optional_data())
         rows.append({"name": case.name, **score_walls(scan, extract(scan.cloud, voxel_size=0.1))})
         say(f"{case.name} {rows[-1]['walls']} walls")

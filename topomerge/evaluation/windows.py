@@ -24,7 +24,7 @@ from topomerge.evaluation import doors
 from topomerge.evaluation.cases import BUILDING_KINDS
 from topomerge.evaluation.markdown import write_medians, write_share, write_table
 from topomerge.evaluation.scans import Case, Scan, load_scan
-from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data, measure_missing
+from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_optional_data, limit_cases, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.types import Array, TopometricMap
 
@@ -60,21 +60,15 @@ def draw_cases(development: bool) -> list[Case]:
     return doors.draw_cases(development) + others
 
 
-def list_cases(settings: TaskSettings) -> list[Case]:
-    """List the cases of a set."""
-    cases = [case for case in draw_cases(settings.data.set == "dev") if settings.data.only in case.name]
-    return cases[: settings.data.limit or None]
-
-
 def list_inputs(settings: TaskSettings) -> list[str]:
     """Names of the scans."""
-    return [case.key for case in list_cases(settings)]
+    return [case.key for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)]
 
 
 def measure(settings: TaskSettings, say: Say) -> list[Row]:
     """Measure the windows of each scan."""
     scans, data = Path(settings.cache) / "scans", find_optional_data()
-    items = {case.key: (case, scans, data) for case in list_cases(settings)}
+    items = {case.key: (case, scans, data) for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)}
     path = Path(settings.cache) / "evaluation" / "windows.jsonl"
     return measure_missing(path, items, measure_case, say, settings, code_digest(*MAKERS, __name__))
 
