@@ -64,10 +64,6 @@ def measure(settings: TaskSettings, say: Say) -> list[Row]:
     scans, data = Path(settings.cache) / "scans", find_optional_data()
     cases = limit_cases(draw_cases(settings.data.set == "dev"), settings)
     items = {f"{case.key} {how}": (case, how, scans, data) for case in cases for how in SHOWN_BY}
-        f"{case.key} {how}": (case, how, scans, data)
-        for case in limit_cases(draw_cases(settings.data.set == "dev"), settings)
-        for how in SHOWN_BY
-    }
     path = Path(settings.cache) / "evaluation" / "doors.jsonl"
     return measure_missing(path, items, measure_case, say, settings, code_digest(*MAKERS, __name__))
 
