@@ -9,7 +9,7 @@ export MPLBACKEND := Agg
 unexport PYTHONDONTWRITEBYTECODE
 test test-longer: export OMP_NUM_THREADS := 1
 
-.PHONY: setup demo test test-longer test-slow lint docs bench sealed weights clean
+.PHONY: setup demo test test-longer test-slow lint docs bench results-check sealed weights clean
 setup: .venv/ready
 
 .venv/ready: pyproject.toml constraints.txt
@@ -53,13 +53,17 @@ docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "The documentation: build/site/index.html"
 
-# All benchmarks of speed, about half an hour; what measures rooms and merges takes hours: see docs/benchmarks.md.
+# All benchmarks of speed, about half an hour. Rooms, merges and the like are measured by evaluate.py: see docs/evaluation.md.
 bench: setup
 	$(BIN)/python -m benchmarks.speed
 
+# Names the generated blocks and figures of README and docs that this state of the code did not make; it measures nothing.
+results-check: setup
+	$(BIN)/python -m topomerge.evaluation.results_check
+
 # Once a release: measures the sealed set and appends to docs/results/sealed.md, about 25 minutes. Nothing else can read it.
 sealed: setup
-	$(BIN)/python -m benchmarks.sealed --jobs 2
+	$(BIN)/python -m topomerge.evaluation.sealed --jobs 2
 
 # All learned parts that ship, in their order; what has ended is left as it is. It says how long is left: hours on two cores.
 weights: setup

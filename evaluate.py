@@ -1,12 +1,18 @@
-"""Judge a learned part on buildings that trained nothing: embedders and descriptors, or what `task=` names.
+"""Measure what the library makes, or judge a learned part on buildings that trained nothing.
 
     python evaluate.py data=heldout_small merge=false
     python evaluate.py data=heldout run=runs/x
     python evaluate.py data=real run=runs/x write=docs/results.md section=real-pairs
     python evaluate.py task=door_classification run=runs/door_classification jobs=2
+    python evaluate.py task=rooms data=homes write=docs/results/rooms.md
+    python evaluate.py task=merges data=test data.limit=40
+
+Without `task=`: embedders and descriptors. Tasks of what the library makes: rooms, doors, windows, walls, merges, joined,
+bending, atlases, retrieval (topomerge/evaluation). All others are learned parts.
 
 Predictions go to disk first (`runs/eval/<name>/predictions`), then they are scored: a run that was killed goes on where it was.
-Keys: configs/evaluate.yaml and configs/data/*.yaml; with a task configs/task/<task>.yaml, whose `heldout` data is judged on.
+Keys: configs/evaluate.yaml and configs/data/*.yaml; of a learned part configs/task/<task>.yaml, whose `heldout` data
+is judged on.
 """
 
 from __future__ import annotations
@@ -19,6 +25,7 @@ from topomerge.datasets.core.script import exit_status
 from topomerge.config import compose
 from topomerge.evaluation.evaluate import evaluate
 from topomerge.evaluation.settings import Evaluation
+from topomerge.evaluation.tasks import MODULES, run_task
 
 
 def say(text: str) -> None:
@@ -42,6 +49,9 @@ def main(words: list[str]) -> int:
             keys = [f"run=[{w[4:]}]" if w.startswith("run=") and not w.startswith("run=[") else w for w in keys]
             scores = evaluate(compose("evaluate", Evaluation, keys), say, command)
             print(f"{scores.summary}\n\nAll tables and figures: {scores.folder}")
+        elif task in MODULES:
+            outcome = run_task(task, words, say)
+            print(f"{outcome.summary}\n\nWritten to {outcome.folder}")
         else:
             from topomerge.training.judging import judge_task
 

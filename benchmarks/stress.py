@@ -26,7 +26,7 @@ from topomerge.datasets.simulation.scanner import scan
 from topomerge.datasets.simulation.walk import part
 
 import topomerge as tm
-from benchmarks.speed.floors import DEPTH, WIDTH, storey
+from benchmarks.speed.bench import DEPTH, WIDTH, storey
 from topomerge.embedding.embedders import embedder
 from topomerge.matching.match import match
 from topomerge.types import Array, PointCloud, Sim3, TopometricMap

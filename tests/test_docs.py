@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import os
 import re
 import shutil
@@ -20,6 +21,13 @@ from topomerge.cli.main import COMMANDS, EXIT_STATUSES
 from topomerge.cli.main import main as cli
 
 QUICK = ("cli.md",)  # pages whose examples need no scans; those of all others are slow
+LONGER = ("extend.md",)  # run by every change all the same
+NEW = r"\*\*One (?:file|YAML)\*\*, `([^`]+)`"  # what a reader of extend.md adds
+
+
+def mark_of(page: Path) -> list[pytest.MarkDecorator]:
+    """Mark the examples of a page by how long they take."""
+    return [] if page.name in QUICK else [pytest.mark.longer if page.name in LONGER else pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +82,7 @@ def run_page(page: Path, folder: Path) -> None:
                 exec(compile(example.text, where, "exec"), names)
 
 
-@pytest.mark.parametrize(
-    "page", [pytest.param(p, id=p.name, marks=[] if p.name in QUICK else [pytest.mark.slow]) for p in pages()]
-)
+@pytest.mark.parametrize("page", [pytest.param(p, id=p.name, marks=mark_of(p)) for p in pages()])
 def test_examples(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     if page.name not in QUICK:
@@ -131,6 +137,71 @@ def named_in(path: Path) -> set[str]:
         if isinstance(node, ast.ClassDef):
             found |= {f"{node.name}.{n.name}" for n in node.body if isinstance(n, ast.FunctionDef)}
     return found
+
+
+def resolve(name: str) -> object:
+    """Import what a name with dots stands for.
+
+    Raises:
+        ImportError, AttributeError: there is no such thing.
+    """
+    parts = name.split(".")
+    for k in range(len(parts), 0, -1):
+        try:
+            found: object = importlib.import_module(".".join(parts[:k]))
+        except ModuleNotFoundError as error:
+            if error.name and not name.startswith(error.name):
+                raise
+            continue
+        for part in parts[k:]:
+            found = getattr(found, part)
+        return found
+    raise ImportError(name)
+
+
+def test_everything_that_the_page_of_python_names_is_there() -> None:
+    text = (ROOT / "docs" / "api.md").read_text()
+    named = re.findall(r"(?m)^::: ([\w.]+)", text) + re.findall(r"`((?:topomerge|tm)\.\w[\w.]*)", text)
+    assert len(named) > 20
+    for name in named:
+        try:
+            resolve(re.sub(r"^tm\b", "topomerge", name))
+        except (ImportError, AttributeError) as error:
+            pytest.fail(f"docs/api.md: {name}: {error}")
+
+
+@pytest.mark.parametrize("page", ["method.md", "extend.md", "api.md", "evaluation.md", "glossary.md"])
+def test_every_file_that_a_page_names_is_there(page: str) -> None:
+    """Also with the name of what stands in it: `file.py:name`; and ``X` of `file.py``."""
+    text = (ROOT / "docs" / page).read_text()
+    new = set(re.findall(NEW, text))
+    for path in re.findall(r"`((?:topomerge|models|datasets|configs|tests|benchmarks|docs)/[\w./-]*)", text):
+        assert path in new or (ROOT / path).exists(), f"docs/{page}: {path} is not there"
+    for name, path in re.findall(r"in `(\w+)`\s+of\s+`([\w/]+\.py)`", text):
+        assert hasattr(importlib.import_module(source_name(path)), name), f"docs/{page}: {path} has no {name}"
+
+
+def source_name(path: str) -> str:
+    """Name the module of a file as it is installed."""
+    name = path.removesuffix(".py").replace("/", ".")
+    return name if name.startswith("topomerge") else f"topomerge.{name}"
+
+
+def test_yaml_of_extend_is_taken(tmp_path: Path) -> None:
+    """A geometry that the page adds can be named in a training."""
+    hydra = pytest.importorskip("hydra")
+    text = (ROOT / "docs" / "extend.md").read_text()
+    added = re.findall(r"\*\*One YAML\*\*, `configs/(\w+)/(\w+)\.yaml`.*?```yaml\n(.*?)```", text, re.DOTALL)
+    assert len(added) == text.count("```yaml") > 0
+    from topomerge.training.tasks import settings_of
+
+    settings_of([])  # schemas
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    for group, name, block in added:
+        (tmp_path / "configs" / group / f"{name}.yaml").write_text(block)
+        with hydra.initialize_config_dir(str(tmp_path / "configs"), version_base="1.3"):
+            settings = hydra.compose("train", overrides=[f"{group}={name}"])
+        assert list(settings.network[group].parts) == [name]
 
 
 def test_every_formula_has_its_function() -> None:

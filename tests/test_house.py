@@ -35,7 +35,7 @@ RANKS = {
     "datasets": 9,
     "checkpoint": 9,
     "training": 10,
-    "evaluation": 10,
+    "evaluation": 11,
     "cli": 13,
     "__main__": 15,
 }

@@ -13,14 +13,16 @@ from tests.test_house import ROOT, imports, sources, tree_of
 def module_of(path: Path) -> str:
     """Name under which a file is imported."""
     parts = path.relative_to(ROOT).with_suffix("").parts
-    parts = parts if parts[0] == "topomerge" else ("topomerge", *parts)
+    parts = parts if parts[0] in ("topomerge", "benchmarks") else ("topomerge", *parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 @cache
 def import_graph() -> dict[str, set[str]]:
     """Module -> the modules of the house that it imports, at its top, inside functions, or through the package's face."""
-    files = {module_of(path): path for _, _, path in sources()}
+    files = {
+        module_of(path): path for path in [*(path for _, _, path in sources()), *sorted((ROOT / "benchmarks").rglob("*.py"))]
+    }
     graph: dict[str, set[str]] = {}
     for module, path in files.items():
         if module == "topomerge":
@@ -75,8 +77,14 @@ def test_no_folder_imports_another_both_ways():
 
 def path_of(module: str) -> Path:
     """Folder of a package, or file without its ending."""
+    if module.startswith("benchmarks"):
+        return Path(*module.split("."))
     parts = module.split(".")[1:]
     return Path(*parts) if parts[:1] in (["models"], ["datasets"], ["configs"]) else Path("topomerge", *parts)
+
+
+def test_nothing_that_is_installed_imports_benchmarks():
+    assert not [(a, b) for a, others in import_graph().items() for b in others if b.startswith("benchmarks") and a[:10] != b[:10]]
 
 
 def test_circles_are_seen():

@@ -12,16 +12,18 @@ import resource
 import subprocess
 import sys
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
-from benchmarks.speed.bench import line
-from benchmarks.speed.floors import STOREY_HEIGHT, WIDTH, storey
+from benchmarks.speed.bench import STOREY_HEIGHT, WIDTH, line, storey
+from topomerge.evaluation.documents import build_stamp
+from topomerge.evaluation.headline import FIGURES, write_headline
 
 STOREY_GAP = 0.4  # m
 
 
-def measure(floors: int, preset: str, points: int, place: str) -> dict[str, object]:
+def measure(floors: int, preset: str, points: int, place: str) -> dict[str, Any]:
     """Extract `floors` storeys in this process: seconds in all and a step, peak memory (MB), rooms, storeys."""
     from topomerge.extraction.extract import extract
     from topomerge.types import PointCloud
@@ -44,17 +46,21 @@ def measure(floors: int, preset: str, points: int, place: str) -> dict[str, obje
     }
 
 
-def in_a_process(floors: int, preset: str = "default", points: int = 6_000_000, place: str = "beside") -> dict[str, object]:
+def in_a_process(floors: int, preset: str = "default", points: int = 6_000_000, place: str = "beside") -> dict[str, Any]:
     command = [sys.executable, "-m", "benchmarks.speed.extract_floor", "--measure", str(floors), preset, str(points), place]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
 
 
 def main(most: int = 16, points: int = 6_000_000) -> None:
-    """Print the lines; `most` floors at the most."""
+    """Print the lines; `most` floors at the most. With 1 the figure of the README is written."""
     in_a_process(1, points=100_000)
     one = min((in_a_process(1, points=points) for _ in range(3)), key=lambda m: m["seconds"])
     thesis = in_a_process(1, "thesis", points)
     line("extract_floor", one["seconds"], thesis["seconds"])
+    if most == 1 and points == 6_000_000:
+        stamp = build_stamp("python -m benchmarks.speed.extract_floor 1", ("topomerge.extraction.extract",))
+        ratio = f"{float(thesis['seconds']) / float(one['seconds']):.1f}"
+        write_headline(FIGURES, {"speed-floor": (ratio, "1 floor, one run of both")}, stamp)
     for step, seconds in one["steps"].items():
         print(f"#   {step}: {seconds:.2f} s")
     print(f"# {one['cells']} cells, {one['rooms']} rooms, peak {one['peak_mb']:.0f} MB; thesis: {thesis['rooms']} rooms")

@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from benchmarks.speed.bench import best, line
-from benchmarks.speed.floors import DEPTH, WIDTH, storey
+from benchmarks.speed.bench import DEPTH, WIDTH, best, line, storey
 from topomerge.extraction.views.visibility import visible_cells
 from topomerge.extraction.voxels import voxelise
 from topomerge.types import VoxelGrid

@@ -7,8 +7,7 @@ points and sorts the cells in Morton order, Open3D's averages positions. Run fro
 
 from __future__ import annotations
 
-from benchmarks.speed.bench import best, line
-from benchmarks.speed.floors import storey
+from benchmarks.speed.bench import best, line, storey
 from topomerge.extraction.voxels import voxelise
 
 

@@ -3,7 +3,7 @@
 `splits/sealed.txt` lists seeds of procedural buildings, files of real data that nothing here was made or judged by, and buildings
 of published sets that nobody here has. A line seals a building and all that lies below its name. Whatever reads plans,
 grids, published sets or makes procedural buildings asks `refuse_building` or `refuse_file` first; both let pass what is asked
-within `sealed_run` only, which `benchmarks/sealed.py` alone enters (a test reads the sources). It is run once a release.
+within `sealed_run` only, which `topomerge/evaluation/sealed.py` alone enters (a test reads the sources), once a release.
 
 What is outside cannot be held: a person who opens a sealed file with a program of their own (``topomerge extract`` among them)
 has looked at it.

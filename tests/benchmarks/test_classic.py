@@ -13,12 +13,12 @@ CELL = 0.05  # m
 
 @pytest.fixture
 def classic():
-    return importlib.import_module("benchmarks.extraction.classic")
+    return importlib.import_module("benchmarks.peers.segmentations")
 
 
 @pytest.fixture
 def occupancy():
-    return importlib.import_module("benchmarks.extraction.occupancy")
+    return importlib.import_module("benchmarks.peers.rooms")
 
 
 def plan(door: int) -> np.ndarray:
@@ -139,7 +139,7 @@ def test_rooms_that_nobody_visited_are_not_held_against_a_method(occupancy) -> N
 
 def test_a_grid_from_above(occupancy) -> None:
     """A floor of 4 m by 3 m with a wall through it, and a lamp and a low sill that are no obstacles."""
-    scans = importlib.import_module("benchmarks.extraction.scans")
+    scans = importlib.import_module("topomerge.evaluation.scans")
     from topomerge.types import PointCloud
 
     x, y = (a.ravel() for a in np.meshgrid(np.arange(0.025, 4, 0.05), np.arange(0.025, 3, 0.05)))

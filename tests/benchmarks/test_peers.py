@@ -16,7 +16,7 @@ from topomerge.types import Sim3, VoxelGrid
 
 @pytest.fixture
 def module():
-    return lambda name: importlib.import_module(f"benchmarks.merging.{name}")
+    return lambda name: importlib.import_module(f"benchmarks.peers.{name}")
 
 
 def pair_row(name="p", kind="overlap", common=100.0, overlap=0.6, sensors=("tls", "depth"), building="office-1-1", **methods):
@@ -55,7 +55,7 @@ def dies(how):
 
 @pytest.mark.longer
 def test_an_answer_over_the_cap_is_a_miss_and_those_before_it_count(module) -> None:
-    calls = module("peer_calls")
+    calls = module("methods")
     work = calls.GuardedWork(answers_slowly, seconds=1)
     answers, why, used = work(7)
     assert answers == {"first": 7} and why == calls.TOO_LONG and used >= 1
@@ -64,7 +64,7 @@ def test_an_answer_over_the_cap_is_a_miss_and_those_before_it_count(module) -> N
 
 @pytest.mark.longer
 def test_a_peer_that_dies_or_fails_is_a_miss_and_the_next_call_works(module) -> None:
-    calls = module("peer_calls")
+    calls = module("methods")
     work = calls.GuardedWork(dies)
     for how in ("killed", "raises"):
         answers, why, _ = work(how)
@@ -88,7 +88,7 @@ def corner(rng) -> np.ndarray:
 def test_peers_bring_a_cloud_back_to_itself(module, method) -> None:
     for package in ("open3d", "kiss_matcher"):
         pytest.importorskip(package)
-    methods = module("peer_methods")
+    methods = module("methods")
     a = corner(np.random.default_rng(0))
     truth = Sim3(0.7, (3.0, -2.0, 0.4))
     b = truth.inverse().apply(a)
@@ -104,7 +104,7 @@ def test_peers_bring_a_cloud_back_to_itself(module, method) -> None:
 
 
 def test_the_threshold_is_the_lowest_at_which_nearly_nothing_is_wrong(module) -> None:
-    least = module("peer_thresholds").least_score
+    least = module("thresholds").least_score
     assert least(np.array([1.0, 4, 3, 5, 2]), np.array([0, 1, 0, 1, 1]), 4) == (3.5, 1.0, 0.5)
     assert least(np.array([3.0, 2]), np.array([0, 1]), 1)[0] is None  # what is wrong scores best
     assert least(np.array([-np.inf, 2.0]), np.array([1, 1]), 2) == (1.0, 1.0, 0.5)  # no answer is never believed
@@ -129,7 +129,7 @@ def training_rows():
 
 
 def test_verdicts_are_chosen_over_variants_scores_and_residuals(module, tmp_path) -> None:
-    thresholds = module("peer_thresholds")
+    thresholds = module("thresholds")
     rows = training_rows()
     verdicts = thresholds.choose(rows)
     assert (verdicts["kiss02"].variant, verdicts["kiss02"].score, verdicts["kiss02"].at_least) == ("kiss02q", "inliers", 4.0)
@@ -145,13 +145,13 @@ def test_verdicts_are_chosen_over_variants_scores_and_residuals(module, tmp_path
 
 
 def test_what_is_believed_nowhere_stays_so(module) -> None:
-    verdict = module("peer_thresholds").PeerVerdict("fgr", "fitness", None, None, 0.0, 0.0, 0)
+    verdict = module("thresholds").PeerVerdict("fgr", "fitness", None, None, 0.0, 0.0, 0)
     assert not verdict.believes(peer_outcome(fitness=1.0, residual=0.0))
     assert not verdict.believes({"scores": {}})
 
 
 def test_rows_know_the_refined_pose_and_the_time_it_took(module) -> None:
-    rows, verdict = module("peer_rows"), module("peer_thresholds").PeerVerdict("kiss02q", "inliers", 4.5, None, 1.0, 1.0, 1)
+    rows, verdict = module("tables"), module("thresholds").PeerVerdict("kiss02q", "inliers", 4.5, None, 1.0, 1.0, 1)
     line = pair_row(ours=our_outcome(), kiss02=peer_outcome(False, inliers=9), kiss02q=peer_outcome(inliers=5))
     ours, kiss = rows.answers([line], {"kiss02": verdict})
     assert (ours["method"], ours["score"], ours["believed"]) == ("ours", 0.9, True)
@@ -164,7 +164,7 @@ def test_rows_know_the_refined_pose_and_the_time_it_took(module) -> None:
 
 def invented(module):
     """Answers of ours and FGR: two ordinary pairs, of which FGR has one right; a stranger that FGR believes."""
-    verdict = module("peer_thresholds").PeerVerdict("fgr", "fitness", 0.5, None, 1.0, 1.0, 1)
+    verdict = module("thresholds").PeerVerdict("fgr", "fitness", 0.5, None, 1.0, 1.0, 1)
     lines = [
         pair_row("one", ours=our_outcome(), fgr=peer_outcome(fitness=0.8)),
         pair_row("two", overlap=0.3, ours=our_outcome(False, 0.1), fgr=peer_outcome(False, fitness=0.6)),
@@ -172,11 +172,11 @@ def invented(module):
     ]
     for r in lines[2:]:
         r["methods"] = {m: {**o, "err": None, "err_icp": None} for m, o in r["methods"].items()}
-    return module("peer_rows").answers(lines, {"fgr": verdict})
+    return module("tables").answers(lines, {"fgr": verdict})
 
 
 def test_every_cell_of_a_crossed_table_stands_and_empty_ones_are_dashes(module) -> None:
-    rows = module("peer_rows")
+    rows = module("tables")
     lines = rows.crossed([r for r in invented(module) if r["kind"] == "overlap"]).splitlines()
     assert len(lines) == 2 + 9 and lines[0].endswith("| topomerge | FGR |")
     cells = {tuple(line.split(" | ")[:2]): line for line in lines[2:]}
@@ -186,12 +186,12 @@ def test_every_cell_of_a_crossed_table_stands_and_empty_ones_are_dashes(module) 
 
 
 def test_pairs_that_must_not_merge_are_counted_by_kind(module) -> None:
-    lines = module("peer_rows").negatives_by_kind(invented(module)).splitlines()
+    lines = module("tables").negatives_by_kind(invented(module)).splitlines()
     assert lines[2:] == ["| stranger | 3D–3D | 1 | 0 | 1 |", "| **all** |  | 1 | 0 | 1 |"]
 
 
 def test_curves_count_wrong_poses_and_strangers_against_precision(module) -> None:
-    rows = module("peer_rows")
+    rows = module("tables")
     fgr = [r for r in invented(module) if r["method"] == "fgr"]
     precision, recall = rows.curve(fgr)  # by fitness: .8 right, .7 a stranger, .6 wrong
     assert precision.tolist() == [1, 1 / 2, 1 / 3] and recall.tolist() == [0.5, 0.5, 0.5]
@@ -203,7 +203,7 @@ def test_curves_count_wrong_poses_and_strangers_against_precision(module) -> Non
 
 
 def test_where_another_has_more_right_is_told(module) -> None:
-    rows = module("peer_rows")
+    rows = module("tables")
     mine = [r for r in invented(module) if r["name"] == "one"]
     assert rows.behind(mine, [lambda r: "all"]) == "nowhere"
     off = [{**r, "err": [9.0, 0.0, 0.0]} if r["method"] == "ours" else r for r in mine]
@@ -211,31 +211,31 @@ def test_where_another_has_more_right_is_told(module) -> None:
 
 
 def test_the_figure_is_written(module, tmp_path) -> None:
-    module("peer_figure").draw_curves({"3D–3D": invented(module), "all": invented(module)}, tmp_path / "new" / "curves.png")
+    module("tables").draw_curves({"3D–3D": invented(module), "all": invented(module)}, tmp_path / "new" / "curves.png")
     assert (tmp_path / "new" / "curves.png").stat().st_size > 5000
 
 
 def test_cells_come_in_turn_and_some_more_often(module) -> None:
-    pairs = module("peer_pairs")
+    pairs = module("pairs")
     groups = {("3D–3D", "a"): list("ABCDE"), ("3D–3D", "b"): list("xy"), ("with a slice", "a"): ["s"]}
     assert "".join(pairs.in_turn(groups, lambda key: 2 if key[1] == "a" and key[0] == "3D–3D" else 1)) == "ABxsCDyE"
     assert list(pairs.in_turn({}, lambda key: 1)) == []
 
 
 def test_pairs_that_must_not_merge_are_cells_of_their_kind(module) -> None:
-    cell = module("peer_pairs").cell_of
+    cell = module("pairs").cell_of
     assert cell({"kind": "twin-wing", "common": 0.0, "sensors": ["tls", "laser2d"]}) == ("with a slice", "twin-wing")
     assert cell({"kind": "overlap", "common": 0.5, "sensors": ["tls", "drawing"]}) == ("with a floor plan", "nothing in common")
     assert cell({"kind": "overlap", "common": 80.0, "sensors": ["tls", "tls"]}) == ("3D–3D", "≥80 m²")
 
 
 def test_peers_get_the_second_map_at_the_scale_of_the_first(module) -> None:
-    pairs = module("peer_pairs")
+    pairs = module("pairs")
     cells = np.array([[0, 0, 0], [3, 1, 2]], np.int32)
     grid = VoxelGrid(cells, np.zeros(3), 0.1, (4, 4, 4))
     a, b = (grid.with_properties(mean=grid.centroids().astype(np.float32)) for _ in range(2))
     truth = Sim3(0.3, (1.0, 2.0, 0.0), 2.0)
-    pair = module("peer_pairs").GridPair("p", a, b, (None, None), truth, 1.0, {"kind": "overlap", "sensors": ["phone", "phone"]})
+    pair = module("pairs").GridPair("p", a, b, (None, None), truth, 1.0, {"kind": "overlap", "sensors": ["phone", "phone"]})
     given = pairs.thinned(pair)
     judged = pairs.scaled(pair)
     assert judged.truth.scale == 1 and np.allclose(judged.truth.apply(given.b), truth.apply(grid.centroids()), atol=1e-6)
@@ -249,7 +249,7 @@ def about_file(path, **about):
 
 
 def test_thirty_ordinary_pairs_come_first_and_unknown_scales_not_at_all(module, monkeypatch, tmp_path) -> None:
-    pairs = module("peer_pairs")
+    pairs = module("pairs")
     alike = {"kind": "overlap", "common": 90.0}
     grids = [about_file(tmp_path / f"a{k:02d}.npz", sensors=["tls", "tls"], **alike) for k in range(40)]
     grids += [about_file(tmp_path / f"s{k}.npz", sensors=["tls", "laser2d"], **alike) for k in range(2)]
@@ -264,7 +264,7 @@ def test_thirty_ordinary_pairs_come_first_and_unknown_scales_not_at_all(module, 
 
 
 def test_poses_are_judged_upright_and_misses_are_told(module, monkeypatch) -> None:
-    peers, pairs, answer = module("peers"), module("peer_pairs"), module("peer_methods").PeerAnswer
+    peers, pairs, answer = module("run"), module("pairs"), module("methods").PeerAnswer
     grid = VoxelGrid(np.array([[0, 0, 0], [30, 10, 20]], np.int32), np.zeros(3), 0.1, (40, 40, 40))
     about = {"kind": "overlap", "sensors": ["tls", "tls"], "source": "procedural", "building": "office-1-1"}
     given = pairs.thinned(pairs.GridPair("p", grid, grid, (None, None), Sim3(0.0, (1.0, 0.0, 0.0)), 1.0, about))
@@ -283,11 +283,11 @@ def test_poses_are_judged_upright_and_misses_are_told(module, monkeypatch) -> No
         [0, 0, 0]
     )
     assert outcomes["kiss02q"]["err"] is None and outcomes["kiss02q"]["status"] == ""  # it turns the map over
-    assert outcomes["fgr"]["status"] == "over the cap" and outcomes["fgr"]["seconds"] == module("peer_calls").CALL_SECONDS
+    assert outcomes["fgr"]["status"] == "over the cap" and outcomes["fgr"]["seconds"] == module("methods").CALL_SECONDS
 
 
 def test_ours_is_measured_anew_and_what_peers_answered_stays(module, monkeypatch, tmp_path) -> None:
-    peers = module("peers")
+    peers = module("run")
     monkeypatch.setattr(peers, "CACHE", tmp_path)
     lines = [{"name": name, "methods": {"ours": {"err": None}, "kiss02": {"err": [9.0, 0.0, 1.0]}}} for name in ("p", "q")]
     target = tmp_path / "peers_test.jsonl"
@@ -303,15 +303,15 @@ def test_ours_is_measured_anew_and_what_peers_answered_stays(module, monkeypatch
 
 def test_without_a_peer_nothing_is_measured(module, monkeypatch) -> None:
     """An answer of a peer that is not there would count as a miss of its."""
-    peers = module("peers")
+    peers = module("run")
     monkeypatch.setitem(peers.PACKAGES, "no_such_module", "no-such-package==1.0")
     with pytest.raises(InputError, match=r"no-such-package==1.0: not installed.*pip install"):
         peers.check_peers()
 
 
 def test_points_of_pairs_of_another_version_are_not_simulated(module, monkeypatch, tmp_path) -> None:
-    pairs = module("peer_pairs")
+    pairs = module("pairs")
     monkeypatch.setattr(pairs, "cached_order", lambda what: [tmp_path / "old.npz"])
     monkeypatch.setattr(pairs, "raw_items", lambda names: {})
-    with pytest.raises(InputError, match="old.npz: was made by another version.*cached_pairs test"):
+    with pytest.raises(InputError, match="old.npz: was made by another version.*task=merges data=test"):
         next(pairs.peer_pairs("raw", set()))

@@ -1,0 +1,100 @@
+"""Generated blocks and the README's figures: they say what made them, and what is stale is found without measuring."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from topomerge.code_digest import code_digest
+from topomerge.errors import InputError
+from topomerge.evaluation import documents, headline, results_check, tasks
+
+MODULES = ("topomerge.metrics",)
+COMMAND = "python evaluate.py task=rooms data=dev data.limit=1"
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Path:
+    path = tmp_path / "page.md"
+    path.write_text("# Page\n<!-- rooms:begin -->\nold words\n<!-- rooms:end -->\nafter\n")
+    return path
+
+
+def fresh_stamp() -> documents.Stamp:
+    return documents.build_stamp(COMMAND, MODULES, tasks.list_inputs_of(COMMAND))
+
+
+def test_a_block_says_what_made_it_and_is_fresh(page: Path) -> None:
+    assert documents.write_blocks(page, {"rooms": "| a |", "doors": "| b |"}, fresh_stamp()) == ["rooms"]
+    text = page.read_text()
+    assert "old words" not in text and "| b |" not in text and text.endswith("<!-- rooms:end -->\nafter\n")
+    ((_, block),) = documents.BLOCK.findall(text)
+    assert documents.read_stamp(block) == fresh_stamp()
+    assert not list(results_check.find_stale([page], page.parent))
+
+
+@pytest.mark.parametrize(
+    ("stamp", "said"),
+    [
+        (documents.Stamp(COMMAND, MODULES, "0123456789abcdef", "x"), "the code has changed and the data has changed since"),
+        (documents.Stamp(COMMAND, MODULES, code_digest(*MODULES), "x"), "the data has changed since"),
+        (documents.Stamp(COMMAND, ("topomerge.gone",), "0123456789abcdef", "x"), "the code has changed and the data"),
+        (documents.Stamp("python -m benchmarks.speed", MODULES, code_digest(*MODULES), "none"), ""),
+    ],
+)
+def test_what_has_changed_is_named(page: Path, stamp: documents.Stamp, said: str) -> None:
+    documents.write_blocks(page, {"rooms": "| a |"}, stamp)
+    found = list(results_check.find_stale([page], page.parent))
+    assert bool(found) == bool(said) and all(said in line and line.startswith("page.md rooms: ") for line in found)
+
+
+def test_a_block_without_a_stamp_is_stale(page: Path) -> None:
+    assert list(results_check.find_stale([page], page.parent)) == ["page.md rooms: nothing says what made it"]
+    page.write_text(page.read_text().replace("old words", "<!-- measured at commit abc123 -->"))
+    assert list(results_check.find_stale([page], page.parent)) == ["page.md rooms: measured at commit abc123, not since"]
+
+
+def test_a_page_without_marks_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="has no marks of rooms"):
+        documents.write_blocks(tmp_path / "none.md", {"rooms": ""}, fresh_stamp())
+
+
+def test_inputs_of_a_command_follow_what_it_measures() -> None:
+    one, two = (tasks.list_inputs_of(f"python evaluate.py task=rooms data=dev data.limit={n}") for n in (1, 2))
+    assert len(one) < len(two) == len(set(two)) and tasks.list_inputs_of("python -m benchmarks.speed") is None
+    assert documents.digest_inputs(two) == documents.digest_inputs(two[::-1]) != documents.digest_inputs(one)
+
+
+def test_figures_are_written_with_what_made_them(tmp_path: Path) -> None:
+    path = tmp_path / "headline.json"
+    path.write_text(headline.FIGURES.read_text(encoding="utf-8"), encoding="utf-8")
+    headline.write_headline(path, {"rooms-homes": ("0.71", "13 maps"), "nothing": ("1", "2")}, fresh_stamp())
+    entries = {e["name"]: e for e in json.loads(path.read_text(encoding="utf-8"))["figures"]}
+    assert entries["rooms-homes"]["result"] == "0.71" and "nothing" not in entries
+    assert documents.read_stamp(entries["rooms-homes"]["stamp"]) == fresh_stamp()
+    line = next(line for line in headline.tabulate_headline(path).splitlines() if "real homes" in line)
+    assert line.endswith("| 0.71 | 13 maps |")
+
+
+def test_every_figure_of_the_readme_has_a_source() -> None:
+    """The block is what the file says, each entry of which names what made it; no other result stands in the README."""
+    text = (documents.ROOT / "README.md").read_text(encoding="utf-8")
+    ((_, block),) = [found for found in documents.BLOCK.findall(text) if found[0] == "headline"]
+    assert block.strip() == headline.tabulate_headline().strip()
+    for entry in headline.read_headline():
+        assert documents.read_stamp(entry["stamp"]) or documents.OLD_STAMP.match(entry["stamp"]), entry["name"]
+        assert (documents.ROOT / entry["page"]).is_file()
+    prose = re.sub(r"(?s)```.*?```|`[^`]*`", "", documents.BLOCK.sub("", text))
+    prose = re.sub(
+        r"Python [\d.]+(?:, [\d.]+)*(?: or [\d.]+)?|[\d.]+ GB|95 % intervals", "", prose
+    )  # versions, sizes of installs
+    assert not re.findall(r"\d+(?:\.\d+)? ?%|\b\d\.\d+|\b\d+(?:\.\d+)? (?:s|seconds|times)\b|\b\d+ of \d+\b", prose)
+
+
+def test_the_check_never_fails_and_names_what_it_counts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert results_check.main() == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert last.startswith(f"{len(lines)} blocks and figures are not of this state")

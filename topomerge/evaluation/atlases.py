@@ -1,0 +1,216 @@
+"""Atlases of sets of simulated maps: time, maps placed right and wrong, registrations that were needed.
+
+``python evaluate.py task=atlases data=test sizes=[2,4,8,16] sets=4`` makes the sets that are missing and puts each together.
+Sensors and kinds of building are mixed; in every second set of four or more maps the last map is of another building of the same
+kind, which must stay apart. A map is right within 0.5 m and 5 degrees of where it lies in the first map of its component, at its
+own middle; with slices, which say nothing of heights, seen from above. Rows are kept when the code changes.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from topomerge.datasets.buildings.procedural import make_building
+from topomerge.datasets.core.builder import one_thread
+from topomerge.datasets.pairs.atlases import make_atlas
+from topomerge.datasets.pairs.evaluation_pair import sim3_of
+from topomerge.datasets.pairs.pairs import Atlas
+from topomerge.datasets.plans.splits import seeds
+from topomerge.errors import InputError
+from topomerge.evaluation.markdown import write_table
+from topomerge.evaluation.tasks import Row, Say, TaskSettings, measure_missing
+from topomerge.extraction.extract import extract
+from topomerge.fusion.atlas.result import AtlasResult
+from topomerge.fusion.atlas.solve import atlas
+from topomerge.matching.poses import pose_difference
+from topomerge.io.maps import save_map
+from topomerge.types import Array, Sim3
+
+MAKERS = ("topomerge.extraction.extract", "topomerge.fusion.atlas.solve", "topomerge.datasets.pairs.atlases")
+RIGHT = (0.5, np.radians(5.0))  # m, rad
+ATLAS_COLUMNS: tuple[str, ...] = (
+    "maps",
+    "sets",
+    "s on one core",
+    "slowest",
+    "peak MiB",
+    "pairs registered",
+    "of",
+    "placed right",
+    "wrong",
+)
+ATLAS_COLUMNS += ("median error m",)
+ATLAS_KINDS = ("office", "hospital", "school", "hotel", "lab", "openplan")
+ATLAS_SENSORS = {"tls": 3, "lidar": 2, "depth": 3, "tablet": 1, "laser2d": 1}
+ATLAS_ROOMS = (6, 12)  # of a map, fewest and most
+
+
+@dataclass
+class Settings(TaskSettings):
+    """Settings of the task.
+
+    Args:
+        sizes: numbers of maps.
+        sets: of each size.
+    """
+
+    sizes: list[int] = field(default_factory=lambda: [2, 4])
+    sets: int = 2
+
+
+def list_sets(settings: Settings) -> list[tuple[str, int, int]]:
+    """List split, size and number of each set."""
+    return [(settings.data.set or "train", size, number) for size in settings.sizes for number in range(settings.sets)]
+
+
+def list_inputs(settings: Settings) -> list[str]:
+    """Names of the sets."""
+    return [str(one) for one in list_sets(settings)]
+
+
+def measure(settings: Settings, say: Say) -> list[Row]:
+    """Measure the sets that are missing."""
+    cache = Path(settings.cache) / "atlas"
+    items = {f"{size:02d}_{number:02d}": (split, size, number, cache) for split, size, number in list_sets(settings)}
+    path = Path(settings.cache) / "evaluation" / f"atlases_{settings.data.set or 'train'}.jsonl"
+    return measure_missing(path, items, measure_set, say, settings)
+
+
+@dataclass(frozen=True)
+class AtlasSet:
+    """Files of maps, T_0k of each (None: of another building), and what they were made of."""
+
+    name: str
+    files: tuple[Path, ...]
+    truth: tuple[Sim3 | None, ...]
+    about: dict[str, object]
+
+
+def draw_set(split: str, maps: int, number: int) -> tuple[Atlas, Atlas | None]:
+    """The clouds of a set, and where it has one the other building's."""
+    rng = np.random.default_rng([maps, number, {"train": 0, "validation": 1, "test": 2}[split]])
+    names = sorted(ATLAS_SENSORS)
+    weight = np.array([ATLAS_SENSORS[n] for n in names], float)
+    sensors = rng.choice(names, maps, p=weight / weight.sum()).tolist()
+    first, last = seeds(split)
+    for _ in range(20):
+        kind, seed = str(rng.choice(ATLAS_KINDS)), int(rng.integers(first, last))
+        rooms = int(rng.integers(ATLAS_ROOMS[0], ATLAS_ROOMS[1] + 1))
+        other = number % 2 == 1 and maps >= 4
+        try:
+            atlas = make_atlas(make_building(kind, seed), sensors, rng, rooms)
+            return atlas, make_atlas(make_building(kind, seed + 1), sensors[-2:], rng, rooms) if other else None
+        except InputError:
+            continue
+    raise InputError(f"no set of {maps} maps number {number} can be made")
+
+
+def make_set(split: str, maps: int, number: int, cache: Path) -> Path:
+    """Make one set, unless it is there."""
+    folder = cache / split / f"{maps:02d}_{number:02d}"
+    if (folder / "truth.json").exists():
+        return folder
+    folder.mkdir(parents=True, exist_ok=True)
+    with one_thread():
+        atlas, other = draw_set(split, maps, number)
+        clouds = list(atlas.maps)
+        truth: list[Array | None] = [t.matrix for t in atlas.truth]
+        if other is not None:
+            clouds[-1], truth[-1] = other.maps[1], None
+        for k, cloud in enumerate(clouds):
+            name = f"map_{k:02d}_{atlas.sensors[k]}"
+            save_map(replace(extract(cloud), source=name), folder / f"{name}.tmap")
+    rooms = [[k, m, len(shared)] for (k, m), shared in sorted(atlas.shared.items())]
+    about = {
+        "building": atlas.building,
+        "sensors": atlas.sensors,
+        "shared": rooms,
+        "truth": [None if t is None else t.tolist() for t in truth],
+    }
+    (folder / "truth.json").write_text(json.dumps(about))
+    return folder
+
+
+def load_set(folder: Path) -> AtlasSet:
+    """A set that was made."""
+    about = json.loads((folder / "truth.json").read_text())
+    truth = tuple(None if t is None else sim3_of(np.array(t)) for t in about.pop("truth"))
+    return AtlasSet(folder.name, tuple(sorted(folder.glob("map_*.tmap"))), truth, about)
+
+
+def errors(made: AtlasSet, result: AtlasResult) -> dict[int, tuple[float, float] | None]:
+    """Error of each map in its component's first map, m and rad; None for maps of two buildings in one component."""
+    out: dict[int, tuple[float, float] | None] = {}
+    sensors: Any = made.about["sensors"]
+    for members in result.components:
+        first = members[0]
+        for k in members[1:]:
+            one, two = made.truth[first], made.truth[k]
+            if one is None or two is None:
+                out[k] = None
+                continue
+            true, middle = one.inverse() @ two, result.maps[k].grid.centroids().mean(axis=0)
+            off = result.transforms[k].apply(middle[None])[0] - true.apply(middle[None])[0]
+            flat = "laser2d" in (sensors[first], sensors[k])
+            out[k] = (float(np.linalg.norm(off[:2] if flat else off)), pose_difference(true, result.transforms[k], middle)[1])
+    return out
+
+
+def measure_set(split: str, maps: int, number: int, cache: Path) -> Row:
+    """Make one set and put its maps together."""
+    made = load_set(make_set(split, maps, number, cache))
+    began = process_time()
+    result = atlas(made.files)
+    seconds = process_time() - began
+    off = errors(made, result)
+    right = [k for k, e in off.items() if e is not None and e[0] < RIGHT[0] and e[1] < RIGHT[1]]
+    belong = sum(t is not None for t in made.truth)
+    best = max((sum(k in right for k in members[1:]) for members in result.components), default=0)
+    return {
+        "maps": len(made.files),
+        "seconds": seconds,  # of one core
+        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "registered": result.registered[0],
+        "pairs": result.registered[1],
+        "could": belong - 1,
+        "right": best,
+        "wrong": len(off) - len(right),
+        "components": [list(c) for c in result.components if len(c) > 1],
+        "errors": {str(k): e for k, e in off.items()},
+        "thrown": [list(link.maps) for link in result.rejected],
+        "building": made.about["building"],
+        "sensors": made.about["sensors"],
+    }
+
+
+def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
+    """Tabulate a line a size."""
+    lines = []
+    for size in settings.sizes:
+        some = [r for r in rows if r["maps"] == size]
+        if not some:
+            continue
+        seconds = [r["seconds"] for r in some]
+        off = [e[0] for r in some for e in r["errors"].values() if e]
+        cells = [
+            size,
+            len(some),
+            f"{np.median(seconds):.1f}",
+            f"{max(seconds):.1f}",
+            f"{max(r['peak_mib'] for r in some):.0f}",
+            f"{np.mean([r['registered'] for r in some]):.1f}",
+            some[0]["pairs"],
+            f"{sum(r['right'] for r in some)} of {sum(r['could'] for r in some)}",
+            sum(r["wrong"] for r in some),
+            f"{np.median(off):.2f}" if off else "–",
+        ]
+        lines.append(cells)
+    return {"atlases": write_table(ATLAS_COLUMNS, lines)}

@@ -1,0 +1,224 @@
+"""Verdicts of pairs, every one counted: what was believed that must not be, by kind and at a stated prior; calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from topomerge.datasets.core.physical import physical_building
+from topomerge.evaluation.markdown import write_table
+from topomerge.statistics import NEAR_ZERO, Calibration, calibration, exact_interval
+from topomerge.training.belief_hypotheses import fair, kind_of, right
+
+Row = dict[str, Any]
+ORIGINS = ("procedural buildings", "simulated scans of real plans", "real maps", "look-alikes, generated")
+PER_BIN = 8  # pairs
+REAL_MAPS = ("carmen", "halmstad", "strands", "utexas", "ipad", "libpointmatcher", "octomap")
+CALIBRATION_HEADS: tuple[str, ...] = (
+    "pairs of",
+    "pairs",
+    "error (by chance)",
+    "pairs of 0.1 or more",
+    "error (by chance)",
+    "believed",
+)
+CALIBRATION_HEADS += ("believed: mean probability, share right",)
+
+# Of the pairs that somebody would try and that must not merge, how many are of each kind: an assumption, not a measurement.
+# Most are of other buildings; in one building the next storey comes first. What was made to be alike is rarer.
+PRIOR = {
+    "stranger": 0.4,
+    "no room in common": 0.1,
+    "other storey": 0.2,
+    "twin wing": 0.1,
+    "repeated modules": 0.1,
+    "own mirror image": 0.03,
+    "own other half": 0.03,
+    "other look-alikes": 0.04,
+}
+MADE_ALIKE = {
+    "modules": "repeated modules",
+    "shifted-row": "repeated modules",
+    "mirror": "own mirror image",
+    "storeys": "other storey",
+    "point-symmetric": "own other half",
+}
+PRIOR_ROUNDS = 20_000
+NEGATIVE_HEADS = (
+    "kind", "pairs", "believed", "physical buildings", "with a false merge (exact 95 %)", "indistinguishable pairs",
+    "of these, believed", "highest probabilities",
+)  # fmt: skip
+
+
+def good(row: Row, limits: tuple[float, float] = (0.5, 5.0)) -> bool:
+    """Right within m and degrees; a slice or a drawing on the wrong storey is not. Maps of two places have no right pose."""
+    return bool(right(row.get("err"), row["sensors"], limits))
+
+
+def physical_of(row: Row) -> str:
+    """The physical building of map a."""
+    return str(row.get("physical") or physical_building(row.get("source", "procedural"), row["building"]))
+
+
+def negative_kind(row: Row) -> str:
+    """What makes a pair one that must not merge: a key of `PRIOR`; empty where its maps share a room.
+
+    Look-alikes are all in, as those that share rooms must not merge a period away.
+    """
+    if row.get("lookalike"):
+        return MADE_ALIKE.get(row["lookalike"], "other look-alikes")
+    if row["kind"] == "overlap":
+        return "no room in common" if kind_of(row).startswith("none") else ""
+    if row["kind"] in ("strangers", "other-building"):
+        return "other storey" if row["physical"] == row.get("physical_other") else "stranger"
+    return {"other-storey": "other storey", "twin-wing": "twin wing"}[row["kind"]]
+
+
+def broken(row: Row) -> bool:
+    """Is what is called true known to be wrong? Of a drawing of a map's own building of which the map shows nothing the
+    generator gave a twin's frame."""
+    return bool(row["kind"] == "overlap" and row.get("common", 1) < 1 and "drawing" in row["sensors"])
+
+
+def tellable(row: Row) -> bool:
+    """Could anybody tell the two places apart by what the maps show? Else the right answer is to abstain."""
+    return bool(row["tellable"]) if "tellable" in row else bool(fair(row))
+
+
+def false_merge(row: Row) -> bool:
+    """Believed, and not at a right pose."""
+    return bool(row["believed"]) and not good(row)
+
+
+def buildings_hit(rows: Sequence[Row]) -> dict[str, float]:
+    """Physical building of map a -> share of its pairs that were merged falsely."""
+    of: dict[str, list[bool]] = {}
+    for r in rows:
+        of.setdefault(physical_of(r), []).append(false_merge(r))
+    return {name: float(np.mean(hits)) for name, hits in of.items()}
+
+
+def tally(name: str, rows: Sequence[Row]) -> list[object]:
+    """A line of the table: under `NEGATIVE_HEADS`."""
+    shares = buildings_hit(rows)
+    hit = sum(share > 0 for share in shares.values())
+    low, high = exact_interval(hit, len(shares))
+    alike = [r for r in rows if not tellable(r)]
+    most = np.round(sorted((r["probability"] for r in rows), reverse=True)[:3], 2).tolist()
+    interval = f"{hit}: {100 * low:.1f} to {100 * high:.1f} %"
+    believed = sum(map(false_merge, rows))
+    return [name, len(rows), believed, len(shares), interval, len(alike), sum(map(false_merge, alike)), ", ".join(map(str, most))]
+
+
+def properties(row: Row) -> Iterator[str]:
+    """What is difficult beside the kind."""
+    yield from row.get("hard", ())
+    for sensor, name in (("laser2d", "a 2D slice"), ("drawing", "a floor plan")):
+        if sensor in row["sensors"]:
+            yield name
+
+
+def negatives(rows: Sequence[Row]) -> list[Row]:
+    """The pairs that must not merge, each with its `negative`."""
+    return [{**r, "negative": kind} for r in rows if not broken(r) and (kind := negative_kind(r))]
+
+
+def false_merges(rows: Sequence[Row]) -> str:
+    """The table of `negatives`: kinds, all, those that nobody can tell apart, and what is difficult."""
+    out = [tally(kind, mine) for kind in PRIOR if (mine := [r for r in rows if r["negative"] == kind])]
+    out.append(tally("**all**", rows))
+    alike = [r for r in rows if not tellable(r)]
+    if alike:
+        out.append(tally("**indistinguishable** (of all; right: to abstain)", alike))
+    for name in sorted({name for r in rows for name in properties(r)}):
+        out.append(tally(f"of all, with {name}", [r for r in rows if name in properties(r)]))
+    return write_table(NEGATIVE_HEADS, out)
+
+
+def rate_at(rows: Sequence[Row], prior: Mapping[str, float] = PRIOR) -> tuple[float, float, float]:
+    """Share of false merges at a prior of kinds, and the ends of its 95 % interval; nan where there is no row.
+
+    Of each kind the mean over its physical buildings of the share of their pairs. What of a kind is not sure is drawn as of k of
+    n buildings, Beta(k + 1/2, n - k + 1/2) (Jeffreys' prior). Kinds without a row are left out, and the others' shares raised.
+    """
+    total = sum(weight for kind, weight in prior.items() if any(r["negative"] == kind for r in rows))
+    if not total:
+        return float("nan"), float("nan"), float("nan")
+    rng = np.random.default_rng(0)
+    rate, drawn = 0.0, np.zeros(PRIOR_ROUNDS)
+    for kind, weight in prior.items():
+        shares = list(buildings_hit([r for r in rows if r["negative"] == kind]).values())
+        if shares:
+            hits = sum(shares)
+            rate += weight / total * hits / len(shares)
+            drawn += weight / total * rng.beta(hits + 0.5, len(shares) - hits + 0.5, PRIOR_ROUNDS)
+    low, high = np.quantile(drawn, [0.025, 0.975]).tolist()
+    return rate, low, high
+
+
+def headline(rows: Sequence[Row]) -> str:
+    """The rate at `PRIOR` with every pair in, and without what nobody can tell apart, in words."""
+    shares = ", ".join(f"{kind} {weight:g}" for kind, weight in PRIOR.items())
+    missing = [kind for kind in PRIOR if not any(r["negative"] == kind for r in rows)]
+    rate, low, high = (100 * v for v in rate_at(rows))
+    apart, least, most = (100 * v for v in rate_at([r for r in rows if tellable(r)]))
+    text = f"**{rate:.1f} % [{low:.1f}, {high:.1f}] of the pairs that must not merge are believed**, over all pairs, at this "
+    text += f"prior of kinds: {shares}. Without the indistinguishable pairs it is {apart:.1f} % [{least:.1f}, {most:.1f}]."
+    return text + (f" Not measured, so the other shares are scaled up: {', '.join(missing)}." if missing else "")
+
+
+def origin(row: Row) -> str:
+    """Where the maps of a pair are from: one of `ORIGINS`; a real plan beside a procedural building is a real plan.
+
+    Look-alikes stand apart: a set of pairs that are all made to deceive says nothing of how sure a probability is elsewhere.
+    """
+    if row.get("lookalike"):
+        return ORIGINS[3]
+    sources = {row.get("source", "procedural"), row.get("other_source", row.get("source", "procedural"))}
+    if sources & set(REAL_MAPS):
+        return ORIGINS[2]
+    return ORIGINS[0] if sources == {"procedural"} else ORIGINS[1]
+
+
+def calibrated(rows: Sequence[Row]) -> Calibration:
+    """`calibration` of the probabilities of pairs, in ten bins, or fewer where a bin of those above the mass near zero would have
+    fewer than `PER_BIN`."""
+    above = sum(r["probability"] >= NEAR_ZERO for r in rows)
+    return calibration([r["probability"] for r in rows], [good(r) for r in rows], min(max(above // PER_BIN, 1), 10))
+
+
+def errors(groups: Mapping[str, Sequence[Row]]) -> str:
+    """A line a group of pairs: the calibration error with and without the mass near zero, and how believed pairs fare."""
+    out: list[Sequence[object]] = []
+    for name, rows in groups.items():
+        if rows:
+            whole, believed = calibrated(rows), [r for r in rows if r["believed"]]
+            means = [float(np.mean([f(r) for r in believed])) for f in (probability_of, good)] if believed else []
+            above = [write_error(whole.above), int(whole.above.count.sum())] if whole.above else ["–", 0]
+            out.append(
+                [name, len(rows), write_error(whole), *above[::-1], len(believed), ", ".join(f"{m:.2f}" for m in means) or "–"]
+            )
+    return write_table(CALIBRATION_HEADS, out)
+
+
+def probability_of(row: Row) -> float:
+    """Get the probability of a pair."""
+    return float(row["probability"])
+
+
+def write_error(c: Calibration) -> str:
+    """Write a calibration error and what chance makes of it."""
+    return f"{c.error:.3f} ({c.by_chance:.3f})"
+
+
+def reliability(rows: Sequence[Row]) -> str:
+    """A line a bin of equal mass and origin: of all pairs, and of those of 0.1 and above."""
+    out: list[Sequence[object]] = []
+    for name in ORIGINS:
+        whole = calibrated([r for r in rows if origin(r) == name])
+        for title, c in ((f"{name}, all", whole), (f"{name}, 0.1 or more", whole.above)):
+            bins = zip(c.count.tolist(), c.probability.tolist(), c.right.tolist(), strict=True) if c else ()
+            out += [[title, n, f"{p:.2f}", f"{y:.2f}"] for n, p, y in bins]
+    return write_table(("pairs of", "pairs", "mean probability", "share right"), out)

@@ -1,0 +1,187 @@
+"""Finding a place among many maps: are the right building and the right room among the first? (`fusion.atlas.find`)
+
+``python evaluate.py task=retrieval write=docs/results/learning.md``: of a cached set of evaluation pairs (``manifest``, which
+``python -m topomerge.datasets.pairs.build data=heldout cache=cache/evaluation`` makes) the first map of each pair stands in the
+atlas, and the second map of each pair that has a room in common is looked for: compared with all maps, and with those on
+a shortlist. ``data=real``: real maps are looked for among those of the set and all other real ones.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from topomerge.datasets.core.physical import physical_building
+from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair, load_set
+from topomerge.datasets.real.maps import real_evaluation_pairs
+from topomerge.datasets.real.sources import REAL_SOURCES
+from topomerge.embedding.embedders import embedder
+from topomerge.embedding.room_cells import Descriptor
+from topomerge.embedding.turns import Rows
+from topomerge.evaluation.tasks import Row, Say, TaskSettings, find_real_data
+from topomerge.fusion.atlas.find import SHORTLIST, ranked, shortlist
+from topomerge.fusion.atlas.partners import most_alike, nearest, owners, queries, vectors, votes
+from topomerge.statistics import interval_text
+
+FIRST = (1, 5, 10)
+PARTNER_PAIRS, PARTNER_DRAWS = 15, 40  # pairs in an atlas of which partners are asked for, and how often they are drawn
+MAKERS = ("topomerge.embedding.embedders", "topomerge.fusion.atlas.find", "topomerge.extraction.extract")
+
+
+@dataclass
+class Settings(TaskSettings):
+    """Settings of the task.
+
+    Args:
+        descriptor: as of topomerge match.
+        manifest: of the cached pairs, below `cache`.
+    """
+
+    descriptor: str = "learned"
+    manifest: str = "evaluation/heldout.jsonl"
+
+
+@dataclass(frozen=True)
+class Search:
+    """A map that was looked for.
+
+    Args:
+        building: the physical one.
+        rank: of the first map of its building, from 1.
+        first: name of the map that came first.
+        rooms: share of its rooms with a partner that stand beside it in the pair's map, if that map is named.
+        seconds: of the search, without the rows of the new map.
+    """
+
+    building: str
+    rank: int
+    first: str
+    rooms: float
+    seconds: float
+
+
+def building(pair: EvaluationPair) -> str:
+    """The physical building of a pair."""
+    return physical_building(str(pair.about["source"]), str(pair.about["building"]))
+
+
+def searches(
+    pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]], compared: int, first: int | None = None
+) -> list[Search]:
+    """Look for the second map of each pair that has a room in common among the first maps of all pairs.
+
+    Args:
+        compared: maps that are compared room by room; with fewer than all by a shortlist.
+        first: pairs of which one is looked for; all if left out.
+    """
+    of, atlas = [building(pair) for pair in pairs], [a for a, _ in rows]
+    places, owner = np.concatenate([vectors(a) for a in atlas]), owners([len(a) for a in atlas])
+    out = []
+    for k, pair in enumerate(pairs[:first]):
+        if not len(pair.matches):
+            continue
+        began = time.process_time()
+        maps, new = list(range(len(pairs))), rows[k][1]
+        if compared < len(pairs):
+            asked = queries(new)
+            maps = shortlist(votes(*nearest(places, np.concatenate(asked)), len(asked), owner, len(pairs)), compared)
+        sightings = ranked([str(m) for m in maps], [atlas[m] for m in maps], new, compared)
+        seconds = time.process_time() - began
+        rank = next((n for n, s in enumerate(sightings, 1) if of[int(s.name)] == of[k]), len(pairs))
+        best = {new: room for s in sightings if s.name == str(k) for new, room, _ in s.rooms}
+        true = {(int(i), int(j)) for i, j in pair.matches}
+        with_partner = sorted({j for _, j in true})
+        right = [(best.get(j), j) in true for j in with_partner]
+        out.append(Search(of[k], rank, sightings[0].name, float(np.mean(right)), seconds))
+    return out
+
+
+def real_searches(
+    pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]], real: Sequence[EvaluationPair], describe: Descriptor
+) -> tuple[list[Search], str]:
+    """Look for the second map of each real pair among the first maps of all pairs; and which ones are not first, in words."""
+    ours = [(describe(a), describe(b)) for a, b in (pair.maps() for pair in real)]
+    those = searches([*real, *pairs], [*ours, *rows], len(real) + len(pairs), len(real))
+    named = [pair for pair in real if len(pair.matches)]
+    late = [f"{pair.about['title']} {s.rank}" for pair, s in zip(named, those, strict=True) if s.rank > 1]
+    return those, f"Not first: {', '.join(late) or 'none'}."
+
+
+def partners_named(pairs: Sequence[tuple[Rows, Rows]]) -> float:
+    """Share of pairs of which one map names the other, in an atlas of all of them."""
+    named = list(most_alike([a for a, _ in pairs] + [b for _, b in pairs], FIRST[-1]))
+    return float(np.mean([k + len(pairs) in named[k] or k in named[k + len(pairs)] for k in range(len(pairs))]))
+
+
+def partners_text(pairs: Sequence[EvaluationPair], rows: Sequence[tuple[Rows, Rows]]) -> str:
+    """What atlases would register of the pairs with a room in common."""
+    common = [of for pair, of in zip(pairs, rows, strict=True) if len(pair.matches)]
+    rng = np.random.default_rng(0)
+    draws = [rng.permutation(len(common))[:PARTNER_PAIRS] for _ in range(PARTNER_DRAWS)]
+    few = np.mean([partners_named([common[k] for k in draw]) for draw in draws])
+    said = f"Pairs in which one map is among the {FIRST[-1]} most similar of the other: {few:.2f} of {PARTNER_PAIRS} pairs in an"
+    all_of_them = f"{partners_named(common):.2f} of {len(common)} in one of {2 * len(common)}"
+    return f"{said} atlas of {2 * PARTNER_PAIRS} maps ({PARTNER_DRAWS} draws), {all_of_them}."
+
+
+def table(results: Sequence[tuple[str, Sequence[Search]]], maps: int, buildings: int, rooms: int) -> str:
+    """Named results as Markdown."""
+    groups = np.array([r.building for r in results[0][1]])
+    chance = [1 - (1 - 1 / buildings) ** n for n in FIRST]
+    lines = [
+        f"Queries: {len(groups)} maps of {len(set(groups))} physical buildings; atlas: {maps} maps of {buildings} buildings with "
+        f"{rooms} rooms. In brackets 95 % intervals over buildings.",
+        "",
+        "| embedder | building first | among 5 | among 10 | same first map | rooms matched right | s per query |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, of in results:
+        first = [interval_text(np.array([r.rank <= n for r in of], float), groups) for n in FIRST]
+        right = interval_text(np.array([r.rooms for r in of]), groups)
+        same = np.mean([r.first == one.first for r, one in zip(of, results[0][1], strict=True)])
+        seconds = np.median([r.seconds for r in of])
+        lines.append(f"| {name} | {' | '.join(first)} | {same:.2f} | {right} | {seconds:.2f} |")
+    return "\n".join([*lines, f"| by chance | {' | '.join(f'{c:.2f}' for c in chance)} | | | |"])
+
+
+def load_real_pairs(cache: Path) -> list[EvaluationPair]:
+    """Load all real pairs, extracted where they are missing."""
+    return [load_evaluation_pair(file) for file in real_evaluation_pairs(str(find_real_data()), cache, REAL_SOURCES)]
+
+
+def count_rooms(pairs: Sequence[EvaluationPair]) -> int:
+    """Count the rooms of the first maps."""
+    return sum(len(pair.maps()[0].rooms) for pair in pairs)
+
+
+def list_inputs(settings: Settings) -> list[str]:
+    """Names of set and descriptor."""
+    return [settings.data.set, settings.manifest, settings.descriptor]
+
+
+def measure(settings: Settings, say: Say) -> list[Row]:
+    """Look for every map: one row with the tables' words, as searches are seconds beside the descriptors."""
+    pairs = load_set(Path(settings.cache) / settings.manifest)[: settings.data.limit or None]
+    name, describe = settings.descriptor, embedder(settings.descriptor)
+    rows = [(describe(a), describe(b)) for a, b in (pair.maps() for pair in pairs)]
+    say(f"{len(rows)} pairs described")
+    if settings.data.set == "real":
+        real = load_real_pairs(Path(settings.cache) / "evaluation")
+        results, said = real_searches(pairs, rows, real, describe)
+        atlas = [*real, *pairs]
+        text = table([(name, results)], len(atlas), len({building(pair) for pair in atlas}), count_rooms(atlas))
+        return [{"name": "retrieval-real", "text": f"{text}\n\n{said}"}]
+    compared = [(name, searches(pairs, rows, len(pairs)))]
+    if len(pairs) > SHORTLIST:
+        compared.append((f"{name}, shortlist of {SHORTLIST}", searches(pairs, rows, SHORTLIST)))
+    text = table(compared, len(pairs), len({building(pair) for pair in pairs}), count_rooms(pairs))
+    return [{"name": "retrieval", "text": f"{text}\n\n{partners_text(pairs, rows)}"}]
+
+
+def tabulate(rows: Sequence[Row], settings: Settings) -> dict[str, str]:
+    """Give the tables of the one row."""
+    return {row["name"]: row["text"] for row in rows}

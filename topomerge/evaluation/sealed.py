@@ -1,0 +1,168 @@
+"""The sealed run: ``make sealed``, once a release, by whoever releases.
+
+``python -m topomerge.evaluation.sealed [--jobs 2]`` measures rooms and merges on the sealed set (`datasets/plans/sealed.py`),
+which nothing else can read, and appends a block to ``docs/results/sealed.md``: date, version,
+command, figures. What stands there is never written again. About 25 minutes on two cores: 110 pairs of grids (a quarter of
+which must not merge), 40 scans of procedural buildings, and the sealed plans and grids of real buildings, if TOPOMERGE_DATA is
+set. ``--public s3dis=FOLDER`` adds the sealed buildings of a published set. A version is measured once; ``--again`` does it once
+more, and the block says so.
+
+``--small`` runs two or three items of training seeds, to try the way; it writes to ``--page`` only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
+from datetime import UTC, datetime
+from pathlib import Path
+
+from topomerge import __version__
+from topomerge.datasets.core.script import exit_status
+from topomerge.datasets.plans.sealed import SEALED, sealed_run
+from topomerge.errors import InputError
+from topomerge.evaluation.sealed_measures import SEALED_PARTS, Row, SealedItem, items_of, measured, tables
+from topomerge.io.atomic import replacing
+
+ROOT = Path(__file__).parent.parent.parent
+PAGE = ROOT / "docs" / "results" / "sealed.md"
+HEAD = """# The sealed set
+
+Buildings that no script of training, fitting, choosing or looking can read ([what they are](../data.md#the-sealed-set)), measured
+once a release by `make sealed`. Blocks are appended, never written again.
+"""
+
+
+def sealed_rows(item: SealedItem, split: str) -> list[Row]:
+    """The rows of an item, in this process; the gate is open for as long as that takes."""
+    with sealed_run() if split == SEALED else nullcontext():
+        return measured(item)
+
+
+def run(
+    split: str, data: Path | None, public: Sequence[tuple[str, Path]], jobs: int, small: bool, parts: Sequence[str] = SEALED_PARTS
+) -> list[Row]:
+    """Measure everything of these parts, in the order of the items."""
+    from joblib import Parallel, delayed
+
+    with sealed_run() if split == SEALED else nullcontext():
+        items = [item for item in items_of(split, data, public, small) if item.part in parts]
+    print(f"sealed: {len(items)} items", file=sys.stderr, flush=True)
+    if jobs == 1:
+        return [row for item in items for row in sealed_rows(item, split)]
+    made: Iterable[list[Row]] = Parallel(jobs, batch_size=1, pre_dispatch=jobs)(delayed(sealed_rows)(i, split) for i in items)
+    return [row for rows in made for row in rows]
+
+
+def commit() -> str:
+    """The commit of the sources, with a word where they differ from it; nothing outside a checkout."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=False)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    named = git("rev-parse", "--short=12", "HEAD")
+    return f"{named} with changes that are not committed" if named and git("status", "--porcelain") else named
+
+
+def blocks(text: str) -> list[str]:
+    """Versions of the blocks of a page."""
+    return re.findall(r"(?m)^## \d{4}-\d\d-\d\d \d\d:\d\d UTC: version (\S+?)(?:,|$)", text)
+
+
+def check_page(page: Path, version: str, again: bool) -> None:
+    """Refuse to measure a version twice.
+
+    Raises:
+        InputError: it was measured, and nobody asks for it again.
+    """
+    if not again and page.is_file() and version in blocks(page.read_text(encoding="utf-8")):
+        raise InputError(f"{page}: has a block of version {version}; a version is measured once (--again does it once more)")
+
+
+def block(rows: Sequence[Row], version: str, command: str, seconds: float, before: int) -> str:
+    """What is appended.
+
+    Args:
+        before: blocks of the same version that are there.
+    """
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    source = commit()
+    title = f"## {now}: version {version}" + (f", commit {source}" if source else "")
+    again = f" This version had been measured {before} times before: the set was not sealed for it any more." if before else ""
+    took = f"`{command}`, {seconds / 60:.0f} minutes.{again}"
+    return "\n".join(["", title, "", took, "", *tables(rows), ""])
+
+
+def append(page: Path, text: str) -> None:
+    """Add text to the end of a page: what stands there stays as it is, byte for byte, and the page is whole at any time."""
+    before = page.read_bytes() if page.is_file() else HEAD.encode()
+    with replacing(page) as beside:
+        beside.write_bytes(before + text.encode())
+
+
+def public_sets(words: Sequence[str]) -> list[tuple[str, Path]]:
+    """Sources and folders of SOURCE=FOLDER.
+
+    Raises:
+        InputError: not of this form, or no such folder.
+    """
+    out = []
+    for word in words:
+        source, _, folder = word.partition("=")
+        if not folder or not Path(folder).is_dir():
+            raise InputError(
+                f"--public {word}: give SOURCE=FOLDER, such as s3dis=Stanford3dDataset_v1.2, with a folder that exists"
+            )
+        out.append((source, Path(folder)))
+    return out
+
+
+def arguments(words: Sequence[str]) -> argparse.Namespace:
+    """What the command line says."""
+    parser = argparse.ArgumentParser(
+        prog="python -m topomerge.evaluation.sealed", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--again", action="store_true", help="measure a version that was measured; the block says so")
+    parser.add_argument("--small", action="store_true", help="a few items of training seeds")
+    parser.add_argument("--parts", nargs="+", choices=SEALED_PARTS, default=list(SEALED_PARTS), help="what is measured")
+    parser.add_argument("--public", nargs="*", default=[], metavar="SOURCE=FOLDER", help="published sets")
+    parser.add_argument("--page", type=Path, help="where the block goes; docs/results/sealed.md")
+    return parser.parse_args(words)
+
+
+def measure_and_append(words: Sequence[str]) -> None:
+    """The whole run."""
+    options = arguments(words)
+    page = options.page or (None if options.small else PAGE)
+    if page:
+        check_page(page, __version__, options.again)
+    before = blocks(page.read_text(encoding="utf-8")).count(__version__) if page and page.is_file() else 0
+    data = Path(os.environ["TOPOMERGE_DATA"]) if os.environ.get("TOPOMERGE_DATA") and not options.small else None
+    began = time.time()
+    split, public = "train" if options.small else SEALED, public_sets(options.public)
+    rows = run(split, data, public, options.jobs, options.small, options.parts)
+    text = block(
+        rows, __version__, shlex.join(["python", "-m", "topomerge.evaluation.sealed", *words]), time.time() - began, before
+    )
+    if page:
+        append(page, text)
+    print(text)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run; the exit status."""
+    said = list(sys.argv[1:] if words is None else words)
+    return exit_status("sealed", lambda: measure_and_append(said), "nothing was written")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
