@@ -190,12 +190,6 @@ def seats(scene: Scene, rows) -> Scene:
     return scene
 
 
-def slice_of(scene: Scene, z: float) -> np.ndarray:
-    """What a laser that looks level shows."""
-    points = scene.points(0.005)
-    return points[np.abs(points[:, 2] - z) < 0.04]
-
-
 WITH_AND_WITHOUT_AISLE = pytest.mark.parametrize("rows", [((4.0, 16.0),), ((3.5, 9.4), (10.6, 16.5))])
 
 
@@ -205,39 +199,6 @@ def test_a_hall_with_rows_of_seats_and_a_counter_is_one_room(rows) -> None:
     points = scene.points(0.005)[::3]
     map = extract(points)
     assert len(map.rooms) == 1 and map.rooms["area"][0] == pytest.approx(240, rel=0.03)
-
-
-@WITH_AND_WITHOUT_AISLE
-@pytest.mark.parametrize("height", [0.3, 0.7])  # of the laser: at the seats, and at their backs
-def test_a_hall_with_rows_of_seats_is_one_room_in_a_slice(rows, height) -> None:
-    map = extract(slice_of(seats(Scene().shell(0, 0, 20, 12, height=4.0), rows), height))
-    assert len(map.rooms) == 1 and map.rooms["area"][0] == pytest.approx(240, rel=0.03)
-
-
-def test_a_school_with_a_lecture_hall_keeps_its_other_rooms_in_a_slice() -> None:
-    scene = Scene().shell(0, 0, 20, 20).wall((0, 12), (20, 12), doors=(3.0, 17.0))
-    scene.wall((0, 14.5), (20, 14.5), doors=(2.0, 7.0, 12.0, 17.0))
-    for x in (5, 10, 15):
-        scene.wall((x, 14.5), (x, 20))
-    map = extract(slice_of(seats(scene, ((4.0, 16.0),)), 0.3))
-    assert sorted(map.rooms["area"]) == pytest.approx([27, 27, 27, 27.5, 48, 238], rel=0.04)
-
-
-@pytest.mark.parametrize("doors", [(4.2, 15.8), (3.0, 17.0), (4.0, 10.0, 16.0)])
-def test_a_wall_with_doors_close_behind_the_last_row_parts_the_hall_from_the_corridor(doors) -> None:
-    scene = Scene().shell(0, 0, 20, 20).wall((0, 11), (20, 11), doors=doors)
-    scene.wall((0, 14.5), (20, 14.5), doors=(2.0, 7.0, 12.0, 17.0))
-    for x in (5, 10, 15):
-        scene.wall((x, 14.5), (x, 20))
-    map = extract(slice_of(seats(scene, ((4.0, 16.0),)), 0.3))
-    assert sorted(map.rooms["area"]) == pytest.approx([27, 27, 27, 27.5, 68, 218], rel=0.04)
-
-
-def test_a_store_with_shelves_is_one_room_in_a_slice() -> None:
-    scene = Scene().shell(0, 0, 14, 10)
-    for k in range(6):
-        scene.box(2, 1.4 + 1.4 * k, 0, 12, 1.8 + 1.4 * k, 2.0)
-    assert len(extract(slice_of(scene, 0.3)).rooms) == 1
 
 
 def cubicles(height: float) -> Scene:

@@ -30,8 +30,8 @@ from topomerge.evaluation.tasks import Row, Say, TaskSettings, measure_missing
 from topomerge.extraction.extract import extract
 from topomerge.fusion.atlas.result import AtlasResult
 from topomerge.fusion.atlas.solve import atlas
-from topomerge.matching.poses import pose_difference
 from topomerge.io.maps import save_map
+from topomerge.matching.poses import pose_difference
 from topomerge.types import Array, Sim3
 
 MAKERS = ("topomerge.extraction.extract", "topomerge.fusion.atlas.solve", "topomerge.datasets.pairs.atlases")

@@ -38,11 +38,6 @@ MAKERS = (
     "topomerge.registration.pipeline",
     "topomerge.registration.bend.bend",
 )
-    "topomerge.extraction.extract",
-    "topomerge.fusion.fuse",
-    "topomerge.registration.pipeline",
-    "topomerge.registration.bend.bend",
-)
 JOINED_PAIRS = 30  # if no limit is given
 WAYS = ("rigid", "bent")
 HEADS = ("pairs", "rooms of the better map", "of the joined map", "not below the better", "doors of the better", "of the joined",

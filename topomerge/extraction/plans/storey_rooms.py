@@ -17,7 +17,6 @@ from topomerge.extraction.plans.partition import Pair, Partition, merge_regions
 from topomerge.extraction.plans.passages import clearance_of, find_passages, regions_of
 from topomerge.extraction.plans.plan import columns_of, storey_plan
 from topomerge.extraction.plans.plan_network import column_probabilities, weights, without_furniture
-from topomerge.extraction.plans.rows_of_seats import without_rows
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.plans.upper_sides import without_upper_sides
 from topomerge.types import Array, VoxelGrid
@@ -79,8 +78,6 @@ def look_at(
 ) -> tuple[StoreyPlan, Array]:
     """The plan of storey `k` without furniture, and what probably stands in each of its columns (nx, ny, 5)."""
     plan = storey_plan(grid, navigable, storey, k, others.crossed)
-    if others.flat or others.raised:
-        plan = without_rows(plan)
     probability = column_probabilities(plan, weights(others.raised))
     return without_furniture(plan, probability), probability
 
