@@ -60,7 +60,7 @@ def judged_pair(pair: Pair, maps: Sequence[TopometricMap]) -> EvaluationPair:
     """What is true of two extracted maps; nothing is kept of them."""
     truths = [room_truth(map, cloud) for map, cloud in zip(maps, (pair.a, pair.b), strict=True)]
     labelled = bool(pair.a.rooms)
-    matches = true_matches(*truths, pair.shared) if labelled else laid(pair, maps)
+    matches = true_matches(truths[0], truths[1], pair.shared) if labelled else laid(pair, maps)
     true, rooms = [truth["room"] for truth in truths], (pair.a.rooms, pair.b.rooms)
     alike = [twins(true[k], true[1 - k], rooms[k], rooms[1 - k]) for k in (0, 1)]
     glimpsed = [np.array(map.rooms["glimpsed"], bool) for map in maps]

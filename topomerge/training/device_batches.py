@@ -172,7 +172,7 @@ class DevicePairs:
     def _load_sheets(self, sheets: Sequence[tuple[Tensor, Tensor]]) -> None:
         """Put each storey on the device once: eight bytes a pixel, its planes, and its room."""
         number: dict[tuple[int, int], int] = {}
-        once = []
+        once: list[tuple[Tensor, Tensor]] = []
         keys = [(planes.data_ptr(), room.data_ptr()) for planes, room in sheets]  # pairs share the storeys of their maps
         for key, sheet in zip(keys, sheets, strict=True):
             if key not in number:
