@@ -22,7 +22,8 @@ from topomerge.datasets.simulation.scanner import moved
 
 from topomerge.extraction.extract import gather_evidence, read_navigable
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
-from topomerge.extraction.plans.passages import door_features
+from topomerge.extraction.passages import EVIDENCE
+from topomerge.extraction.plans.passages import DOOR_FEATURES, door_features
 from topomerge.extraction.segment import GrowingRooms, SegmentedStorey, log_odds, score_by_plan
 from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.io import archive
@@ -52,7 +53,7 @@ class PassageExamples:
         plan: (n,) log odds of a door by the plan alone.
         evidence: (n, 4) `EVIDENCE`.
         parted: (n,) bool, do they part two true rooms?
-        kind: "walls", "flat" or "" (`passages.choose_scorer`).
+        kind: "walls", or "" of a scan that shows none at heights (`passages.choose_scorer`).
     """
 
     features: Array
@@ -96,10 +97,10 @@ def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
         flat = storey.plan.origin + (columns + 0.5) * storey.plan.edge
         places = np.concatenate([flat, storey.plan.floor[..., None]], axis=-1)
         rows += storey_passages(storey, truth_of(made.building, storey.plan, places, made.frame, made.shift)[0], visited)
-    count, kind = len(rows), "walls" if found.walls is not None else "flat" if scan.flat else ""
+    count, kind = len(rows), "walls" if found.walls is not None else ""
     features, odds, evidence, parted = zip(*rows, strict=True) if rows else ((), (), (), ())
     return PassageExamples(
-        np.array(features, float).reshape(count, -1), np.array(odds, float), np.array(evidence, float).reshape(count, -1),
+        np.array(features, float).reshape(count, len(DOOR_FEATURES)), np.array(odds, float), np.array(evidence, float).reshape(count, len(EVIDENCE)),
         np.array(parted, bool), kind,
     )  # fmt: skip
 

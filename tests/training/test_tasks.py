@@ -121,7 +121,7 @@ def read(task: str) -> Any:
         "room_matcher": lambda: matcher_weights()["rows.w"],
         "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
         "wall_colours": lambda: colour_weights()["out.w"],
-        "passages": lambda: choose_scorer(True, False)(np.ones((2, 17)), tiny.passages(2)),
+        "passages": lambda: choose_scorer(True)(np.ones((2, 17)), tiny.passages(2)),
         "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(4, EDGE_DTYPE), signs, np.arange(4))),
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "room_odds": lambda: np.array(room_weights()["entered"]),

@@ -241,12 +241,12 @@ def passages(count: int) -> list[Passage]:
 
 
 def passage_scans(count: int) -> list[PassageExamples]:
-    """Scans with walls and slices in turn, in which a door is what the plan and, surer, the evidence says."""
+    """Scans with walls, in which a door is what the plan and, surer, the evidence says."""
     scans = []
     for k in range(count):
         rng = np.random.default_rng(k)
         evidence = np.column_stack([rng.normal(0, 3, (40, 2)), rng.random((40, 2)) < 0.3]).astype(float)
         parted = evidence[:, 0] + rng.normal(0, 0.5, 40) > 0
         plan = np.where(parted, 1.0, -1.0) + rng.normal(0, 2, 40)
-        scans.append(PassageExamples(rng.random((40, 17)), plan, evidence, parted, ("walls", "flat")[k % 2]))
+        scans.append(PassageExamples(rng.random((40, 17)), plan, evidence, parted, "walls"))
     return scans

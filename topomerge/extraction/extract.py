@@ -153,7 +153,7 @@ def cut_rooms(
     found = gather_evidence(scan, navigable, p, watch, parts)
     watch.begin("rooms", 0.75)
     weigh = p.walls and not parts
-    score = choose_scorer(weigh and found.walls is not None, weigh and scan.flat)
+    score = choose_scorer(weigh and found.walls is not None)
     door = p.slice_door if scan.flat else p.door
     least, half_width = (FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH) if scan.flat else (ROOM_LEAST_AREA, ROOM_LEAST_HALF_WIDTH)
     cut = [partition_rooms(storey, score, door, least, half_width) for storey in found.storeys]  # 2.6

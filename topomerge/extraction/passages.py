@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 
+from topomerge.errors import InputError
 from topomerge.extraction.elevations.doorways import StoreyWalls
 from topomerge.extraction.elevations.wall_doors import SUREST, WALL_DOOR_FEATURES, door_candidates, door_chance
 from topomerge.extraction.plans.door_classifier import door_probability
@@ -25,9 +26,9 @@ from topomerge.types import EDGE_DTYPE, Array
 # Of a passage, beside the plan: log odds of a door by walls, plan network and plan together (`door_chance`), and of a doorway
 # that walls show there, on average along it; 0 or 1: the sensor was carried through, a doorway split the segment.
 EVIDENCE = ("door", "shown", "walked", "within")
-# What the score weighs: log odds by the plan, the evidence, and log m2 of the smaller side.
-SCORE_INPUTS = ("constant", "plan", "door", "shown", "walked", "walked door", "within", "small", "small plan")
-KINDS = ("walls", "flat")  # of scans: walls show at heights; slices
+# What the score weighs: log odds by the plan, and of a doorway that walls show; those against a door where somebody walked; 0 or 1.
+SCORE_INPUTS = ("constant", "plan", "shown", "walked without door", "within")
+KINDS = ("walls",)  # of scans that have a model: walls show at heights
 PASSAGES_FILE = "passages.json"
 MOST_LOG_ODDS = 8.0
 WAY_SAMPLE = 0.05  # m along the sensor's way
@@ -61,46 +62,45 @@ def find_passages(
     return out
 
 
-def score_passages(x: Array, passages: Sequence[Passage], weights: Sequence[float]) -> Array:
+def score_passages(x: Array, passages: Sequence[Passage], weights: Array) -> Array:
     """(n,) calibrated probability that a door parts the two sides of each passage, by all evidence.
 
     Args:
         x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
-        weights: (9,) of `SCORE_INPUTS`.
+        weights: (5,) of `SCORE_INPUTS`.
     """
     evidence = np.array([passage.evidence for passage in passages], float)
-    return sigmoid(compute_inputs(x, log_odds(door_probability(x)), evidence) @ np.asarray(weights, float))
+    return sigmoid(compute_inputs(log_odds(door_probability(x)), evidence) @ weights)
 
 
-def choose_scorer(walls: bool, flat: bool) -> Scorer:
-    """The score of a scan's passages: one of those that were fitted; of raised plans and joined maps the plan's alone.
+def choose_scorer(walls: bool) -> Scorer:
+    """The score of a scan's passages: by all evidence; of slices, raised plans and joined maps by the plan and what the parts say.
 
     Args:
-        walls: does it show walls at heights?
-        flat: is it a slice?
+        walls: does the scan show walls at heights, and is it of one map?
 
     Raises:
         InputError: the weights that ship are damaged.
     """
-    if not walls and not flat:
+    if not walls:
         return score_by_plan
-    weights = read_weights_json("topomerge.extraction", PASSAGES_FILE)["walls" if walls else "flat"]
+    weights = np.array(read_weights_json("topomerge.extraction", PASSAGES_FILE).get("walls", ()), float)
+    if weights.shape != (len(SCORE_INPUTS),) or not np.isfinite(weights).all():
+        numbers = f"walls must be {len(SCORE_INPUTS)} numbers"
+        raise InputError(f"{PASSAGES_FILE}: {numbers}: run train.py task=passages export=package")
     return partial(score_passages, weights=weights)
 
 
-def compute_inputs(x: Array, plan: Array, evidence: Array) -> Array:
-    """(n, 9) `SCORE_INPUTS` of passages.
+def compute_inputs(plan: Array, evidence: Array) -> Array:
+    """(n, 5) `SCORE_INPUTS` of passages.
 
     Args:
-        x: (n, 17) `DOOR_FEATURES`.
         plan: (n,) log odds of a door by the plan alone.
         evidence: (n, 4) `EVIDENCE`.
     """
     plan = np.clip(plan, -MOST_LOG_ODDS, MOST_LOG_ODDS)
-    small, (door, shown, walked, within) = x[:, -2], evidence.T
-    return np.column_stack(
-        [np.ones(len(x)), plan, door, np.maximum(shown, 0), walked, walked * door, within, small, small * plan]
-    )
+    door, shown, walked, within = evidence.T
+    return np.column_stack([np.ones(len(plan)), plan, np.maximum(shown, 0), walked * np.minimum(door, 0), within])
 
 
 def find_crossings(storeys: Sequence[SegmentedStorey], places: Array) -> set[Pair]:

@@ -1,6 +1,7 @@
 """Task `passages`: how much all evidence together says of a door between two segments (`extraction.passages`).
 
-A logistic model for each kind of scan, pulled towards the plan's own answer: what the evidence adds must show in the scans.
+A logistic model for scans that show walls, pulled towards the plan's own answer: what evidence adds must show in the scans.
+Slices have none: on them the plan alone was better.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from topomerge.training.loop import Say
 from topomerge.training.scan_settings import Passages
 from topomerge.types import Array
 
-PLAN_ALONE = np.array([float(name == "plan") for name in SCORE_INPUTS])
-STIFF = np.array([30.0 if name == "small plan" else 1.0 if name == "constant" else 4.0 for name in SCORE_INPUTS])  # of each pull
+# Towards which weights are pulled: the plan alone, but for doorways that split a segment, of which scans show few (docs/adr/0018).
+PRIOR = np.array([{"plan": 1.0, "within": 6.0}.get(name, 0.0) for name in SCORE_INPUTS])
+STIFF = np.array([1.0 if name == "constant" else 4.0 for name in SCORE_INPUTS])  # of each pull
 
 
 def fit(settings: Passages, say: Say) -> dict[str, float]:
@@ -62,26 +64,26 @@ def fit_models(scans: Sequence[PassageExamples], pull: float) -> dict[str, list[
     models = {}
     for kind in KINDS:
         own = [scan for scan in scans if scan.kind == kind]
-        weights = PLAN_ALONE
+        weights = PRIOR
         if own:
-            x = np.concatenate([compute_inputs(scan.features, scan.plan, scan.evidence) for scan in own])
+            x = np.concatenate([compute_inputs(scan.plan, scan.evidence) for scan in own])
             y = np.concatenate([scan.parted for scan in own])
             count = np.concatenate([np.full(len(scan.parted), 1 / np.sqrt(len(scan.parted))) for scan in own])
-            weights = minimize(_loss, PLAN_ALONE, (x, y, count / count.mean(), pull), jac=True, method="BFGS").x
+            weights = minimize(_loss, PRIOR, (x, y, count / count.mean(), pull), jac=True, method="BFGS").x
         models[kind] = np.round(weights, 3).tolist()
     return models
 
 
 def _loss(weights: Array, x: Array, y: Array, count: Array, pull: float) -> tuple[float, Array]:
-    """Negative log likelihood with what pulls the weights to `PLAN_ALONE`, and its gradient."""
-    z, off = x @ weights, weights - PLAN_ALONE
+    """Negative log likelihood with what pulls the weights to `PRIOR`, and its gradient."""
+    z, off = x @ weights, weights - PRIOR
     loss = float((count * np.logaddexp(0, np.where(y, -z, z))).sum() + pull * (STIFF * off**2).sum() / 2)
     return loss, x.T @ (count * (sigmoid(z) - y)) + pull * STIFF * off
 
 
 def score(scan: PassageExamples, weights: dict[str, list[float]]) -> tuple[Array, Array, Array]:
     """(n,) probability of a door in each passage, of the plan alone, and are they doors?"""
-    inputs = compute_inputs(scan.features, scan.plan, scan.evidence)
+    inputs = compute_inputs(scan.plan, scan.evidence)
     return sigmoid(inputs @ np.array(weights[scan.kind])), sigmoid(scan.plan), scan.parted
 
 
