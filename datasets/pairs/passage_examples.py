@@ -100,9 +100,12 @@ def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
     count, kind = len(rows), "walls" if found.walls is not None else ""
     features, odds, evidence, parted = zip(*rows, strict=True) if rows else ((), (), (), ())
     return PassageExamples(
-        np.array(features, float).reshape(count, len(DOOR_FEATURES)), np.array(odds, float), np.array(evidence, float).reshape(count, len(EVIDENCE)),
-        np.array(parted, bool), kind,
-    )  # fmt: skip
+        np.array(features, float).reshape(count, len(DOOR_FEATURES)),
+        np.array(odds, float),
+        np.array(evidence, float).reshape(count, len(EVIDENCE)),
+        np.array(parted, bool),
+        kind,
+    )
 
 
 def storey_passages(

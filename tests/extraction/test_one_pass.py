@@ -79,7 +79,9 @@ def test_a_doorway_splits_the_segment_that_it_lies_in_where_walls_close_the_rest
     assert split.count == 2 and len(np.unique(split.segment[:19][split.segment[:19] >= 0])) == 1
     assert split.split == frozenset({(0, 1)}) == frozenset(split.passages)
     assert split.areas.sum() == pytest.approx(storey.areas.sum())
-    assert split_segments(storey_of(np.zeros((40, 20), np.int64), {}), doorway(2.05, 1.0)).count == 1  # the floor goes on beside it
+    assert (
+        split_segments(storey_of(np.zeros((40, 20), np.int64), {}), doorway(2.05, 1.0)).count == 1
+    )  # the floor goes on beside it
     assert split_segments(storey, doorway(2.05, 1.0)[:0]) is storey
 
 
@@ -101,7 +103,10 @@ def test_the_way_of_the_sensor_crosses_segments_and_ends_where_it_is_far_off() -
 
 
 def test_doorways_that_walls_show_raise_the_score() -> None:
-    score, x = choose_scorer(True), np.tile(np.array([0.8, 0.4, 0.3, 0.5, 1, 1, 0.2, 0.3, 1, 1, 0, 1, 1, 0.8, 0.9, 2, 3.0]), (4, 1))
+    score, x = (
+        choose_scorer(True),
+        np.tile(np.array([0.8, 0.4, 0.3, 0.5, 1, 1, 0.2, 0.3, 1, 1, 0, 1, 1, 0.8, 0.9, 2, 3.0]), (4, 1)),
+    )
     rows = [(0.0, 0.0, 0, 0), (0.0, 1.0, 0, 0), (0.0, 3.0, 0, 0), (0.0, 0.0, 0, 1)]
     none, shown, surely, within = score(x, [replace(PASSAGE, evidence=row) for row in rows]).tolist()
     assert none < shown < surely and none < within

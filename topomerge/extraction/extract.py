@@ -64,12 +64,13 @@ def extract(
     """
     p = chosen_parameters(preset, overrides)
     watch = Stopwatch(progress)
+    doubts: list[str] = []
     scan, navigable = read_navigable(source, voxel_size, p, watch)
     if isinstance(p, ThesisParameters):
         watch.begin("rooms", 0.4)
         floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
         map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
-        map, doubts = replace(map, rooms=with_outline_odds(map.rooms)), []
+        map = replace(map, rooms=with_outline_odds(map.rooms))
     else:
         floor, walls = cut_rooms(scan, navigable, p, watch, parts)
         watch.begin("topology", 0.85)

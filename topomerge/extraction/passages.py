@@ -26,7 +26,7 @@ from topomerge.types import EDGE_DTYPE, Array
 # Of a passage, beside the plan: log odds of a door by walls, plan network and plan together (`door_chance`), and of a doorway
 # that walls show there, on average along it; 0 or 1: the sensor was carried through, a doorway split the segment.
 EVIDENCE = ("door", "shown", "walked", "within")
-# What the score weighs: log odds by the plan, and of a doorway that walls show; those against a door where somebody walked; 0 or 1.
+# What the score weighs: log odds by the plan, of a doorway that walls show, and against a door where somebody walked; 0 or 1.
 SCORE_INPUTS = ("constant", "plan", "shown", "walked without door", "within")
 KINDS = ("walls",)  # of scans that have a model: walls show at heights
 PASSAGES_FILE = "passages.json"
@@ -74,7 +74,7 @@ def score_passages(x: Array, passages: Sequence[Passage], weights: Array) -> Arr
 
 
 def choose_scorer(walls: bool) -> Scorer:
-    """The score of a scan's passages: by all evidence; of slices, raised plans and joined maps by the plan and what the parts say.
+    """The score of a scan's passages: by all evidence; of slices, raised plans and joined maps by plan and parts.
 
     Args:
         walls: does the scan show walls at heights, and is it of one map?

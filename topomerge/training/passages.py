@@ -24,7 +24,7 @@ from topomerge.training.loop import Say
 from topomerge.training.scan_settings import Passages
 from topomerge.types import Array
 
-# Towards which weights are pulled: the plan alone, but for doorways that split a segment, of which scans show few (docs/adr/0018).
+# Weights are pulled to the plan alone, but for doorways that split a segment, of which scans show few (docs/adr/0018).
 PRIOR = np.array([{"plan": 1.0, "within": 6.0}.get(name, 0.0) for name in SCORE_INPUTS])
 STIFF = np.array([1.0 if name == "constant" else 4.0 for name in SCORE_INPUTS])  # of each pull
 
