@@ -56,6 +56,7 @@ def test_comments_docstrings_and_layout_keep_the_digest(before, after):
         (EXTRACT, "extraction/plans/plan_network.npz"),
         (EXTRACT, "extraction/elevations/wall_network.npz"),
         (EXTRACT, "extraction/elevations/wall_doors.json"),
+        (EXTRACT, "extraction/passages.json"),
         (EXTRACT, "extraction/room_odds.json"),
         ("topomerge.datasets.pairs.example", "extraction/plans/door_classifier.json"),
     ],

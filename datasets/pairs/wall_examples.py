@@ -41,18 +41,19 @@ from topomerge.extraction.elevations.elevation import (
     FACE_DTYPE,
     STRIP_CHANNELS,
     Elevations,
-    wall_elevations,
+    strip_colours,
 )
-from topomerge.extraction.extract import rooms_and_passages
-from topomerge.extraction.parameters import PRESETS
+from topomerge.extraction.extract import cut_rooms, read_navigable
+from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.scan import FINE_CELL
 from topomerge.extraction.stopwatch import Stopwatch
+from topomerge.extraction.topology import topometric_map
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import archive
 from topomerge.io.listing import plain
 from topomerge.types import ROOM_DTYPE, Array, PointCloud, Sim3, TopometricMap, VoxelGrid
 
-WALL_FORMAT = 6  # raise it when the same item gives other bytes: it is part of the files' names
+WALL_FORMAT = 7  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.6, "r2v": 0.25, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.35, "depth": 0.25, "lidar": 0.2, "tablet": 0.12, "mono": 0.08}
 MAP_CELL = 0.1  # m
@@ -199,11 +200,19 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     name, cloud, shift = _flat(building, visited, seed, rng) if item.flat else _seen(building, visited, item, rng)
     frame = Sim3(float(rng.uniform(-np.pi, np.pi)))
     cloud = replace(moved(thinned(cloud, seed) if item.sparse else cloud, frame), rooms=())
-    scan, _, floor, map = rooms_and_passages(cloud, MAP_CELL, PRESETS["default"], Stopwatch())
-    cells = scan.grid if rng.random() < COARSE_SHARE else voxelise(cloud, FINE_CELL)
-    walls = NO_WALLS if item.flat else wall_elevations(map, cells, scan.shades, scan.crossed)
+    p, watch = PRESETS["default"], Stopwatch()
+    assert isinstance(p, DefaultParameters)
+    scan, navigable = read_navigable(cloud, MAP_CELL, p, watch)
+    coarse = rng.random() < COARSE_SHARE
+    if not item.flat:
+        scan = replace(scan, fine=scan.grid if coarse else voxelise(cloud, FINE_CELL))
+    floor, seen = cut_rooms(scan, navigable, p, watch)
+    map = topometric_map(scan.grid, floor, p.standing_height)
+    walls = NO_WALLS if seen is None or item.flat else seen.elevations
     if not item.flat and not len(walls.faces):
         raise InputError(f"{seed}: no wall was seen")
+    if scan.shades is not None and not item.flat:
+        walls = replace(walls, colours=strip_colours(walls, *scan.shades))
     strips, truth = np.rint(255 * walls.strips).astype(np.uint8), true_classes(building, walls, frame, shift)
     doors = building.doors["centre"]
     if shift is not None:

@@ -27,6 +27,7 @@ from topomerge.extraction.elevations.wall_doors import (
     door_chance,
 )
 from topomerge.extraction.elevations.wall_network import place_probabilities
+from topomerge.extraction.passages import choose_scorer
 from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
 from topomerge.extraction.plans.plan_network import weights as plan_weights
@@ -39,6 +40,7 @@ from topomerge.registration.evidence.network import weights as place_weights
 from topomerge.registration.verify import model
 from topomerge.training import (
     door_classification,
+    passages,
     place_evidence,
     plan_segmentation,
     room_matcher,
@@ -65,7 +67,7 @@ NETWORKS = {
     "room_matcher": ["epochs=2", "steps=2", "batch=2", "width=8", "layers=1"],
 }
 WITHOUT_MORE = {"merge_belief": ["lookalikes=none", "floor=0"]}  # data that takes minutes to make
-FITS = ("merge_belief", "room_odds", "match_odds", "match_belief", "feature_scale", "wall_doors")
+FITS = ("merge_belief", "room_odds", "match_odds", "match_belief", "feature_scale", "passages", "wall_doors")
 
 
 def quiet(text: str) -> None:
@@ -82,6 +84,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(wall_segmentation, "build_walls", lambda *_: (walls, None))
     monkeypatch.setattr(wall_colours, "build_walls", lambda *_: (walls, None))
     monkeypatch.setattr(wall_doors, "build_walls", lambda *_: (walls, None))
+    monkeypatch.setattr(passages, "read_scans", lambda *_: tiny.passage_scans(10))
     places = tiny.place_files(tmp_path / "places")
     monkeypatch.setattr(place_evidence, "hypothesis_files", lambda *_: places)
     monkeypatch.setattr(room_matcher, "read_examples", lambda *_: tiny.room_examples(4))
@@ -118,6 +121,7 @@ def read(task: str) -> Any:
         "room_matcher": lambda: matcher_weights()["rows.w"],
         "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
         "wall_colours": lambda: colour_weights()["out.w"],
+        "passages": lambda: choose_scorer(True)(np.ones((2, 17)), tiny.passages(2)),
         "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(4, EDGE_DTYPE), signs, np.arange(4))),
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
         "room_odds": lambda: np.array(room_weights()["entered"]),
@@ -285,6 +289,7 @@ SIMULATED = {
     "door_classification": ["data=plan_scans", "data.scans=4", "data.seed=0", "epochs=2", "hold_out=2", "heldout.scans=1"],
     "wall_segmentation": [*NETWORKS["wall_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "wall_colours": [*NETWORKS["wall_colours"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
+    "passages": ["data=plan_scans", "data.scans=6", "data.seed=0", "folds=2", "heldout=plan_scans_heldout", "heldout.scans=4"],
     "wall_doors": [
         *(f"{of}.scans=2" for of in ("data", "painted", "flat", "heldout", "heldout_painted", "heldout_flat")),
         *(f"{of}.seed=0" for of in ("data", "painted", "flat")), "folds=2",

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from topomerge.datasets.pairs.passage_examples import PassageExamples
 from topomerge.datasets.pairs.plan_examples import PlanExample, PlanRecipe, example_arrays
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 from topomerge.datasets.pairs.scan_items import PlanItem
@@ -16,6 +17,8 @@ from topomerge.datasets.pairs.wall_examples import WallExample, WallItem, wall_a
 from topomerge.embedding.engineered import FEATURES
 from topomerge.embedding.turns import FACTS, TurnedRows
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS
+from topomerge.extraction.passages import EVIDENCE
+from topomerge.extraction.plans.passages import Passage
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.room_features import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
@@ -230,3 +233,20 @@ def room_examples(count: int) -> list[Example]:
         pair = GraphPair(graphs[0], graphs[1], matches, *truth, {"file": "", "sides": "ab"}, torch.eye(4))
         out.append(Example(views[0], views[1], pair, 1))
     return out
+
+
+def passages(count: int) -> list[Passage]:
+    """Passages of which nothing but the plan speaks."""
+    return [Passage((0, 0), 0.8, (1.0, 0.0), (0.0,) * 12, evidence=(0.0,) * len(EVIDENCE))] * count
+
+
+def passage_scans(count: int) -> list[PassageExamples]:
+    """Scans with walls, in which a door is what the plan and, surer, the evidence says."""
+    scans = []
+    for k in range(count):
+        rng = np.random.default_rng(k)
+        evidence = np.column_stack([rng.normal(0, 3, (40, 2)), rng.random((40, 2)) < 0.3]).astype(float)
+        parted = evidence[:, 0] + rng.normal(0, 0.5, 40) > 0
+        plan = np.where(parted, 1.0, -1.0) + rng.normal(0, 2, 40)
+        scans.append(PassageExamples(rng.random((40, 17)), plan, evidence, parted, "walls"))
+    return scans

@@ -3,37 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
-from typing import Any, NamedTuple
-
-import numpy as np
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 from topomerge.blas import one_blas_thread
-from topomerge.extraction.distinct_doors import distinct_doors
-from topomerge.extraction.elevations.doorway_rooms import doors_inside_rooms
-from topomerge.extraction.elevations.doorways import place_classes
-from topomerge.extraction.elevations.elevation import wall_elevations
-from topomerge.extraction.elevations.fixtures import with_fixtures
-from topomerge.extraction.elevations.wall_doors import with_wall_doors
-from topomerge.extraction.elevations.windows import with_windows
+from topomerge.extraction.attributes import estimate_attributes
+from topomerge.extraction.elevations.doorways import StoreyWalls
 from topomerge.extraction.floor import Floor
-from topomerge.extraction.floor_patches import without_patches
 from topomerge.extraction.free_space import free_space, with_crossed_cells
 from topomerge.extraction.navigable import navigable_volume
-from topomerge.extraction.parameters import Parameters, ThesisParameters, chosen_parameters
-from topomerge.extraction.plans.inner_doors import INNER_DOOR_DTYPE
+from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, chosen_parameters
+from topomerge.extraction.partition import (
+    FLAT_LEAST_AREA,
+    FLAT_LEAST_HALF_WIDTH,
+    ROOM_LEAST_AREA,
+    ROOM_LEAST_HALF_WIDTH,
+    partition_rooms,
+    rooms_of_segments,
+)
+from topomerge.extraction.passages import choose_scorer, find_passages
 from topomerge.extraction.plans.part_rooms import PartRooms
-from topomerge.extraction.plans.plan_rooms import rooms_of_plans
-from topomerge.extraction.plans.storey_rooms import OtherSigns
-from topomerge.extraction.room_odds import with_room_odds
+from topomerge.extraction.plans.storey_floor import floor_of_storeys
 from topomerge.extraction.scan import Scan, read_scan
-from topomerge.extraction.slices import is_raised, is_slice, with_raised_slice
-from topomerge.extraction.small_rooms import gathered, without_small_rooms
+from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, rasterise_storeys, segment_storey
+from topomerge.extraction.slices import is_slice, with_raised_slice
 from topomerge.extraction.stopwatch import Progress, Stopwatch
-from topomerge.extraction.topology import topometric_map
+from topomerge.extraction.topology import rooms_with_floor, topometric_map
 from topomerge.extraction.views.view_rooms import rooms_of_views
-from topomerge.extraction.walked_doors import with_walked_doors
-from topomerge.extraction.walked_rooms import walked_rooms
+from topomerge.extraction.walls import relabel_walls, split_at_doorways, unroll_walls
 from topomerge.types import LEVELLED, Array, PointCloud, TopometricMap, VoxelGrid, with_outline_odds
 
 COARSE_CELL = 0.15  # m: in larger ones, the walls beside a door leave too little of it
@@ -67,21 +64,19 @@ def extract(
     """
     p = chosen_parameters(preset, overrides)
     watch = Stopwatch(progress)
-
-    scan, navigable, floor, map = rooms_and_passages(source, voxel_size, p, watch, parts)
-
-    watch.begin("odds of rooms, doors on walls", 0.87)
-    made, doubts, again = _with_odds_and_openings(map, scan, floor, p)
-    if not parts:  # rooms of joined maps are what their parts say
-        if len(again.doors) and not isinstance(p, ThesisParameters):
-            looks = [(plan, storey.probability) for plan, storey in zip(floor.plans, floor.classified_storeys, strict=True)]
-            signs = OtherSigns(doors=again.doors, looked_at=looks, places=scan.places)
-            floor = rooms_of_plans(scan.grid, navigable, p.door, p.narrow, p.standing_height, signs)
-            made, doubts, again = _with_odds_and_openings(topometric_map(scan.grid, floor, p.standing_height), scan, floor, p)
-        if again.one is not None:
-            floor = gathered(floor, again.one)
-            made, doubts, _ = _with_odds_and_openings(topometric_map(scan.grid, floor, p.standing_height), scan, floor, p)
-    map = made
+    doubts: list[str] = []
+    scan, navigable = read_navigable(source, voxel_size, p, watch)
+    if isinstance(p, ThesisParameters):
+        watch.begin("rooms", 0.4)
+        floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
+        map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+        map = replace(map, rooms=with_outline_odds(map.rooms))
+    else:
+        floor, walls = cut_rooms(scan, navigable, p, watch, parts)
+        watch.begin("topology", 0.85)
+        map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
+        watch.begin("odds of rooms, doors on walls", 0.87)
+        map, doubts = estimate_attributes(map, scan, floor, walls, p.walls)
 
     watch.begin("free space", 0.9)
     free = free_space(scan, navigable, p.range) if p.carve else scan.free
@@ -99,80 +94,74 @@ def extract(
     )
 
 
-def rooms_and_passages(
-    source: PointCloud | VoxelGrid | Array | Iterable[PointCloud],
-    voxel_size: float,
-    p: Parameters,
-    watch: Stopwatch,
-    parts: Sequence[PartRooms] = (),
-) -> tuple[Scan, VoxelGrid, Floor, TopometricMap]:
-    """The scan, its navigable volume, its floors cut into rooms, and the map of these with what the floors show of doors.
-
-    Args:
-        source, voxel_size, parts: as of `extract`.
-        p: of its preset.
+def read_navigable(
+    source: PointCloud | VoxelGrid | Array | Iterable[PointCloud], voxel_size: float, p: Parameters, watch: Stopwatch
+) -> tuple[Scan, VoxelGrid]:
+    """Read a scan, complete it where it shows no floor, and find where a body can walk.
 
     Raises:
         InputError: as `extract`.
     """
     watch.begin("read and voxelise", 0.0)
     scan = read_scan(source, voxel_size, p.sparse, p.level)  # 2.2
-    flat = is_slice(scan.grid)
+    scan = replace(scan, flat=is_slice(scan.grid))
     scan = with_raised_slice(scan) if p.assume else scan
-
     watch.begin("navigable volume", 0.3)
     scan, navigable = navigable_volume(scan, p)  # 2.3
-
-    watch.begin("rooms", 0.4)
-    if isinstance(p, ThesisParameters):
-        floor = rooms_of_views(scan.grid, navigable, p, watch)  # 2.4 to 2.6
-    else:
-        scan = scan if flat else with_crossed_cells(scan)
-        signs = OtherSigns(parts, flat=flat, crossed=scan.crossed, raised=not flat and is_raised(scan.grid), places=scan.places)
-        floor = rooms_of_plans(scan.grid, navigable, p.slice_door if flat else p.door, p.narrow, p.standing_height, signs)
-
-    watch.begin("topology", 0.85)
-    map = topometric_map(scan.grid, floor, p.standing_height)  # 2.7
-    if flat and not isinstance(p, ThesisParameters) and p.walls and not parts:  # rooms of joined maps are what their parts say
-        larger = without_small_rooms(floor, map)
-        if larger is not floor:
-            floor, map = larger, topometric_map(scan.grid, larger, p.standing_height)
-    return scan, navigable, floor, map
+    if scan.flat or isinstance(p, ThesisParameters):
+        return scan, navigable
+    return with_crossed_cells(scan), navigable
 
 
-class _Reconsidered(NamedTuple):
-    """What walls and the sensor's way say of how the floors were cut: doors inside of rooms (`doorway_rooms.doors_inside_rooms`),
-    and rooms that are one (`walked_rooms`)."""
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """All that is known of a scan's storeys before anything is cut.
 
-    doors: Array = np.zeros(0, INNER_DOOR_DTYPE)
-    one: Array | None = None
+    Args:
+        rasters: the storeys seen from above.
+        storeys: cut into segments, whose passages have all evidence.
+        walls: with the segments beside them; None of a scan that shows none at heights.
+    """
+
+    rasters: RasterisedStoreys
+    storeys: list[SegmentedStorey]
+    walls: StoreyWalls | None
 
 
-def _with_odds_and_openings(
-    map: TopometricMap, scan: Scan, floor: Floor, p: Parameters
-) -> tuple[TopometricMap, list[str], _Reconsidered]:
-    """The map with how likely each room is one, with the doors, windows and fixtures that its walls show, and with the doors that
-    the sensor was carried through; what is odd about its way; and what these say of its rooms."""
-    if isinstance(p, ThesisParameters):  # its floors end before the walls: the odds were fitted to others
-        return replace(map, rooms=with_outline_odds(map.rooms)), [], _Reconsidered()
-    map = with_room_odds(map, scan.rays, scan.raised)
-    walls = None
-    if p.walls and scan.fine is not None and len(map.rooms):
-        walls = wall_elevations(map, scan.fine, scan.shades, scan.crossed)
-    classes = None if walls is None else place_classes(walls)
-    again = _Reconsidered()
-    if walls is not None and classes is not None:
-        again = _Reconsidered(doors_inside_rooms(map, walls, classes))
-    if p.walls:
-        map, likeliest = with_wall_doors(map, floor.classified_storeys, walls, classes)
-    map, doubt = with_walked_doors(map, scan.places)
-    map = distinct_doors(map)
+def gather_evidence(
+    scan: Scan, navigable: VoxelGrid, p: DefaultParameters, watch: Stopwatch, parts: Sequence[PartRooms] = ()
+) -> Evidence:
+    """Cut the storeys into too many segments rather than too few, and gather what speaks for doors between them."""
+    watch.begin("segments", 0.4)
+    rasters, places = rasterise_storeys(scan, navigable, p.standing_height), scan.places
+    narrow = min(p.narrow, p.slice_door if scan.flat else p.door)
+    storeys = [segment_storey(rasters, i, narrow, parts, places) for i in range(len(rasters.numbers))]
+    watch.begin("walls", 0.6)
+    walls = unroll_walls(scan, navigable, rasters, storeys) if p.walls else None
     if walls is not None:
-        again = again._replace(one=walked_rooms(map, floor, likeliest))
-    if walls is not None and classes is not None:
-        map = with_fixtures(with_windows(map, walls, classes), walls, classes)
-        map = without_patches(map, scan.places)
-    return map, [doubt] if doubt else [], again
+        storeys, walls = split_at_doorways(storeys, walls)
+    return Evidence(rasters, find_passages(storeys, walls, places, p.walls and not parts), walls)
+
+
+def cut_rooms(
+    scan: Scan, navigable: VoxelGrid, p: DefaultParameters, watch: Stopwatch, parts: Sequence[PartRooms] = ()
+) -> tuple[Floor, StoreyWalls | None]:
+    """Cut the storeys of a scan into rooms, once, by all evidence (docs/adr/0024).
+
+    Returns:
+        The floors of all storeys; their walls with the rooms of the map beside them, None of a scan that shows none at heights.
+    """
+    found = gather_evidence(scan, navigable, p, watch, parts)
+    watch.begin("rooms", 0.75)
+    weigh = p.walls and not parts
+    score = choose_scorer(weigh and found.walls is not None)
+    door = p.slice_door if scan.flat else p.door
+    least, half_width = (FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH) if scan.flat else (ROOM_LEAST_AREA, ROOM_LEAST_HALF_WIDTH)
+    cut = [partition_rooms(storey, score, door, least, half_width) for storey in found.storeys]  # 2.6
+    floor = floor_of_storeys(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)
+    if found.walls is None:
+        return floor, None
+    return floor, relabel_walls(found.walls, rooms_of_segments(cut, rooms_with_floor(floor)))
 
 
 def _doubts(map: TopometricMap) -> list[str]:

@@ -183,6 +183,23 @@ class WallDoors(TaskSettings):
 
 
 @dataclass
+class Passages(TaskSettings):
+    """Args:
+    data: scans; heldout: of other buildings.
+    pull: of the weights to what the plan alone says.
+    folds: of scans, for the scores.
+    """
+
+    task: str = "passages"
+    name: str = "passages"
+    data: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout: PlanRecipe = field(default_factory=PlanRecipe)
+    pull: float = 3.0
+    folds: int = 5
+    watch: str = "log_loss"
+
+
+@dataclass
 class DoorClassification(NetworkTask):
     """Args:
     hidden: units of each network; networks: that are averaged.

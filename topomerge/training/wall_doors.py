@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,10 @@ from sklearn.linear_model import LogisticRegression
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import build_walls, load_walls
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.doorways import place_classes
+from topomerge.extraction.classified_storey import ClassifiedStorey
+from topomerge.extraction.distinct_doors import LEVEL_KINDS, rooms_at
+from topomerge.extraction.elevations.doorways import StoreyWalls, door_places, place_classes
+from topomerge.extraction.elevations.elevation import Elevations
 from topomerge.extraction.elevations.wall_doors import (
     SOURCES,
     WALL_DOOR_FEATURES,
@@ -26,12 +30,13 @@ from topomerge.extraction.elevations.wall_doors import (
     door_candidates,
     door_chance,
 )
+from topomerge.extraction.walls import find_doorways
 from topomerge.io.weight_files import read_weights_json
 from topomerge.metrics import match_places
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.scan_settings import WallDoors
-from topomerge.types import Array
+from topomerge.types import Array, TopometricMap
 
 FEWEST_DOORS = 5  # among the candidates of a source
 NEAR_DOOR = 0.7  # m: of a door that lies farther off than the metrics allow (0.5 m) the rooms that it joins may still be right
@@ -65,14 +70,32 @@ def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Can
     scans = []
     for path in paths:
         example = load_walls(path)
-        walls = example.elevations
-        candidates = door_candidates(example.map, example.storeys, walls, None if walls is None else place_classes(walls))
+        candidates = candidates_of_map(example.map, example.storeys, example.elevations)
         right = np.zeros(len(candidates.edges), bool)
         right[match_places(example.doors, candidates.edges["centre"], NEAR_DOOR)[:, 1]] = True
         scans.append((candidates, right))
     if len(scans) < settings.folds:
         raise InputError(f"data.scans={recipe.scans}: too few scans for {settings.folds} folds")
     return scans
+
+
+def candidates_of_map(
+    map: TopometricMap, storeys: Sequence[ClassifiedStorey], elevations: Elevations | None, classes: Array | None = None
+) -> DoorCandidates:
+    """The candidates of a map, by the network of elevations that ships.
+
+    Args:
+        storeys: what probably stands in the columns of its plans.
+        elevations: its walls; None: it shows none at heights.
+        classes: (n / 2, 7) of its walls; None: as the network has it.
+    """
+    walls = None
+    if elevations is not None:
+        classes = place_classes(elevations) if classes is None else classes
+        doors = door_places(elevations, classes)
+        walls = StoreyWalls(elevations, classes, doors, find_doorways(elevations, doors, partial(rooms_at, map)))
+    level = map.edges[np.isin(map.edges["kind"], LEVEL_KINDS)]
+    return door_candidates(level, map.rooms["completeness"], storeys, walls)
 
 
 def doors_model(scans: Sequence[Candidates], pull: float) -> dict[str, list[float]]:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.extraction.elevations.doors import SHUT_DOOR, extracted, three_doors
-from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, BEFORE, PAST_ENDS, wall_elevations, wall_faces
+from tests.extraction.elevations.doors import SHUT_DOOR, three_doors
+from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, BEFORE, PAST_ENDS, Elevations, unroll
+from topomerge.extraction.extract import gather_evidence, read_navigable
+from topomerge.extraction.parameters import PRESETS
+from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.voxels import voxelise
 from topomerge.types import VoxelGrid
 
@@ -14,8 +17,17 @@ CLOUD = three_doors().points()
 
 
 @pytest.fixture(scope="module")
-def map():
-    return extracted(CLOUD, walls=False)
+def found():
+    """Navigable cells and the faces of segments."""
+    scan, navigable = read_navigable(CLOUD, 0.1, PRESETS["default"], Stopwatch())
+    walls = gather_evidence(scan, navigable, PRESETS["default"], Stopwatch()).walls
+    assert walls is not None
+    return navigable, walls.elevations.faces
+
+
+def wall_elevations(found, cells, crossed=None) -> Elevations:
+    navigable, faces = found
+    return unroll(faces, navigable, cells, crossed)
 
 
 def between(faces, x):
@@ -24,8 +36,8 @@ def between(faces, x):
     return np.flatnonzero(turned & (np.abs(faces["start"][:, 0] - x) < 0.04))
 
 
-def test_each_face_has_its_room_before_it_and_the_wall_behind(map):
-    faces = wall_faces(map)
+def test_each_face_has_its_room_before_it_and_the_wall_behind(found):
+    faces = found[1]
     left, right = between(faces, 3.925 + 0.013), between(faces, 4.075 + 0.013)
     assert len(left) and len(right)
     assert (faces["out"][left] @ (1.0, 0.0) > 0.99).all() and (faces["out"][right] @ (1.0, 0.0) < -0.99).all()
@@ -33,8 +45,8 @@ def test_each_face_has_its_room_before_it_and_the_wall_behind(map):
     assert faces["length"][left].max() == pytest.approx(5 + 2 * PAST_ENDS, abs=0.4)
 
 
-def test_a_leaf_that_lies_back_shows_and_an_open_door_is_empty(map):
-    walls = wall_elevations(map, voxelise(CLOUD, 0.05))
+def test_a_leaf_that_lies_back_shows_and_an_open_door_is_empty(found):
+    walls = wall_elevations(found, voxelise(CLOUD, 0.05))
     face = max(between(walls.faces, 3.925 + 0.013), key=lambda f: walls.faces["length"][f])
     strip = walls.strips[walls.first[face] : walls.first[face + 1]]
     y = walls.faces["start"][face][1] + walls.faces["along"][face][1] * (np.arange(len(strip)) + 0.5) * ALONG
@@ -50,7 +62,7 @@ def test_a_leaf_that_lies_back_shows_and_an_open_door_is_empty(map):
     assert strip[open_door][..., BANDS].mean() > 0.15  # where one can walk
 
 
-def test_rays_went_through_the_open_door_and_not_through_the_shut_one(map):
+def test_rays_went_through_the_open_door_and_not_through_the_shut_one(found):
     """Cells that are free on both sides of the wall, in the open doorway, and before the leaf."""
     cell = 0.2
     nx, ny, nz = 36, 26, 14
@@ -58,7 +70,7 @@ def test_rays_went_through_the_open_door_and_not_through_the_shut_one(map):
     x, y, z = (grid.centroids(np.argwhere(np.ones((nx, ny, nz), bool))))[:, :3].T
     free = (np.abs(x - 4) > 0.2) | ((np.abs(y - 4.0) < 0.4) & (z < 2.2))
     crossed = grid.with_cells(np.argwhere(np.ones((nx, ny, nz), bool))[free])
-    walls, unknown = wall_elevations(map, voxelise(CLOUD, 0.05), crossed=crossed), wall_elevations(map, voxelise(CLOUD, 0.05))
+    walls, unknown = wall_elevations(found, voxelise(CLOUD, 0.05), crossed=crossed), wall_elevations(found, voxelise(CLOUD, 0.05))
     face = max(between(walls.faces, 3.925 + 0.013), key=lambda f: walls.faces["length"][f])
     strip = walls.strips[walls.first[face] : walls.first[face + 1], :, BANDS + 1 :]
     y = walls.faces["start"][face][1] + walls.faces["along"][face][1] * (np.arange(len(strip)) + 0.5) * ALONG
@@ -72,7 +84,7 @@ def test_rays_went_through_the_open_door_and_not_through_the_shut_one(map):
     )
 
 
-def test_strips_hold_shares_and_cover_all_faces(map):
-    walls = wall_elevations(map, voxelise(CLOUD, 0.05))
+def test_strips_hold_shares_and_cover_all_faces(found):
+    walls = wall_elevations(found, voxelise(CLOUD, 0.05))
     assert walls.strips.shape == (walls.first[-1], 32, BANDS + 4) and len(walls.first) == len(walls.faces) + 1
     assert walls.strips.min() >= 0 and walls.strips.max() <= 1 and not (np.diff(walls.first) % 2).any()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -17,8 +19,8 @@ from tests.extraction.elevations.doors import (
 )
 from tests.scenes import Scene
 from topomerge.extraction.elevations.doorways import door_places, doorways, place_classes
-from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, Elevations, wall_elevations
-from topomerge.extraction.extract import extract, rooms_and_passages
+from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, FACE_DTYPE, STRIP_CHANNELS, Elevations
+from topomerge.extraction.extract import extract, gather_evidence, read_navigable
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.types import door_state
@@ -102,10 +104,12 @@ def test_walls_of_hardly_any_points_have_no_doors(count: int):
 @pytest.mark.parametrize("count", [0, 1, 5])
 def test_elevations_of_hardly_any_points_show_no_doorways(count: int):
     """The walls stand, but of what is looked at closely hardly a point is left."""
-    scan, _, _, map = rooms_and_passages(three_doors().points(), 0.1, PRESETS["default"], Stopwatch())
+    scan, navigable = read_navigable(three_doors().points(), 0.1, PRESETS["default"], Stopwatch())
     assert scan.fine is not None
     cells = scan.fine.subset(np.arange(len(scan.fine)) < count)
-    walls = wall_elevations(map, cells)
+    seen = gather_evidence(replace(scan, fine=cells), navigable, PRESETS["default"], Stopwatch()).walls
+    assert seen is not None and not len(seen.doorways)
+    walls = seen.elevations
     assert len(walls.faces) and not len(doorways(walls, door_places(walls, place_classes(walls))))
 
 

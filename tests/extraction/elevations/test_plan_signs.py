@@ -12,10 +12,10 @@ from topomerge.extraction.classified_storey import DOORWAY_CLASS, PLAN_SIGNS, SH
 from topomerge.extraction.elevations.wall_doors import (
     SOURCES,
     WALL_DOOR_FEATURES,
-    door_candidates,
     door_chance,
     with_wall_doors,
 )
+from topomerge.training.wall_doors import candidates_of_map
 from topomerge.types import EDGE_DTYPE
 
 
@@ -53,18 +53,18 @@ def test_of_a_map_without_walls_the_plan_is_weighed():
     open_there, wall_there = storey((2.0, 2.9, DOORWAY_CLASS)), storey()
     chances = []
     for plan in (open_there, wall_there):
-        candidates = door_candidates(map, (plan,), None, None)
+        candidates = candidates_of_map(map, (plan,), None)
         at = dict(zip(WALL_DOOR_FEATURES, candidates.features[0], strict=True))
         assert [SOURCES[k] for k in candidates.source] == ["flat"] and at["plan"] == pytest.approx(0.9) and at["wall"] == 0
         chances += door_chance(candidates).tolist()
     assert chances[0] > 0.8 and chances[1] < 0.4
-    (edge,) = with_wall_doors(map, (open_there,), None, None)[0].edges
+    (edge,) = with_wall_doors(map, (open_there,), None).edges
     assert edge["confidence"] == pytest.approx(chances[0]) and edge["centre"].tolist() == map.edges["centre"][0].tolist()
 
 
 def test_a_map_without_edges_stays_as_it_is():
     map = replace(two_doors(0)[0], edges=np.zeros(0, EDGE_DTYPE))
-    assert len(with_wall_doors(map, (storey(),), None, None)[0].edges) == 0
+    assert len(with_wall_doors(map, (storey(),), None).edges) == 0
 
 
 def test_the_only_way_between_two_rooms_stays_however_unlikely_and_a_second_one_does_not():
@@ -72,7 +72,7 @@ def test_the_only_way_between_two_rooms_stays_however_unlikely_and_a_second_one_
     two = np.concatenate([map.edges, map.edges])
     two["centre"][1, 0] = 6.5
     faint = storey((2.0, 2.9, DOORWAY_CLASS))
-    edges = with_wall_doors(replace(map, edges=two), (faint,), None, None)[0].edges
+    edges = with_wall_doors(replace(map, edges=two), (faint,), None).edges
     assert edges["centre"][:, 0].tolist() == [map.edges["centre"][0, 0]] and edges["confidence"][0] > 0.5
-    (edge,) = with_wall_doors(map, (storey(),), None, None)[0].edges
+    (edge,) = with_wall_doors(map, (storey(),), None).edges
     assert edge["confidence"] < 0.4

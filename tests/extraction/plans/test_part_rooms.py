@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from tests import scenes
+from tests.extraction.segments import rooms_of_segments
 from topomerge.extraction.extract import extract
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import PRESETS
-from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.part_rooms import GLIMPSED, LOG_ODDS, PartRooms, door_log_odds, laid_rooms, parted_columns
-from topomerge.extraction.plans.partition import merge_regions
 from topomerge.extraction.plans.passages import clearance_of, find_passages, regions_of
 from topomerge.extraction.plans.plan import storey_plan
 from topomerge.extraction.plans.plan_network import column_probabilities
 from topomerge.extraction.scan import Scan
+from topomerge.extraction.segment import score_by_plan
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
 
@@ -90,9 +90,9 @@ def test_a_side_that_was_not_seen_and_another_storey_say_nothing(cut):
 def rooms_of(cut, log_odds) -> int:
     plan, region, clearance, passages, _ = cut
     weighed = {pair: replace(passage, log_odds=log_odds.get(pair, 0.0)) for pair, passage in passages.items()}
-    partition = merge_regions(region, clearance, weighed, plan.edge, door_probability, 0.5, 0.2, (0.8, 0.8))
+    room = rooms_of_segments(region, clearance, weighed, score_by_plan, edge=plan.edge)
     sizes = np.bincount(region[region >= 0])
-    return len(np.unique(partition.room[sizes * plan.edge**2 > 1]))
+    return len(np.unique(room[sizes * plan.edge**2 > 1]))
 
 
 def test_log_odds_stay_with_their_passage_while_rooms_merge(cut):

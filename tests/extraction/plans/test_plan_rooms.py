@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from tests import scenes
+from tests.extraction.segments import rooms_of_segments
 from topomerge.extraction.assumed_floor import has_floor
 from topomerge.extraction.extract import extract
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
+from topomerge.extraction.partition import FLAT_LEAST_AREA, ROOM_LEAST_AREA
 from topomerge.extraction.plans.door_classifier import door_probability
-from topomerge.extraction.plans.partition import merge_regions
 from topomerge.extraction.plans.passages import DOOR_FEATURES, Passage, clearance_of, door_features, find_passages, regions_of
 from topomerge.extraction.plans.plan import _box_around, storey_plan
 from topomerge.extraction.plans.plan_network import COARSEST_STRIDE, column_probabilities
-from topomerge.extraction.plans.plan_rooms import _is_upper_side
 from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, joined_floor
-from topomerge.extraction.plans.storey_rooms import FLAT_LEAST_AREA, ROOM_LEAST_AREA
 from topomerge.extraction.scan import Scan
+from topomerge.extraction.segment import _is_upper_side, score_by_plan
 from topomerge.extraction.slices import is_slice
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.extraction.voxels import voxelise
@@ -238,12 +238,12 @@ def test_passages_measure_the_door() -> None:
     assert values["lintel"] == pytest.approx(scenes.HEIGHT - scenes.DOOR[1], abs=0.15) and values["lintel_cover"] > 0.8
     assert values["jamb"] > 0.8 and values["opens"] > 1.0 and values["length"] < 0.5
     assert door_probability(door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
-    parted = merge_regions(region, clearance, passages, plan.edge, door_probability, 0.5, 0.2, (0.8, 0.8))
-    never = merge_regions(region, clearance, passages, plan.edge, lambda x: np.zeros(len(x)), 0.5, 0.2, (0.8, 0.8))
-    always = merge_regions(region, clearance, passages, plan.edge, lambda x: np.ones(len(x)), 0.5, 0.2, (0.0, 0.0))
+    parted = rooms_of_segments(region, clearance, passages, score_by_plan)
+    never = rooms_of_segments(region, clearance, passages, lambda x, _: np.zeros(len(x)))
+    always = rooms_of_segments(region, clearance, passages, lambda x, _: np.ones(len(x)), (0.0, 0.0))
     sizes = np.bincount(region[region >= 0])
-    assert len(np.unique(parted.room[sizes * 0.01 > 1])) == 2
-    assert len(np.unique(never.room)) == 1 and len(np.unique(always.room)) == len(sizes)
+    assert len(np.unique(parted[sizes * 0.01 > 1])) == 2
+    assert len(np.unique(never)) == 1 and len(np.unique(always)) == len(sizes)
 
 
 @pytest.mark.parametrize(
@@ -265,8 +265,8 @@ def test_what_is_small_is_a_room_where_a_door_surely_parts_it(
     region[:side, 60 - side :] = 2  # squares of 0.81, 0.49 and 0.25 m2
     passage = Passage((0, 0), 0.8, (1.0, 0.0), (0.0,) * 12)
     passages = {(0, 1): passage, (1, 2): passage}
-    partition = merge_regions(region, np.ones(region.shape), passages, 0.1, lambda x: np.full(len(x), chance), 0.5, 0.2, least)
-    assert len(np.unique(partition.room)) == rooms
+    of_segment = rooms_of_segments(region, np.ones(region.shape), passages, lambda x, _: np.full(len(x), chance), least)
+    assert len(np.unique(of_segment)) == rooms
 
 
 def test_what_nothing_is_above_at_the_height_of_a_ceiling_is_no_storey() -> None:

@@ -6,6 +6,7 @@ A wall between two rooms has a face on either side; what is seen on both is one 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
@@ -40,6 +41,23 @@ DOORWAY_DTYPE = np.dtype(
         ("faces", "i4"),  # on which it was seen
     ]
 )
+
+
+@dataclass(frozen=True, eq=False)
+class StoreyWalls:
+    """The walls of all storeys.
+
+    Args:
+        elevations: their faces, unrolled.
+        classes: (n / 2, 7) of `place_classes`.
+        doors: (n / 2, 3) of `door_places`.
+        doorways: (D,) DOORWAY_DTYPE with the segments, or rooms, on both sides.
+    """
+
+    elevations: Elevations
+    classes: Array
+    doors: Array
+    doorways: Array
 
 
 def place_classes(walls: Elevations) -> Array:
@@ -121,6 +139,8 @@ def doorways(walls: Elevations, doors: Array, before: Array | None = None, by_sh
 def _most_common(rooms: Array, otherwise: int) -> int:
     """The room that occurs most often, `otherwise` where it is one of these or there is none (-1)."""
     counts = np.bincount(rooms[rooms >= 0].astype(np.int64), minlength=otherwise + 1)
+    if otherwise < 0:
+        return int(counts.argmax()) if len(counts) else -1
     return otherwise if counts[otherwise] == counts.max() else int(counts.argmax())
 
 

@@ -8,16 +8,14 @@ shows, of which nothing is left in the cells of a map.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from topomerge.extraction.cell_means import cell_middles
 from topomerge.kernels.strips import fill_strips
-from topomerge.structure.face_points import face_points, wall_columns
-from topomerge.structure.floors import room_levels
-from topomerge.structure.lines import Line, main_direction, straight_lines
-from topomerge.types import Array, TopometricMap, VoxelGrid
+from topomerge.structure.lines import Line
+from topomerge.types import Array, VoxelGrid
 
 ALONG, ACROSS, UPWARDS = 0.05, 0.025, 0.2  # m, of an element
 BEFORE, BEHIND = 0.3, 0.5  # m on both sides of a face
@@ -68,32 +66,27 @@ class Elevations:
     colours: Array | None = None
 
 
-def wall_elevations(
-    map: TopometricMap, cells: VoxelGrid, shades: tuple[Array, Array] | None = None, crossed: VoxelGrid | None = None
-) -> Elevations:
-    """The faces of all rooms, unrolled.
+def unroll(faces: Array, navigable: VoxelGrid, cells: VoxelGrid, crossed: VoxelGrid | None = None) -> Elevations:
+    """Unroll faces (F,) FACE_DTYPE.
 
     Args:
+        navigable: the navigable volume; of one with the property `standing`, the cells where a body fits.
         cells: with the means of their points (`cell_means`), in the map's frame; 5 cm or as fine as there are.
-        shades: (k, 3) points and their colours (k, 3) uint8, as of `Scan`.
         crossed: cells that rays crossed and in which nothing stands; None: unknown.
     """
-    faces = wall_faces(map)
     sizes = 2 * np.ceil(faces["length"] / ALONG / 2).astype(np.int64)
     frames = np.column_stack([faces["start"] - BEFORE * faces["out"], faces["along"], faces["out"], faces["floor"] + LOWEST])
     step = np.array([ALONG, ACROSS, UPWARDS])
     solid = fill_strips(np.ascontiguousarray(cell_middles(cells)), frames, sizes, (DEPTHS, BANDS), step, TILE)
-    floor = map.navigable.centroids()
-    standing = map.navigable.properties.get("standing")
+    floor = navigable.centroids()
+    standing = navigable.properties.get("standing")
     floor = floor if standing is None else floor[standing.astype(bool)]
     frames[:, 6] -= BANDS * UPWARDS / 2 + LOWEST  # one band about the floor
     walk = fill_strips(floor, frames, sizes, (DEPTHS, 1), np.array([ALONG, ACROSS, BANDS * UPWARDS]), TILE)
     flat = ALONG * UPWARDS / cells.edge**2  # cells of a wall that an element holds
-    edge = map.navigable.edge
     rays = crossed_places(crossed, faces, sizes)
-    strips = np.concatenate([solid / (FULL * flat), walk / (FULL * ALONG * ACROSS / edge**2), rays], axis=2)
-    walls = Elevations(faces, np.concatenate([[0], np.cumsum(sizes)]), np.minimum(strips, 1.0))
-    return walls if shades is None else replace(walls, colours=strip_colours(walls, *shades))
+    strips = np.concatenate([solid / (FULL * flat), walk / (FULL * ALONG * ACROSS / navigable.edge**2), rays], axis=2)
+    return Elevations(faces, np.concatenate([[0], np.cumsum(sizes)]), np.minimum(strips, 1.0))
 
 
 def crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array) -> Array:
@@ -141,23 +134,8 @@ def strip_colours(walls: Elevations, points: Array, colours: Array) -> Array:
     return np.asarray(np.clip(out, -MOST_CONTRAST, MOST_CONTRAST), np.float32)
 
 
-def wall_faces(map: TopometricMap) -> Array:
-    """(F,) FACE_DTYPE: the straight lines along which the walls that a room sees stand, each with its room on one side."""
-    levels = room_levels(map)[0][:, 0]
-    rows = []
-    for storey in range(len(map.storeys)):
-        rooms = np.flatnonzero(map.rooms["storey"] == storey).tolist()
-        points = face_points(map, storey)
-        columns = [wall_columns(points, r) for r in rooms]
-        main = main_direction([line for column in columns for line in straight_lines(*column)])
-        for r, column in zip(rooms, columns, strict=True):
-            floor = map.navigable.centroids(map.navigable.cells[map.navigable_room == r])[:, :2]
-            rows += _room_faces(r, straight_lines(*column, main), floor, float(levels[r]))
-    return np.array(rows, FACE_DTYPE)
-
-
-def _room_faces(room: int, lines: Sequence[Line], floor: Array, level: float) -> list[tuple[object, ...]]:
-    """Rows of FACE_DTYPE; lines with no floor of the room beside them are left out."""
+def face_rows(room: int, lines: Sequence[Line], floor: Array, level: float) -> list[tuple[object, ...]]:
+    """Rows of FACE_DTYPE along lines; those with no floor (n, 2) m of the room beside them are left out."""
     rows: list[tuple[object, ...]] = []
     for line in lines:
         at = floor - line.middle

@@ -14,15 +14,9 @@ import numpy as np
 
 from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
 from topomerge.extraction.doors import DOOR_MOST_WIDTH
-from topomerge.extraction.elevations.doorway_rooms import colour_doorways, doorways_of
-from topomerge.extraction.elevations.doorways import (
-    STRAIGHT,
-    door_places,
-    joined_openings,
-)
+from topomerge.extraction.elevations.doorways import STRAIGHT, StoreyWalls, joined_openings
 from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
 from topomerge.extraction.elevations.wall_network import PLACES
-from topomerge.extraction.plans.partition import Pair, pair_of
 from topomerge.io.weight_files import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
@@ -68,30 +62,21 @@ class DoorCandidates:
     source: Array
 
 
-def with_wall_doors(
-    map: TopometricMap, storeys: Sequence[ClassifiedStorey], walls: Elevations | None, classes: Array | None
-) -> tuple[TopometricMap, dict[Pair, float]]:
-    """The map with the doors that its plans and walls show; and how likely the likeliest door of each two rooms is, of all that
-    anything shows.
+def with_wall_doors(map: TopometricMap, storeys: Sequence[ClassifiedStorey], walls: StoreyWalls | None) -> TopometricMap:
+    """The map with the doors that its plans and walls show.
 
     Args:
         storeys: what probably stands in the columns of its plans.
-        walls: None of a map that shows none at heights.
-        classes: (n / 2, 7) of `place_classes`, of its walls.
+        walls: with the map's rooms beside them; None of a map that shows none at heights.
     """
-    candidates = door_candidates(map, storeys, walls, classes)
+    level = np.isin(map.edges["kind"], ("door", "opening"))
+    candidates = door_candidates(map.edges[level], map.rooms["completeness"], storeys, walls)
     chance = door_chance(candidates)
     edges = candidates.edges.copy()
     edges["confidence"] = chance
-    likely = (chance >= 0.5) | _only_ways(candidates, chance, len(map.rooms))
-    flights = map.edges[~np.isin(map.edges["kind"], ("door", "opening"))]
-    edges = np.concatenate([edges[likely], flights])
-    likeliest: dict[Pair, float] = {}
-    for rooms, likely in zip(candidates.edges["rooms"].tolist(), chance.tolist(), strict=True):
-        pair = pair_of(*rooms)
-        likeliest[pair] = max(likeliest.get(pair, 0.0), likely)
+    edges = np.concatenate([edges[(chance >= 0.5) | _only_ways(candidates, chance, len(map.rooms))], map.edges[~level]])
     order = np.lexsort((*edges["centre"].T[::-1], edges["rooms"][:, 1], edges["rooms"][:, 0]))
-    return replace(map, edges=edges[order]), likeliest
+    return replace(map, edges=edges[order])
 
 
 def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]] | None = None) -> Array:
@@ -114,55 +99,45 @@ def door_chance(candidates: DoorCandidates, models: Mapping[str, Sequence[float]
 
 
 def door_candidates(
-    map: TopometricMap, storeys: Sequence[ClassifiedStorey], walls: Elevations | None, classes: Array | None
+    edges: Array, complete: Array, storeys: Sequence[ClassifiedStorey], walls: StoreyWalls | None
 ) -> DoorCandidates:
-    """All doors and openings that the plans or the walls of a map show.
+    """Gather all doors and openings that plans or walls show, between rooms or between segments.
 
     Args:
-        storeys, walls, classes: as of `with_wall_doors`.
+        edges: EDGE_DTYPE, those that plans show; of their `confidence` the plan is as sure.
+        complete: (R,) share of each room's outline at which a wall was seen.
+        storeys: what probably stands in the columns of the plans.
+        walls: with what lies beside them numbered as in the edges; None of a map that shows none at heights.
     """
-    level = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
-    if walls is None or classes is None:
-        return _flat_candidates(map, storeys, level)
-    doors = door_places(walls, classes)
-    ways, shown = joined_openings(doorways_of(map, walls, doors))
-    whole = _opening_of(level, ways)
-    partner = _partners(level, ways, whole)
-    edges, features, source = [], [], []
-    for edge, i in zip(level, partner, strict=True):
-        complete = float(map.rooms["completeness"][edge["rooms"]].min())
+    if walls is None:
+        return _flat_candidates(complete, storeys, edges)
+    ways, shown = joined_openings(walls.doorways)
+    whole = _opening_of(edges, ways)
+    partner = _partners(edges, ways, whole)
+    rows, features, source = [], [], []
+    for edge, i in zip(edges, partner, strict=True):
+        less = float(complete[edge["rooms"]].min())
         if i >= 0:
             way = ways[i]
             part = whole[i] >= 0
             apart = 0.0 if part else float(np.hypot(*(way["centre"] - edge["centre"])[:2]))
-            edges.append(edge if part else _moved(edge, way))
-            features.append([*_seen(way), float(edge["confidence"]), 0, 1, *_size(shown[i], complete, apart)])
+            rows.append(edge if part else _moved(edge, way))
+            features.append([*_seen(way), float(edge["confidence"]), 0, 1, *_size(shown[i], less, apart)])
         else:
-            near, covered = _near(walls, doors, edge)
-            edges.append(edge)
-            features.append([0, 0, 0, 0, float(edge["confidence"]), near, covered, *_size(edge["width"], complete, 0)])
+            near, covered = _near(walls.elevations, walls.doors, edge)
+            rows.append(edge)
+            features.append([0, 0, 0, 0, float(edge["confidence"]), near, covered, *_size(edge["width"], less, 0)])
         source.append(SOURCES.index("both" if i >= 0 else "plan"))
     for i in np.setdiff1d(np.arange(len(ways)), partner).tolist():
         way = ways[i]
         if way["rooms"][1] >= 0 and whole[i] < 0:
-            complete = float(map.rooms["completeness"][way["rooms"]].min())
-            edges.append(_edge(way))
-            features.append([*_seen(way), 0, 0, 1, *_size(shown[i], complete, 0)])
+            rows.append(_edge(way))
+            features.append([*_seen(way), 0, 0, 1, *_size(shown[i], float(complete[way["rooms"]].min()), 0)])
             source.append(SOURCES.index("wall"))
-    for way in colour_doorways(map, walls, classes, np.concatenate([ways["centre"], level["centre"]]), WALL_DOOR_REACH):
-        complete = float(map.rooms["completeness"][way["rooms"]].min())
-        edges.append(_edge(way))
-        features.append([*_seen(way), 0, 0, 1, *_size(way["width"], complete, 0)])
-        source.append(SOURCES.index("colour"))
-    table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
-    seen = walls.strips[..., :BANDS] > 0
+    table = np.array(rows, EDGE_DTYPE) if rows else np.zeros(0, EDGE_DTYPE)
+    seen = walls.elevations.strips[..., :BANDS] > 0
     fill = float(np.log(LEAST_FILL + (seen.mean() if seen.size else 0.0)))
     return _candidates(table, features, fill, storeys, np.array(source, np.int8))
-
-
-def flat_door_chance(map: TopometricMap, storeys: Sequence[ClassifiedStorey], edges: Array) -> Array:
-    """(E,) probability that each passage (E,) EDGE_DTYPE of a map without walls is a door."""
-    return door_chance(_flat_candidates(map, storeys, edges))
 
 
 def _only_ways(candidates: DoorCandidates, chance: Array, rooms: int) -> Array:
@@ -177,10 +152,10 @@ def _only_ways(candidates: DoorCandidates, chance: Array, rooms: int) -> Array:
     return ways
 
 
-def _flat_candidates(map: TopometricMap, storeys: Sequence[ClassifiedStorey], edges: Array) -> DoorCandidates:
+def _flat_candidates(complete: Array, storeys: Sequence[ClassifiedStorey], edges: Array) -> DoorCandidates:
     """The doors of the plans of a map without walls."""
-    complete = map.rooms["completeness"][edges["rooms"]].min(axis=1).tolist()
-    sizes = [_size(width, c, 0) for width, c in zip(edges["width"], complete, strict=True)]
+    less = complete[edges["rooms"]].min(axis=1).tolist()
+    sizes = [_size(width, c, 0) for width, c in zip(edges["width"], less, strict=True)]
     features = [[0, 0, 0, 0, float(e["confidence"]), 0, 0, *size] for e, size in zip(edges, sizes, strict=True)]
     return _candidates(edges, features, 0.0, storeys, np.full(len(edges), SOURCES.index("flat"), np.int8))
 

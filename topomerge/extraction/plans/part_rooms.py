@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.plans.partition import Pair
-from topomerge.extraction.plans.passages import Passage
+from topomerge.extraction.plans.passages import Pair, Passage
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.types import Array
 

@@ -7,7 +7,7 @@ it, what is above it and how the walls beside it stand tell whether it is a door
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import edt
 import numpy as np
@@ -45,6 +45,9 @@ DOOR_FEATURES = (
 )
 
 
+Pair = tuple[int, int]  # of two regions, segments or rooms, the smaller number first
+
+
 @dataclass(frozen=True)
 class Passage:
     """The widest connection of two neighbouring regions; what does not depend on how the regions are merged."""
@@ -54,6 +57,13 @@ class Passage:
     across: tuple[float, float]  # unit vector from jamb to jamb
     measured: tuple[float, ...]  # the features 3 to 14
     log_odds: float = 0.0  # of a door, by the maps that were joined (`part_rooms`): added to what the classifier says
+    evidence: tuple[float, ...] = ()  # `extraction.passages.EVIDENCE`, once it was gathered
+
+
+def joined(one: Passage, other: Passage) -> Passage:
+    """The wider of two passages between the same rooms, with the evidence of both: each its highest."""
+    wider = one if one.width > other.width else other
+    return replace(wider, evidence=tuple(np.maximum(one.evidence, other.evidence).tolist()))
 
 
 def clearance_of(plan: StoreyPlan) -> Array:
@@ -176,3 +186,8 @@ def door_features(passage: Passage, peaks: Sequence[float] | Array, areas: Seque
     sides = half / max(min(peaks), half), half / max(max(peaks), half)
     small, large = (float(np.log(max(a, 0.1))) for a in sorted(areas))
     return np.array([passage.width, *sides, *passage.measured, small, large])
+
+
+def pair_of(a: int, b: int) -> Pair:
+    """Two rooms, the smaller number first."""
+    return (a, b) if a < b else (b, a)

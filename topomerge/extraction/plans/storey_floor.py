@@ -10,10 +10,10 @@ from scipy import ndimage
 from topomerge.extraction.completeness import outline_seen
 from topomerge.extraction.components import spread_labels
 from topomerge.extraction.floor import Floor
-from topomerge.extraction.plans.partition import Pair
+from topomerge.extraction.partition import PartitionedStorey
+from topomerge.extraction.plans.passages import Pair
 from topomerge.extraction.plans.plan import columns_of
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.extraction.plans.storey_rooms import StoreyRooms
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import Array, VoxelGrid
 
@@ -25,7 +25,7 @@ FLOOR_PROPERTIES = ("standing", "storey", "room", "area")
 
 
 def floor_of_storeys(
-    grid: VoxelGrid, navigable: VoxelGrid, storey: Array, storeys: Array, cut: Sequence[StoreyRooms], factor: int
+    grid: VoxelGrid, navigable: VoxelGrid, storey: Array, storeys: Array, cut: Sequence[PartitionedStorey], factor: int
 ) -> Floor:
     """The floor of all storeys, its rooms and areas numbered from storey to storey.
 
@@ -76,6 +76,16 @@ def _label_cells(label: Array, grid: VoxelGrid, plan: StoreyPlan, room: Array, f
     """Give the occupied cells of a storey the room of their column; walls go to the nearest room."""
     far, nearest = ndimage.distance_transform_edt(room < 0, return_indices=True)
     room = np.where(far * plan.edge <= WALL_REACH, room[tuple(nearest)], -1)
+    rows, column = cells_of_storey(grid, plan, room, factor)
+    label[rows] = room[tuple(column.T)]
+
+
+def cells_of_storey(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor: int) -> tuple[Array, Array]:
+    """Rows of the occupied cells between floor and ceiling of a storey, in columns that have a room (nx, ny), and (k, 2) these.
+
+    Args:
+        factor: how many times longer the columns are than the cells.
+    """
     low, base = columns_of(plan, grid)
     at = (grid.cells // factor if factor > 1 else grid.cells)[:, :2].astype(np.int64) - low
     rows = np.flatnonzero(((at >= 0) & (at < room.shape)).all(axis=1))
@@ -84,10 +94,10 @@ def _label_cells(label: Array, grid: VoxelGrid, plan: StoreyPlan, room: Array, f
     z = (grid.cells[rows, 2] // factor - base[tuple(at.T)]) * plan.edge
     top = np.minimum(np.where(np.isnan(ceiling), np.inf, ceiling + OVER_CEILING), above + 0.5 * plan.edge)
     in_storey = (z >= -UNDER_FLOOR) & (z <= top) & (room[tuple(at.T)] >= 0)
-    label[rows[in_storey]] = room[tuple(at[in_storey].T)]
+    return rows[in_storey], at[in_storey]
 
 
-def _floor_cells(part: StoreyRooms, navigable: VoxelGrid, in_storey: Array, factor: int) -> tuple[Array, Array, Array]:
+def _floor_cells(part: PartitionedStorey, navigable: VoxelGrid, in_storey: Array, factor: int) -> tuple[Array, Array, Array]:
     """Cells of a storey's floor, the column of the plan in which each lies, and whether somebody can stand there.
 
     These are its navigable cells, and below furniture all cells of a column of the plan at the level of its floor.

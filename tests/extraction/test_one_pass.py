@@ -1,0 +1,118 @@
+"""The extraction looks once, weighs once and cuts once; what it weighs."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import topomerge.extraction
+from tests.extraction.elevations.doors import three_doors
+from tests.extraction.segments import storey_of
+from topomerge.errors import InputError
+from topomerge.extraction import extract as pipeline
+from topomerge.extraction import passages as evidence
+from topomerge.extraction import segment, walls
+from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE
+from topomerge.extraction.passages import EVIDENCE, choose_scorer, find_crossings
+from topomerge.extraction.plans.passages import Passage
+from topomerge.extraction.segment import find_segments, split_segments
+
+ONCE = (
+    (pipeline, "rasterise_storeys"),
+    (segment, "column_probabilities"),
+    (pipeline, "segment_storey"),
+    (pipeline, "unroll_walls"),
+    (walls, "place_classes"),
+    (pipeline, "find_passages"),
+    (pipeline, "partition_rooms"),
+    (pipeline, "topometric_map"),
+    (pipeline, "estimate_attributes"),
+)
+CLOUD = three_doors().points()
+PASSAGE = Passage((10, 20), 0.8, (0.0, 1.0), (0.0,) * 12, evidence=(0.0,) * len(EVIDENCE))
+
+
+def test_each_step_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    for module, name in ONCE:
+        step = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, step=step, name=name, **k: (calls.append(name), step(*a, **k))[1])
+    map = pipeline.extract(CLOUD)
+    assert calls.index("unroll_walls") < calls.index("find_passages") < calls.index("partition_rooms")
+    assert sorted(calls) == sorted(name for _, name in ONCE) and len(map.rooms) == 2 and len(map.edges) == 2
+
+
+def test_a_cloud_enters_few_files_of_the_extraction() -> None:
+    pipeline.extract(CLOUD)  # compiled
+    folder, entered = str(Path(topomerge.extraction.__file__).parent), set()
+
+    def note(frame, event, _):
+        if event == "call" and frame.f_code.co_filename.startswith(folder) and frame.f_code.co_name != "<module>":
+            entered.add(frame.f_code.co_filename)
+
+    sys.setprofile(note)
+    try:
+        pipeline.extract(CLOUD)
+    finally:
+        sys.setprofile(None)
+    assert 10 < len(entered) <= MOST_FILES, sorted(entered)
+
+
+MOST_FILES = 52  # of the extraction: the aim is 35, when its small modules are put together
+
+
+def doorway(x: float, y: float, width: float = 0.9) -> np.ndarray:
+    out = np.zeros(1, DOORWAY_DTYPE)
+    out["centre"], out["out"], out["width"] = (x, y, 0.0), (1.0, 0.0), width
+    return out
+
+
+def test_a_doorway_splits_the_segment_that_it_lies_in_where_walls_close_the_rest() -> None:
+    columns = np.zeros((40, 20), np.int64)
+    columns[20, :6] = columns[20, 14:] = -1  # a wall with a gap of 0.8 m
+    storey = storey_of(columns, {}, np.where(columns >= 0, 0.5, 0.0))
+    split = split_segments(storey, doorway(2.05, 1.0))
+    assert split.count == 2 and len(np.unique(split.segment[:19][split.segment[:19] >= 0])) == 1
+    assert split.split == frozenset({(0, 1)}) == frozenset(split.passages)
+    assert split.areas.sum() == pytest.approx(storey.areas.sum())
+    assert (
+        split_segments(storey_of(np.zeros((40, 20), np.int64), {}), doorway(2.05, 1.0)).count == 1
+    )  # the floor goes on beside it
+    assert split_segments(storey, doorway(2.05, 1.0)[:0]) is storey
+
+
+def test_places_lie_in_the_segment_of_the_nearest_floor_below_or_above() -> None:
+    columns = np.repeat([[0], [1]], 10, axis=0).repeat(4, axis=1)
+    lower = storey_of(columns, {})
+    upper = replace(lower, number=1, plan=replace(lower.plan, floor=lower.plan.floor + 3.0))
+    places = np.array([(0.25, 0.2, 0.1), (1.25, 0.2, 0.1), (0.25, 0.2, 2.9), (0.25, 0.2, 1.5), (9.0, 0.2, 0.0)])
+    assert find_segments([lower, upper], places).tolist() == [0, 1, 2, -1, -1]
+
+
+def test_the_way_of_the_sensor_crosses_segments_and_ends_where_it_is_far_off() -> None:
+    columns = np.repeat([0, 1, 2], 10)[:, None].repeat(5, axis=1)
+    storey = storey_of(columns, {})
+    way = np.array([(0.5, 0.2, 1.5), (1.5, 0.2, 1.5), (2.5, 0.2, 1.5)])
+    assert find_crossings([storey], way) == {(0, 1), (1, 2)}
+    assert find_crossings([storey], way[[0, 2]]) == set()  # 2 m apart: no way
+    assert find_crossings([storey], way + (0, 0, 3.0)) == set() == find_crossings([storey], way[:0])
+
+
+def test_doorways_that_walls_show_raise_the_score() -> None:
+    score, x = (
+        choose_scorer(True),
+        np.tile(np.array([0.8, 0.4, 0.3, 0.5, 1, 1, 0.2, 0.3, 1, 1, 0, 1, 1, 0.8, 0.9, 2, 3.0]), (4, 1)),
+    )
+    rows = [(0.0, 0.0, 0, 0), (0.0, 1.0, 0, 0), (0.0, 3.0, 0, 0), (0.0, 0.0, 0, 1)]
+    none, shown, surely, within = score(x, [replace(PASSAGE, evidence=row) for row in rows]).tolist()
+    assert none < shown < surely and none < within
+
+
+def test_damaged_weights_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evidence, "read_weights_json", lambda *_: {"walls": [0.0, np.nan]})
+    with pytest.raises(InputError, match=r"passages.json: walls must be 5 numbers"):
+        choose_scorer(True)

@@ -1,0 +1,318 @@
+"""Segments of storeys: floor within which the plan shows no passage to another room (beyond the thesis: docs/adr/0024).
+
+There are too many segments rather than too few. Which of them are one room is decided once all evidence is there (`partition`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from heapq import heappop, heappush
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.extraction.ceilings import NOWHERE
+from topomerge.extraction.classified_storey import ClassifiedStorey
+from topomerge.extraction.completeness import outline_seen
+from topomerge.extraction.plans.door_classifier import door_probability
+from topomerge.extraction.plans.part_rooms import PartRooms, door_log_odds, laid_rooms, parted_columns
+from topomerge.extraction.plans.passages import (
+    Pair,
+    Passage,
+    clearance_of,
+    door_features,
+    find_passages,
+    joined,
+    pair_of,
+    regions_of,
+)
+from topomerge.extraction.plans.plan import columns_of, storey_plan
+from topomerge.extraction.plans.plan_network import column_probabilities, weights, without_furniture
+from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.upper_sides import without_upper_sides
+from topomerge.extraction.scan import Scan
+from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
+from topomerge.numpy_nn import sigmoid
+from topomerge.types import Array, VoxelGrid
+
+Scorer = Callable[[Array, Sequence[Passage]], Array]  # (n, 17) features and passages -> (n,) probability of a door
+
+PLAN_CELL = 0.1  # m: finer grids are looked at with about this
+THINNEST_SLAB = 0.15  # m: a thinner one parts no storeys
+SAME_LEVEL = 1.0  # m between a place and the floor of the storey on which it is
+LINE_COLUMNS = 0.75  # columns to both sides of the line of a doorway: segments that touch at a corner are split, too
+PAST_JAMBS = 0.2  # m past both jambs of a doorway along which a segment is split
+SUREST_DOOR = 1e-6  # probabilities are that far from 0 and 1 at least where other maps are weighed
+LEAST_SPLIT = 0.3  # m2 on each side of a doorway that splits a segment
+
+
+@dataclass(frozen=True, eq=False)
+class RasterisedStoreys:
+    """The storeys seen from above.
+
+    Args:
+        grid: occupied cells, of the length of the plans' columns.
+        storeys: (S,) STOREY_DTYPE.
+        storey: (m,) storey of each navigable cell.
+        factor: how many times longer the columns are than the navigable cells.
+        numbers: storey of each plan.
+        plans: without furniture.
+        probabilities: (nx, ny, 5) of each plan, what probably stands in its columns.
+    """
+
+    grid: VoxelGrid
+    storeys: Array
+    storey: Array
+    factor: int
+    numbers: tuple[int, ...]
+    plans: tuple[StoreyPlan, ...]
+    probabilities: tuple[Array, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedStorey:
+    """A storey cut into segments.
+
+    Args:
+        number: of the storey.
+        plan: without furniture.
+        classes: what probably stands in its columns.
+        clearance: (nx, ny) m to the next wall.
+        segment: (nx, ny) segment of each column, -1 none.
+        passages: the widest of each two neighbouring segments.
+        split: pairs of them that a doorway in a wall parts, which the plan missed.
+    """
+
+    number: int
+    plan: StoreyPlan
+    classes: ClassifiedStorey
+    clearance: Array
+    segment: Array
+    passages: dict[Pair, Passage]
+    split: frozenset[Pair] = frozenset()
+
+    @property
+    def count(self) -> int:
+        """Number of segments."""
+        return int(self.segment.max(initial=-1)) + 1
+
+    @property
+    def areas(self) -> Array:
+        """(n,) m2 of each segment."""
+        return np.bincount(self.segment[self.segment >= 0], minlength=self.count) * self.plan.edge**2
+
+    @property
+    def completeness(self) -> Array:
+        """(n,) share of each segment's outline at which a wall was seen."""
+        return outline_seen(self.segment, self.plan.inside, self.plan.wall, self.plan.edge)
+
+    def centre_of(self, passage: Passage) -> Array:
+        """(3,) m, where a passage lies."""
+        at = self.plan.origin + (np.array(passage.place) + 0.5) * self.plan.edge
+        return np.append(at, self.plan.floor[passage.place])
+
+
+def rasterise_storeys(scan: Scan, navigable: VoxelGrid, standing_height: float) -> RasterisedStoreys:
+    """Detect the storeys and draw each of them once, with what probably stands in its columns.
+
+    Args:
+        navigable: the navigable volume.
+        standing_height: m, whatever is lower than this above the floor is no ceiling.
+    """
+    grid = scan.grid
+    storeys, storey = find_storeys(navigable, floor_to_ceiling(grid, navigable, standing_height))
+    factor = max(round(PLAN_CELL / grid.edge), 1)
+    coarse, floor, of_coarse = _coarsen(grid, navigable, storey, factor)
+    numbers = [k for k in range(len(storeys)) if (of_coarse == k).any() and not _is_upper_side(storeys[k], storeys[:k])]
+    plans, probabilities = [], []
+    for k in numbers:
+        plan = storey_plan(coarse, floor, of_coarse, k, scan.crossed)
+        probability = column_probabilities(plan, weights(scan.raised))
+        plans.append(without_furniture(plan, probability))
+        probabilities.append(probability)
+    return RasterisedStoreys(coarse, storeys, storey, factor, tuple(numbers), tuple(plans), tuple(probabilities))
+
+
+def segment_storey(
+    rasters: RasterisedStoreys, i: int, narrow: float, parts: Sequence[PartRooms] = (), places: Array = NOWHERE
+) -> SegmentedStorey:
+    """Cut the `i`-th plan at all narrowings, and merge what surely no door parts.
+
+    Args:
+        narrow: probability of a door, by the plan, up to which regions are merged.
+        parts: rooms of the maps that the cells were joined of: segments end where these do.
+        places: (n, 3) m, where the sensor was.
+    """
+    plan, probability, k = rasters.plans[i], rasters.probabilities[i], rasters.numbers[i]
+    clearance, laid = clearance_of(plan), laid_rooms(plan, parts)
+    region = regions_of(plan, probability, parted_columns(laid) if laid else None)
+    if k > 0:
+        region = without_upper_sides(rasters.grid, plan, region, places)
+    passages = find_passages(plan, clearance, region, probability)
+    if laid:
+        odds = door_log_odds(region, plan.edge, passages, laid)
+        passages = {pair: replace(passage, log_odds=odds[pair]) for pair, passage in passages.items()}
+    growing = GrowingRooms(region, clearance, passages, plan.edge, score_by_plan)
+    while growing.door_probability and growing.door_probability[pair := growing.weakest()] <= narrow:
+        growing.merge(pair)
+    names = np.unique(growing.of_region[region[region >= 0]])
+    number = np.full(len(growing.of_region) + 1, -1)
+    number[names] = np.arange(len(names))
+    segment = number[np.append(growing.of_region, -1)[region]]
+    passages = {(int(number[a]), int(number[b])): passage for (a, b), passage in growing.passages.items()}
+    low, base = columns_of(plan, rasters.grid)
+    corner = rasters.grid.origin + np.append(low, np.median(base)) * plan.edge
+    classes = ClassifiedStorey(probability, corner[:2], plan.edge, float(corner[2]))
+    return SegmentedStorey(k, plan, classes, clearance, segment, passages)
+
+
+def split_segments(storey: SegmentedStorey, doorways: Array) -> SegmentedStorey:
+    """Split segments along doorways that lie within them: the plan misses the doors of rooms that are no wider.
+
+    Args:
+        doorways: DOORWAY_DTYPE of this storey, with one segment on both sides.
+    """
+    segment, split, pairs = storey.segment.copy(), set(), set()
+    for doorway in doorways:
+        line = _columns_along(storey.plan, doorway)
+        at = np.rint((doorway["centre"][:2] - storey.plan.origin) / storey.plan.edge - 0.5).astype(int)
+        near = segment[tuple(slice(max(k - 4, 0), k + 5) for k in at)]
+        for s in np.unique(near[near >= 0]).tolist():
+            own = segment == s
+            label, _ = ndimage.label(own & ~line)
+            sizes = np.bincount(label.ravel())[1:] * storey.plan.edge**2
+            large = np.flatnonzero(sizes >= LEAST_SPLIT) + 1
+            beside = np.unique(label[ndimage.binary_dilation(line, np.ones((3, 3))) & (label > 0)])
+            if len(np.intersect1d(large, beside)) < 2:
+                continue
+            nearest = ndimage.distance_transform_edt(~np.isin(label, large), return_distances=False, return_indices=True)
+            label = label[tuple(nearest)]
+            for part in large[np.argsort(-sizes[large - 1], kind="stable")][1:].tolist():
+                split |= {s, int(segment.max()) + 1}
+                segment[own & (label == part)] = int(segment.max()) + 1
+    if not split:
+        return storey
+    found = find_passages(storey.plan, storey.clearance, segment, storey.classes.probability)
+    passages = {pair: storey.passages.get(pair, passage) if not split & set(pair) else passage for pair, passage in found.items()}
+    for doorway in doorways:
+        near = ndimage.binary_dilation(_columns_along(storey.plan, doorway), np.ones((3, 3)))
+        pairs |= {pair for pair, passage in passages.items() if split & set(pair) and near[passage.place]}
+    return replace(storey, segment=segment, passages=passages, split=frozenset(pairs))
+
+
+def find_segments(
+    storeys: Sequence[SegmentedStorey], places: Array, up: tuple[float, float] = (-SAME_LEVEL, SAME_LEVEL)
+) -> Array:
+    """(n,) int64 segment under each place (n, 3) m, numbered on from storey to storey, -1 none.
+
+    Args:
+        up: m, between which a place lies above the floor.
+    """
+    out, nearest = np.full(len(places), -1, np.int64), np.full(len(places), np.inf)
+    first = 0
+    for storey in storeys:
+        plan = storey.plan
+        at = np.floor((places[:, :2] - plan.origin) / plan.edge).astype(np.int64)
+        inside = np.flatnonzero(((at >= 0) & (at < plan.wall.shape)).all(axis=1))
+        column = tuple(at[inside].T)
+        above = places[inside, 2] - plan.floor[column]
+        own = (above > up[0]) & (above < up[1]) & (np.abs(above) < nearest[inside])
+        here = storey.segment[column]
+        nearest[inside[own]] = np.abs(above[own])
+        out[inside[own]] = np.where(here[own] >= 0, here[own] + first, -1)
+        first += storey.count
+    return out
+
+
+def score_by_plan(x: Array, passages: Sequence[Passage]) -> Array:
+    """(n,) probability of a door in each passage by the plan, and by what the maps say that were joined.
+
+    Args:
+        x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
+    """
+    plan, said = door_probability(x), np.array([passage.log_odds for passage in passages])
+    return np.where(said == 0, plan, sigmoid(log_odds(plan) + said))
+
+
+def log_odds(probability: Array) -> Array:
+    """(n,) of probabilities, which are taken for no surer than `SUREST_DOOR`."""
+    sure = np.clip(probability, SUREST_DOOR, 1 - SUREST_DOOR)
+    return np.log(sure / (1 - sure))
+
+
+def _columns_along(plan: StoreyPlan, doorway: Array) -> Array:
+    """(nx, ny) bool: the columns along a doorway."""
+    x, y = (plan.origin[k] + (np.arange(n) + 0.5) * plan.edge - doorway["centre"][k] for k, n in enumerate(plan.wall.shape))
+    u, v = doorway["out"]
+    along, across = y[None] * u - x[:, None] * v, x[:, None] * u + y[None] * v
+    columns: Array = (np.abs(across) < LINE_COLUMNS * plan.edge) & (np.abs(along) < doorway["width"] / 2 + PAST_JAMBS)
+    return columns
+
+
+def _coarsen(grid: VoxelGrid, navigable: VoxelGrid, storey: Array, factor: int) -> tuple[VoxelGrid, VoxelGrid, Array]:
+    """Both grids with cells `factor` times as long, and the storey of each navigable one: the lowest of those in it."""
+    if factor == 1:
+        return grid, navigable, storey
+    coarse = navigable.coarser(factor)
+    coarse_storey = np.full(len(coarse), np.iinfo(np.int32).max, np.int32)
+    np.minimum.at(coarse_storey, coarse.rows(navigable.cells // factor), storey)
+    return grid.coarser(factor), coarse, coarse_storey
+
+
+def _is_upper_side(top: Array, below: Array) -> bool:
+    """Is a storey with nothing above it the ceiling of one below? A floor lies a slab above that."""
+    return bool(np.isnan(top["ceiling"]) and (np.abs(below["ceiling"] - top["floor"]) < THINNEST_SLAB).any())
+
+
+class GrowingRooms:
+    """Rooms that grow by merging and how likely doors part them; a room is named by one of its regions."""
+
+    def __init__(self, region: Array, clearance: Array, passages: dict[Pair, Passage], edge: float, score: Scorer) -> None:
+        count = int(region.max(initial=-1)) + 1
+        in_region = region >= 0
+        self.of_region = np.arange(count)
+        self.area = np.bincount(region[in_region], minlength=count) * edge**2
+        self.peak = np.zeros(count)
+        np.maximum.at(self.peak, region[in_region], clearance[in_region])
+        self.passages = dict(passages)
+        self.score = score
+        self.door_probability: dict[Pair, float] = {}
+        self.queue: list[tuple[float, Pair]] = []  # holds outdated probabilities, too
+        self.neighbours: list[set[int]] = [set() for _ in range(count)]
+        for a, b in passages:
+            self.neighbours[a].add(b)
+            self.neighbours[b].add(a)
+        self._score(sorted(passages))
+
+    def _score(self, pairs: list[Pair]) -> None:
+        if pairs:
+            x = np.array([door_features(self.passages[p], self.peak[list(p)], self.area[list(p)]) for p in pairs])
+            for pair, probability in zip(pairs, self.score(x, [self.passages[p] for p in pairs]).tolist(), strict=True):
+                self.door_probability[pair] = probability
+                heappush(self.queue, (probability, pair))
+
+    def weakest(self) -> Pair:
+        """The pair that the least likely door parts; there must be one."""
+        while self.door_probability.get(self.queue[0][1]) != self.queue[0][0]:
+            heappop(self.queue)
+        return self.queue[0][1]
+
+    def merge(self, pair: Pair) -> None:
+        """The second becomes part of the first."""
+        room, absorbed = pair
+        del self.passages[pair], self.door_probability[pair]
+        self.of_region[self.of_region == absorbed] = room
+        self.peak[room] = max(self.peak[room], self.peak[absorbed])
+        self.area[room] += self.area[absorbed]
+        self.neighbours[room].discard(absorbed)
+        for other in self.neighbours[absorbed] - {room}:
+            old, new = pair_of(absorbed, other), pair_of(room, other)
+            self.neighbours[other].discard(absorbed)
+            self.neighbours[other].add(room)
+            self.neighbours[room].add(other)
+            passage = self.passages.pop(old)
+            del self.door_probability[old]
+            known = self.passages.get(new)
+            self.passages[new] = passage if known is None else joined(passage, known)
+        self._score(sorted(pair_of(room, other) for other in self.neighbours[room]))

@@ -1,0 +1,163 @@
+"""Walls of storeys, unrolled before rooms exist, and the doorways in them (beyond the thesis: docs/adr/0018, 0024).
+
+The faces of segments are read once by the network of elevations. Faces and doorways have the numbers of the segments beside them,
+and those of rooms once segments are merged (`relabel_walls`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from scipy import ndimage
+
+from topomerge.extraction.doors import DOOR_MOST_WIDTH
+from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE, StoreyWalls, door_places, doorways, place_classes
+from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, Elevations, face_rows, unroll
+from topomerge.extraction.elevations.wall_network import PLACES
+from topomerge.extraction.plans.storey_floor import WALL_REACH, cells_of_storey
+from topomerge.extraction.scan import Scan
+from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, find_segments, split_segments
+from topomerge.kernels.voxelise import OFFSET_STEPS
+from topomerge.structure.face_points import FACE_HEIGHTS, FULL_COLUMN, LEAST_CELLS
+from topomerge.structure.lines import main_direction, straight_lines
+from topomerge.types import Array, VoxelGrid
+
+Locate = Callable[[Array], Array]  # (n, 3) m places on floors -> (n,) int64 segment or room there, -1 none
+SPOTS_BEFORE = (0.2, 0.35, 0.5)  # m before a face: there the floor lies that sees it
+BEYOND = (0.1, 1.0)  # m from a wall: there the other side begins
+SURE_WITHIN = 0.91  # probability of a door, the mean along a doorway, from which on it splits a segment
+SAME_SIDE = 0.5  # of the places behind it
+LARGEST_SPLIT = 30.0  # m2: the plan misses the doors of toilets and stores, and what is on their other side is small, too
+
+
+def unroll_walls(
+    scan: Scan, navigable: VoxelGrid, rasters: RasterisedStoreys, storeys: Sequence[SegmentedStorey]
+) -> StoreyWalls | None:
+    """Unroll the walls of all segments and read them once; None of a scan that shows no walls at heights.
+
+    Args:
+        navigable: the navigable volume.
+    """
+    if scan.fine is None or not any(storey.count for storey in storeys):
+        return None
+    first, rows = 0, []
+    for storey in storeys:
+        rows += _faces_of(scan.grid, rasters, storey, first)
+        first += storey.count
+    elevations = unroll(np.array(rows, FACE_DTYPE), navigable, scan.fine, scan.crossed)
+    classes = place_classes(elevations)
+    doors = door_places(elevations, classes)
+    return StoreyWalls(
+        elevations, classes, doors, find_doorways(elevations, doors, lambda places: find_segments(storeys, places))
+    )
+
+
+def find_doorways(elevations: Elevations, doors: Array, locate: Locate) -> Array:
+    """Find the doorways (D,) DOORWAY_DTYPE on walls, with what lies on their two sides; the second -1 where that is nothing else.
+
+    Args:
+        doors: (n / 2, 3) of `door_places`.
+    """
+    found = doorways(elevations, doors, _sides_before(elevations, locate))
+    found = found[found["rooms"][:, 0] >= 0].copy()
+    for k in np.flatnonzero(found["rooms"][:, 1] < 0).tolist():
+        behind = locate(_places_behind(found[k]))
+        other = behind[(behind >= 0) & (behind != found["rooms"][k, 0])]
+        if len(other):
+            found["rooms"][k, 1] = np.bincount(other).argmax()
+    return found
+
+
+def find_doorways_within(walls: StoreyWalls, storeys: Sequence[SegmentedStorey]) -> list[Array]:
+    """Find the doorways of each storey that walls show surely, with one small segment on both sides."""
+    ways, area = walls.doorways, np.concatenate([storey.areas for storey in storeys])
+    sure = (ways["rooms"][:, 1] < 0) & (ways["rooms"][:, 0] >= 0) & (ways["mean"] >= SURE_WITHIN)
+    sure &= (ways["width"] <= DOOR_MOST_WIDTH) & (area[ways["rooms"][:, 0]] <= LARGEST_SPLIT)
+    within: list[list[Array]] = [[] for _ in storeys]
+    ends = np.cumsum([storey.count for storey in storeys])
+    for way in ways[sure]:
+        behind = find_segments(storeys, _places_behind(way))
+        if np.mean(behind == way["rooms"][0]) >= SAME_SIDE:
+            within[int(np.searchsorted(ends, way["rooms"][0], side="right"))].append(way)
+    return [np.array(some, DOORWAY_DTYPE) for some in within]
+
+
+def split_at_doorways(storeys: Sequence[SegmentedStorey], walls: StoreyWalls) -> tuple[list[SegmentedStorey], StoreyWalls]:
+    """Split segments along doorways that walls surely show within them; doorways and faces then lie beside the new segments."""
+    within = find_doorways_within(walls, storeys)
+    if not any(len(some) for some in within):
+        return list(storeys), walls
+    split = [split_segments(storey, some) for storey, some in zip(storeys, within, strict=True)]
+    doorways = find_doorways(walls.elevations, walls.doors, lambda places: find_segments(split, places))
+    return split, replace(walls, doorways=doorways)
+
+
+def relabel_walls(walls: StoreyWalls, number: Array) -> StoreyWalls:
+    """The walls with other numbers of what lies beside them: of rooms, once segments were merged.
+
+    Args:
+        number: (n,) of each segment, -1 none.
+    """
+    number = np.append(number, -1)
+    faces, ways = walls.elevations.faces.copy(), walls.doorways.copy()
+    faces["room"] = number[faces["room"]]
+    sides = number[ways["rooms"]]
+    sides[sides[:, 0] == sides[:, 1], 1] = -1
+    ways["rooms"] = np.where((sides[:, 0] < 0)[:, None], sides[:, ::-1], sides)
+    return replace(walls, elevations=replace(walls.elevations, faces=faces), doorways=ways[ways["rooms"][:, 0] >= 0])
+
+
+def _faces_of(grid: VoxelGrid, rasters: RasterisedStoreys, storey: SegmentedStorey, first: int) -> list[tuple[object, ...]]:
+    """Rows of FACE_DTYPE of a storey's segments, which are numbered from `first` on."""
+    plan = storey.plan
+    far, nearest = ndimage.distance_transform_edt(storey.segment < 0, return_indices=True)
+    segment = np.where(far * plan.edge <= WALL_REACH, storey.segment[tuple(nearest)], -1)
+    rows, column = cells_of_storey(grid, plan, segment, rasters.factor)
+    of = segment[tuple(column.T)]
+    count = storey.count
+    inside = storey.segment >= 0
+    order = np.argsort(storey.segment[inside], kind="stable")
+    ends = np.searchsorted(storey.segment[inside][order], np.arange(count + 1))
+    floors = plan.origin + (np.argwhere(inside)[order] + 0.5) * plan.edge
+    heights = plan.floor[inside][order]
+    level = np.array([np.median(heights[a:b]) for a, b in pairwise(ends)])
+    offset = grid.properties.get("offset")
+    within = 0.5 if offset is None else (offset[rows].astype(np.float64) + 0.5) / OFFSET_STEPS
+    at = grid.origin + (grid.cells[rows] + within) * grid.edge
+    above = at[:, 2] - level[of]
+    upright = (above > FACE_HEIGHTS[0]) & (above < FACE_HEIGHTS[1])
+    rows, of, at = rows[upright], of[upright], at[upright]
+    key = (of * grid.shape[0] + grid.cells[rows, 0]) * grid.shape[1] + grid.cells[rows, 1]
+    _, start, column_of, cells = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    middle = np.column_stack([np.bincount(column_of, at[:, k], len(cells)) / np.maximum(cells, 1) for k in (0, 1)])
+    scale = 0.1 / grid.edge  # how many cells stand above each other
+    full = cells >= LEAST_CELLS * scale
+    owner, middle = of[start][full], middle[full]
+    weight = np.minimum(cells[full] / (FULL_COLUMN * scale), 1.0) * grid.edge
+    columns = [(middle[owner == s], weight[owner == s]) for s in range(count)]
+    main = main_direction([line for points in columns for line in straight_lines(*points)])
+    faces: list[tuple[object, ...]] = []
+    for s, points in enumerate(columns):
+        faces += face_rows(first + s, straight_lines(*points, main), floors[ends[s] : ends[s + 1]], float(level[s]))
+    return faces
+
+
+def _sides_before(elevations: Elevations, locate: Locate) -> Array:
+    """(n / 2, 3) int64 what lies under spots before each place along all strips, -1 none."""
+    sizes = np.diff(elevations.first) // PLACES
+    face = elevations.faces[np.repeat(np.arange(len(sizes)), sizes)]
+    along = (np.arange(len(face)) - np.repeat(elevations.first[:-1] // PLACES, sizes) + 0.5) * (PLACES * ALONG)
+    at = face["start"] + along[:, None] * face["along"]
+    return np.stack([locate(np.column_stack([at - off * face["out"], face["floor"]])) for off in SPOTS_BEFORE], axis=1)
+
+
+def _places_behind(way: Array) -> Array:
+    """(k, 3) m, behind a doorway as its first side sees it."""
+    steps = np.arange(BEYOND[0], BEYOND[1] + 0.05, 0.1)
+    aside = np.array([-way["out"][1], way["out"][0]]) * float(way["width"]) / 4
+    places = way["centre"][:2] + aside * np.array([[-1.0], [0.0], [1.0]]) + steps[:, None, None] * way["out"]
+    places = places.reshape(-1, 2)
+    return np.column_stack([places, np.full(len(places), way["centre"][2])])
