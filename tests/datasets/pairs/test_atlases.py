@@ -1,4 +1,4 @@
-"""Atlases: transforms close around every cycle; pictures of what is made are small files."""
+"""Atlases: transforms close around every cycle."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.pairs.atlases import make_atlas
 from topomerge.datasets.pairs.pairs import Atlas, PairSettings, make_pair
-from topomerge.datasets.reports.gallery import building_picture, match_picture, save
 
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
@@ -41,10 +40,3 @@ def test_bad_atlases() -> None:
 
 
 @pytest.mark.longer
-def test_pictures(tmp_path: Path) -> None:
-    building = make_building("house", 3, 2)
-    pair = make_pair(building, PairSettings(0.5, ("depth", "depth"), 4), 2)
-    save(building_picture(building), tmp_path / "building.png")
-    save(match_picture(pair, (extract(pair.a, voxel_size=0.2), extract(pair.b, voxel_size=0.2))), tmp_path / "pair.png")
-    for path in tmp_path.iterdir():
-        assert 1000 < path.stat().st_size < 150_000
