@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from topomerge.datasets.buildings.procedural import make_building
 from topomerge.datasets.pairs.atlases import make_atlas
-from topomerge.datasets.pairs.pairs import Atlas, PairSettings, make_pair
+from topomerge.datasets.pairs.pairs import Atlas
 
 from topomerge.errors import InputError
-from topomerge.extraction.extract import extract
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +34,3 @@ def test_bad_atlases() -> None:
         make_atlas(make_building("house", 3), ("tls",))
     with pytest.raises(InputError, match="a transform and a sensor each"):
         Atlas("x", (), (), {}, (), "procedural", "x")
-
-
-@pytest.mark.longer
