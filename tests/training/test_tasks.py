@@ -114,7 +114,7 @@ def read(task: str) -> Any:
         "plan_segmentation": lambda: column_probabilities(plan),
         "grid_segmentation": lambda: column_probabilities(plan, plan_weights(raised=True)),
         "door_classification": lambda: door_probability(np.zeros((3, 17))),
-        "place_evidence": lambda: place_weights()["a.w"],
+        "place_evidence": lambda: place_weights()(planes=np.ones((1, 16, 16, 22)))[0],
         "room_matcher": lambda: matcher_weights()["rows.w"],
         "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
         "wall_colours": lambda: colour_weights()["out.w"],

@@ -1,0 +1,104 @@
+"""Networks of torch as ONNX files (`topomerge.networks` runs them), and as what the package calls before they are exported."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+from topomerge.networks.network import Run
+from topomerge.networks.signature import Signature
+from topomerge.types import Array
+
+ONNX_OPSET = 18
+
+
+def export_network(module: nn.Module, signature: Signature, sample: Sequence[Tensor], path: str | Path) -> None:
+    """Write a network; the same weights give the same bytes.
+
+    Args:
+        module: its arguments are the inputs of the signature, in order; it returns the outputs, in order.
+        sample: inputs that the graph is traced with; sizes with names must be 2 or more there.
+
+    Raises:
+        InputError: onnx is not installed, a weight is no finite number, or the path can't be written.
+    """
+    try:
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise InputError("ONNX needs onnx and onnxscript: pip install topomerge[learn]") from error
+    if not all(torch.isfinite(value).all() for value in module.state_dict().values()):
+        raise InputError(f"{path}: weights are no finite numbers; training diverged, take another run")
+    shapes = tuple(
+        {axis: torch.export.Dim.DYNAMIC for axis, size in enumerate(tensor.shape) if isinstance(size, str)}
+        for tensor in signature.inputs.values()
+    )
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(), replacing(path) as beside:
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            _Positional(module.eval()), tuple(sample), dynamo=True, opset_version=ONNX_OPSET, verbose=False, optimize=False,
+            input_names=list(signature.inputs), output_names=list(signature.outputs), dynamic_shapes=(shapes,),
+        )  # fmt: skip
+        assert program is not None
+        model = program.model_proto
+        _strip(model.graph)
+        for function in model.functions:
+            _strip(function)
+        beside.write_bytes(model.SerializeToString(deterministic=True))
+
+
+def _strip(graph: Any) -> None:
+    """Remove what tells of the machine: stack traces with paths of files."""
+    del graph.metadata_props[:]
+    for node in (*graph.node, *getattr(graph, "input", ()), *getattr(graph, "output", ()), *getattr(graph, "initializer", ())):
+        if hasattr(node, "metadata_props"):
+            del node.metadata_props[:]
+    del graph.value_info[:]
+
+
+def run_with_torch(module: nn.Module, signature: Signature) -> Run:
+    """A network as `topomerge.networks.Network` would run it: what training is scored with, before anything is exported."""
+
+    @torch.no_grad()
+    def run(outputs: Sequence[str] | None = None, /, **inputs: Array) -> list[Array]:
+        module.eval()
+        device = next(module.parameters()).device
+        # Copies: of a map with one room, views of its table count as contiguous with steps that torch refuses.
+        feeds = (torch.from_numpy(np.array(inputs[n], t.dtype, order="C")).to(device) for n, t in signature.inputs.items())
+        computed = module(*feeds)
+        arrays = [t.cpu().numpy() for t in (computed if isinstance(computed, Sequence) else (computed,))]
+        named = dict(zip(signature.outputs, arrays, strict=True))
+        return list(named.values()) if outputs is None else [named[name] for name in outputs]
+
+    return run
+
+
+def read_weights(path: str | Path) -> dict[str, Tensor]:
+    """The weights of an exported network by their names in the module: what a training goes on with."""
+    import onnx
+
+    model = onnx.load(str(path), load_external_data=False)
+    prefix = "network."
+    arrays = {i.name: onnx.numpy_helper.to_array(i) for i in model.graph.initializer}
+    return {n.removeprefix(prefix): torch.from_numpy(a.copy()) for n, a in arrays.items() if n.startswith(prefix)}
+
+
+class _Positional(nn.Module):
+    """A network whose inputs come as a tuple, whatever their number."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *tensors: Tensor) -> Tensor | Sequence[Tensor]:
+        outputs: Tensor | Sequence[Tensor] = self.network(*tensors)
+        return outputs
