@@ -65,6 +65,13 @@ def _strip(graph: Any) -> None:
     del graph.value_info[:]
 
 
+def build_sample(signature: Signature) -> list[Tensor]:
+    """Random inputs of a signature, in which sizes of different names differ."""
+    names = sorted({size for tensor in signature.inputs.values() for size in tensor.shape if isinstance(size, str)})
+    sizes = {name: 5 + 2 * k for k, name in enumerate(names)}
+    return [torch.rand([sizes[n] if isinstance(n, str) else n for n in t.shape]) for t in signature.inputs.values()]
+
+
 def run_with_torch(module: nn.Module, signature: Signature) -> Run:
     """A network as `topomerge.networks.Network` would run it: what training is scored with, before anything is exported."""
 

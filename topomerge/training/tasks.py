@@ -58,7 +58,7 @@ TASKS = {
     "match_belief": Task("match_belief", "MatchBelief", "topomerge.fusion", "match_belief.json", 0.3),
     "merge_belief": Task("merge_belief", "MergeBelief", "topomerge.fusion", "calibration.json", 4.0),
     "embedding": Task("embedding", "", "topomerge.embedding.pretrained", "embedder.safetensors", 0.6),
-    "room_matcher": Task("room_matcher", "RoomMatching", "topomerge.matching", "room_matcher.npz", 0.3),
+    "room_matcher": Task("room_matcher", "RoomMatching", "topomerge.networks", "room_matcher.onnx", 0.3),
 }
 
 

@@ -23,11 +23,7 @@ TAPS, DILATIONS = 5, (1, 2, 4)  # of the convolutions along the wall
 
 WALL_SIGNATURE = Signature(
     "Says what is in each place along a wall.",
-    {
-        "strips": Tensor(
-            ("strips", "length", DEPTHS, STRIP_CHANNELS), "elements along walls (an even number), depths, heights; 0 to 1"
-        )
-    },
+    {"strips": Tensor(("strips", "length", DEPTHS, STRIP_CHANNELS), "0 to 1, along walls (even)")},
     {"probability": Tensor(("strips", "places", len(WALL_CLASSES)), f"of {', '.join(WALL_CLASSES)}, of each two elements")},
 )
 

@@ -37,8 +37,8 @@ PLAN_SIGNATURE = Signature(
     {
         "evidence": Tensor(
             ("plans", EVIDENCE_CHANNELS, "nx", "ny"),
-            "of each column, sides multiples of 16: known, wall, how full four bands of heights are (0 to 1), floor, lintel, ceiling, "
-            "height of the ceiling less 2.5 m, a column's side times 5, m",
+            "of each column, sides multiples of 16: known, wall, how full four bands of heights are (0 to 1), "
+            "floor, lintel, ceiling, height of the ceiling less 2.5 m, a column's side times 5, m",
         )
     },
     {"probability": Tensor(("plans", len(COLUMN_CLASSES), "nx", "ny"), f"of {', '.join(COLUMN_CLASSES)}")},

@@ -29,7 +29,7 @@ PLACE_SIGNATURE = Signature(
     {
         "planes": Tensor(
             ("squares", SIDE // POOLED, SIDE // POOLED, PLANES),
-            "what both maps show and what one misses, in squares of 0.4 m (`fusion.evidence.network.planes`)",
+            "what both maps show, what one misses (`planes`); 0.4 m",
         )
     },
     {"log_odds": Tensor(("squares",), "that they are one place, before any prior")},
