@@ -201,7 +201,7 @@ def build_signature(numbers: int, width: int, stages: int) -> Signature:
         width: numbers of a room within the network.
         stages: of the network, the first of which has no attention.
     """
-    inputs = {}
+    inputs: dict[str, Tensor] = {}
     for side in "ab":
         rooms = f"rooms_{side}"
         inputs |= {
@@ -216,7 +216,7 @@ def build_signature(numbers: int, width: int, stages: int) -> Signature:
     for k in range(stages):
         shapes = (("rooms_a", width), ("rooms_b", width), ("rooms_a", "partners"), ("rooms_b", "partners"))
         meanings = ("state of the rooms", "state of the rooms", "probability of each partner, then of none", "likewise")
-        outputs |= {f"{n}_{k}": Tensor(*told) for n, *told in zip(STAGE_OUTPUTS, shapes, meanings, strict=True)}
+        outputs |= {f"{n}_{k}": Tensor(shape, what) for n, shape, what in zip(STAGE_OUTPUTS, shapes, meanings, strict=True)}
     return Signature("Says which rooms of two maps are one; each call runs the stages asked for.", inputs, outputs)
 
 
