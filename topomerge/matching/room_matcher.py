@@ -214,7 +214,12 @@ def build_signature(numbers: int, width: int, stages: int) -> Signature:
     inputs["votes"] = Tensor(("rooms_a", "rooms_b", len(AGREEMENT)), "log(1 + 3 times the votes of pairs that are moved alike)")
     outputs = {"likely": Tensor(("rooms_a", "rooms_b"), "how likely each pair is at first")}
     for k in range(stages):
-        shapes = (("rooms_a", width), ("rooms_b", width), ("rooms_a", "partners"), ("rooms_b", "partners"))
+        shapes: tuple[tuple[int | str, ...], ...] = (
+            ("rooms_a", width),
+            ("rooms_b", width),
+            ("rooms_a", "partners"),
+            ("rooms_b", "partners"),
+        )
         meanings = ("state of the rooms", "state of the rooms", "probability of each partner, then of none", "likewise")
         outputs |= {f"{n}_{k}": Tensor(shape, what) for n, shape, what in zip(STAGE_OUTPUTS, shapes, meanings, strict=True)}
     return Signature("Says which rooms of two maps are one; each call runs the stages asked for.", inputs, outputs)
