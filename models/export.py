@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from topomerge.models.embedder import Embedder
 from torch import Tensor, nn
 
+from topomerge.embedding.network import build_embedder_signature
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 from topomerge.networks.network import Run
@@ -72,6 +74,32 @@ def build_sample(signature: Signature) -> list[Tensor]:
     return [torch.rand([sizes[n] if isinstance(n, str) else n for n in t.shape]) for t in signature.inputs.values()]
 
 
+def build_embedder_sample(
+    network: Embedder, rooms: int = 6, edges: int = 10, pairs: int = 12, seed: int = 0
+) -> dict[str, Tensor]:
+    """Random tensors of a map, of the shapes that an embedder reads."""
+    generator, sizes = torch.Generator().manual_seed(seed), {"rooms": rooms, "edges": edges, "pairs": pairs}
+    sample = {}
+    for name, tensor in build_embedder_signature(network.network).inputs.items():
+        shape = [sizes[n] if isinstance(n, str) else n for n in tensor.shape]
+        if tensor.dtype == "int64":
+            sample[name] = torch.randint(0, max(rooms if name == "edge_index" else edges, 1), shape, generator=generator)
+        else:
+            values = torch.rand(shape, generator=generator) * 3
+            sample[name] = (80 * values).to(torch.uint8) if tensor.dtype == "uint8" else values
+    return sample
+
+
+def export_embedder(network: Embedder, path: str | Path) -> None:
+    """Write an embedder, as `embedding.network.build_embedder_signature` describes it.
+
+    Raises:
+        InputError: as `export_network`.
+    """
+    sample = list(build_embedder_sample(network).values())
+    export_network(Turned(network), build_embedder_signature(network.network), sample, path)
+
+
 def run_with_torch(module: nn.Module, signature: Signature) -> Run:
     """A network as `topomerge.networks.Network` would run it: what training is scored with, before anything is exported."""
 
@@ -97,6 +125,18 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     prefix = "network."
     arrays = {i.name: onnx.numpy_helper.to_array(i) for i in model.graph.initializer}
     return {n.removeprefix(prefix): torch.from_numpy(a.copy()) for n, a in arrays.items() if n.startswith(prefix)}
+
+
+class Turned(nn.Module):
+    """An embedder on all quarter turns of a map (`Embedder.turned`), with its tensors in order."""
+
+    def __init__(self, network: Embedder) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows and dustbins."""
+        return self.network.turned(dict(zip(self.network.tensors, tensors, strict=True)))
 
 
 class _Positional(nn.Module):
