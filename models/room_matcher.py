@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from topomerge.models.export import Branches
 from torch import Tensor, nn
 
 from topomerge.embedding.turns import FACTS
@@ -38,6 +39,7 @@ MATCHER_PARTS = {  # that an ablation leaves out, and the layers that tell of th
 WAY_HIDDEN = 32  # units between the way to a room and what is made of it
 LEAST_SPREAD = 1e-3  # of a fact that says something
 FAR_HEIGHT = 1e4  # m
+RING_DISTANCES: list[float] = RINGS.tolist()
 
 
 class Partners(NamedTuple):
@@ -156,11 +158,11 @@ class RoomMatcher(nn.Module):
     def stage(self, k: int, maps: Sequence[Rooms], states: Sequence[Tensor], votes: Tensor) -> tuple[list[Tensor], Partners]:
         """States of the rooms of both maps after a stage, and their partners by them. The first stage reads no states."""
         if k:
-            states = self.layers[k - 1](states, [ways(m.places, m.heights) for m in maps], votes)
+            after: list[Tensor] = self.layers[k - 1](states, [ways(m.places, m.heights) for m in maps], votes)
         else:
             facts = [((m.facts - self.usual) / self.spread).clamp(-UNUSUAL, UNUSUAL) for m in maps]
-            states = [self.rows(m.rows) + self.facts(f) for m, f in zip(maps, facts, strict=True)]
-        return list(states), self._partners(k, states, maps[0].rows @ maps[1].rows.T, votes)
+            after = [self.rows(m.rows) + self.facts(f) for m, f in zip(maps, facts, strict=True)]
+        return after, self._partners(k, after, nn.functional.linear(maps[0].rows, maps[1].rows), votes)
 
     def _partners(self, k: int, states: Sequence[Tensor], cosine: Tensor, votes: Tensor) -> Partners:
         a, b = (nn.functional.normalize(self.head[k](state), dim=1) for state in states)
@@ -170,29 +172,30 @@ class RoomMatcher(nn.Module):
         return Partners(rows.log_softmax(dim=1), columns.log_softmax(dim=1))
 
 
-class MatcherStages(nn.Module):
-    """All stages of the network beside each other: what is exported, for `matching.room_matcher.build_signature`."""
+class MatcherStage(nn.Module):
+    """A stage of the network with inputs and outputs in the order of `matching.room_matcher.build_signature`, but which it is."""
 
-    def __init__(self, network: RoomMatcher) -> None:
+    def __init__(self, network: RoomMatcher, k: int) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.k = network, k
 
-    def forward(self, *inputs: Tensor) -> list[Tensor]:
-        """Inputs and outputs in the order of the signature."""
-        (*a, state_a), (*b, state_b), (votes,) = inputs[:5], inputs[5:10], inputs[10:]
-        maps = [Rooms(*a), Rooms(*b)]
-        outputs = [self.network.first_guess(maps)]
-        for k in range(len(self.network.head)):
-            states, partners = self.network.stage(k, maps, [state_a, state_b], votes)
-            outputs += [*states, partners.rows.exp(), partners.columns.exp()]
-        return outputs
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """States of the rooms after the stage, and probabilities of their partners."""
+        (*a, state_a), (*b, state_b), votes = inputs[:5], inputs[5:10], inputs[10]
+        states, partners = self.network.stage(self.k, [Rooms(*a), Rooms(*b)], [state_a, state_b], votes)
+        return *states, partners.rows.exp(), partners.columns.exp()
+
+
+def build_stages(network: RoomMatcher) -> Branches:
+    """Make what is exported of a network: its stages, of which a call runs one."""
+    return Branches(MatcherStage(network, k) for k in range(len(network.head)))
 
 
 def ways(places: Tensor, heights: Tensor) -> Tensor:
     """(R, R, WAY_FACTS) from each room of a map to each of its rooms: direction, distance in rings, climb."""
     off = places[None] - places[:, None]
     far = (off**2).sum(dim=2, keepdim=True).sqrt()
-    ring = [(-(((far - at) / (RING_WIDTH[0] + RING_WIDTH[1] * at)) ** 2)).exp() for at in RINGS.tolist()]
+    ring = [(-(((far - at) / (RING_WIDTH[0] + RING_WIDTH[1] * at)) ** 2)).exp() for at in RING_DISTANCES]
     climb = ((heights[None] - heights[:, None]) / CLIMB_UNIT).clamp(-2, 2)[..., None]
     return torch.cat([off / (far + WAY_SOFT), *ring, climb], dim=2)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from topomerge.models.export import read_weights, run_with_torch
-from topomerge.models.room_matcher import MatcherStages, RoomMatcher
+from topomerge.models.room_matcher import MatcherStage, RoomMatcher, build_stages
 
 from topomerge.embedding.turns import FACTS, room_facts
 from topomerge.errors import InputError
@@ -52,7 +52,7 @@ def some(of: RoomsSeen, index: np.ndarray) -> RoomsSeen:
 def matcher_of(net: RoomMatcher) -> Matcher:
     """A network of torch as the package runs it."""
     stages = len(net.head)
-    return Matcher(run_with_torch(MatcherStages(net), build_signature(ROWS, WIDTH, stages)), WIDTH, stages, "embedder")
+    return Matcher(run_with_torch(build_stages(net), build_signature(ROWS, WIDTH, stages)), WIDTH, stages, "embedder")
 
 
 def network(seed: int = 0) -> Matcher:
@@ -101,7 +101,7 @@ def test_the_network_that_ships_is_as_its_module_of_torch(few: int, more: int) -
     assert isinstance(shipped.run, Network)
     numbers = int(shipped.run.signature.inputs["rows_a"].shape[1])
     net = RoomMatcher(numbers, shipped.width, shipped.stages - 1)
-    assert not any(MatcherStages(net).load_state_dict(read_weights(shipped.run.path)))
+    assert not any(MatcherStage(net, 0).load_state_dict(read_weights(shipped.run.path)))
     rng, maps = np.random.default_rng(few), []
     for count in (few, few + more):
         rows = np.repeat(rng.normal(size=(count, 1)), numbers, axis=1) + rng.normal(size=(count, numbers))

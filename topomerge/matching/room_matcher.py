@@ -40,7 +40,6 @@ MOST_VOTED = 20_000  # pairs of rooms that are voted for, the likeliest ones
 FIRST_SHARPNESS = 25.0  # that cosines are multiplied with for the first votes
 LIKENESS_SCALE = 10.0  # that likeness is multiplied with, times what is learned
 UNUSUAL = 4.0  # standard deviations by which a fact differs from what is usual, at most
-STAGE_OUTPUTS = ("state_a", "state_b", "rows", "columns")
 MOST_SIZE = 4096  # of a network; more is a mistake, or a file that was made to take all memory
 
 
@@ -161,17 +160,24 @@ def every_turn(a: RoomsSeen, turned: Sequence[RoomsSeen], matcher: Matcher) -> t
 
 def odds_of(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
     """Run the network on two maps as they are turned, stage by stage: before each of them, pairs of rooms vote (`agreement`)."""
-    feeds: dict[str, Array] = {"votes": np.zeros((len(a.rows), len(b.rows), len(AGREEMENT)))}
+    feeds: dict[str, Array] = {}
     for side, map in (("a", a), ("b", b)):
         feeds |= {f"rows_{side}": map.rows, f"facts_{side}": map.facts, f"places_{side}": map.places - map.places.mean(axis=0)}
         feeds |= {f"heights_{side}": map.heights - map.heights.mean(), f"state_{side}": np.zeros((len(map.rows), matcher.width))}
-    (likely,) = matcher.run(["likely"], **feeds)
+    likely = first_guess(a.rows @ b.rows.T)
     for stage in range(matcher.stages):
-        feeds["votes"] = agreement(likely, a, b)
-        names = [f"{name}_{stage}" for name in STAGE_OUTPUTS]
-        feeds["state_a"], feeds["state_b"], rows, columns = matcher.run(names, **feeds)
+        feeds |= {"stage": np.arange(matcher.stages) == stage, "votes": agreement(likely, a, b)}
+        feeds["state_a"], feeds["state_b"], rows, columns = matcher.run(**feeds)
         likely = np.sqrt(rows[:, :-1] * columns[:, :-1].T)
     return RoomOdds(rows.astype(float), columns.astype(float))
+
+
+def first_guess(cosine: Array) -> Array:
+    """(R_a, R_b) how likely each pair of rooms is by their rows alone: what votes in the first stage."""
+    from scipy.special import softmax
+
+    likely: Array = np.sqrt(softmax(FIRST_SHARPNESS * cosine, axis=1) * softmax(FIRST_SHARPNESS * cosine, axis=0))
+    return likely
 
 
 def agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
@@ -201,7 +207,7 @@ def build_signature(numbers: int, width: int, stages: int) -> Signature:
         width: numbers of a room within the network.
         stages: of the network, the first of which has no attention.
     """
-    inputs: dict[str, Tensor] = {}
+    inputs = {"stage": Tensor((stages,), "1 for the one to run, else 0; the first one has no attention", "int64")}
     for side in "ab":
         rooms = f"rooms_{side}"
         inputs |= {
@@ -212,17 +218,10 @@ def build_signature(numbers: int, width: int, stages: int) -> Signature:
             f"state_{side}": Tensor((rooms, width), "what the stage before gave; the first one reads none"),
         }
     inputs["votes"] = Tensor(("rooms_a", "rooms_b", len(AGREEMENT)), "log(1 + 3 times the votes of pairs that are moved alike)")
-    outputs = {"likely": Tensor(("rooms_a", "rooms_b"), "how likely each pair is at first")}
-    for k in range(stages):
-        shapes: tuple[tuple[int | str, ...], ...] = (
-            ("rooms_a", width),
-            ("rooms_b", width),
-            ("rooms_a", "partners"),
-            ("rooms_b", "partners"),
-        )
-        meanings = ("state of the rooms", "state of the rooms", "probability of each partner, then of none", "likewise")
-        outputs |= {f"{n}_{k}": Tensor(shape, what) for n, shape, what in zip(STAGE_OUTPUTS, shapes, meanings, strict=True)}
-    return Signature("Says which rooms of two maps are one; each call runs the stages asked for.", inputs, outputs)
+    outputs = {f"next_{side}": Tensor((f"rooms_{side}", width), "state of the rooms after the stage") for side in "ab"}
+    for name, side in (("rows", "a"), ("columns", "b")):
+        outputs[name] = Tensor((f"rooms_{side}", "partners"), "probability that a room of the other map is it, then that none is")
+    return Signature("Says which rooms of two maps are one; each call runs one stage.", inputs, outputs)
 
 
 def matcher_weights() -> Matcher:

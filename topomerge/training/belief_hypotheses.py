@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from topomerge.fusion.search import search
 from topomerge.fusion.verify import rank
 from topomerge.matching.poses import wrapped
 from topomerge.metrics import pose_right
+from topomerge.networks.network import Network, Run
 from topomerge.training.task_settings import MergeBelief, PlaceEvidence
 from topomerge.training.tasks import weights_of
 from topomerge.types import Array, Sim3
@@ -92,7 +93,7 @@ def belief_rows(recipe: GridRecipe, settings: MergeBelief, say: Any) -> list[Row
     return [row_of(path, networks) for path in hypothesis_files(recipe, settings, say)]
 
 
-def place_networks(settings: MergeBelief) -> list[Mapping[str, Array]]:
+def place_networks(settings: MergeBelief) -> list[Network]:
     """The networks of the runs that saw one half of the buildings each (`task=place_evidence half=1`, `half=2`); the one that
     ships where none are named.
 
@@ -104,7 +105,7 @@ def place_networks(settings: MergeBelief) -> list[Mapping[str, Array]]:
     return [read_weights(weights_of("place_evidence", run)) for run in settings.halves]
 
 
-def row_of(path: Path, networks: Sequence[Mapping[str, Array]]) -> Row:
+def row_of(path: Path, networks: Sequence[Run]) -> Row:
     """The row of a file, with what its places say (``place_mean`` and the like) by the network of the other half of the
     buildings: what it was trained on it knows too well."""
     data = read_derived(path)

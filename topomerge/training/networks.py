@@ -69,6 +69,30 @@ class NetworkJob(ABC):
         return {"loss": float(loss.detach())}
 
     @abstractmethod
+    def write_weights(self, path: Path) -> None:
+        """Write the weights as the package has them."""
+
+    def interface(self) -> dict[str, Any]:
+        """What a card says of inputs and outputs; nothing of weights that are no network of `topomerge.networks`."""
+        return {}
+
+    def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
+        """The file of weights and its card."""
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / TASKS[self.settings.task].file
+        self.write_weights(path)
+        metrics = {k: v for k, v in row.items() if k.startswith("val/")}
+        write_card(path, asdict(self.settings), self.origin, metrics, self.interface())
+
+    def line(self, row: Mapping[str, Any]) -> str:
+        """The score that is watched."""
+        return f"{self.settings.watch} {row[f'val/{self.settings.watch}']:.3f}"
+
+
+class ExportedJob(NetworkJob):
+    """A job whose network `topomerge.networks` runs."""
+
+    @abstractmethod
     def exported(self) -> Exported:
         """The network as the package runs it."""
 
@@ -82,17 +106,9 @@ class NetworkJob(ABC):
         module, signature, sample = self.exported()
         export_network(module, signature, [tensor.to(self.device) for tensor in sample], path)
 
-    def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
-        """The file of weights and its card."""
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / TASKS[self.settings.task].file
-        self.write_weights(path)
-        metrics = {k: v for k, v in row.items() if k.startswith("val/")}
-        write_card(path, asdict(self.settings), self.origin, metrics, self.exported().signature.describe())
-
-    def line(self, row: Mapping[str, Any]) -> str:
-        """The score that is watched."""
-        return f"{self.settings.watch} {row[f'val/{self.settings.watch}']:.3f}"
+    def interface(self) -> dict[str, Any]:
+        """What it does, inputs and outputs."""
+        return self.exported().signature.describe()
 
 
 def device_of(settings: NetworkTask) -> torch.device:

@@ -21,10 +21,11 @@ from topomerge.datasets.core.derived import read_derived
 from topomerge.datasets.pairs.lookalikes import build_lookalikes
 from topomerge.errors import InputError
 from topomerge.fusion.evidence.network import PLACE_SIGNATURE, UPPER_PLANES, network_log_odds, planes, read_weights
+from topomerge.models.export import build_sample
 from topomerge.models.place_network import PlaceLogOdds, PlaceNetwork
 from topomerge.training.belief_hypotheses import fair, half_of, hypothesis_files, judged_files
 from topomerge.training.loop import Say, State, mixed
-from topomerge.training.networks import Exported, NetworkJob, run_network
+from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
 from topomerge.types import Array
 
@@ -98,7 +99,7 @@ def some(places: Places, pick: Array) -> Places:
     return Places(places.planes[pick], places.right[pick], places.weight[pick], places.building[pick], places.buildings)
 
 
-class PlaceJob(NetworkJob):
+class PlaceJob(ExportedJob):
     """Squares, right ones and wrong ones alike."""
 
     def __init__(self, settings: PlaceEvidence, learned: Places, watched: Places) -> None:
@@ -132,7 +133,7 @@ class PlaceJob(NetworkJob):
     def exported(self) -> Exported:
         """The network with probabilities for scores."""
         assert isinstance(self.network, PlaceNetwork)
-        return Exported(PlaceLogOdds(self.network), PLACE_SIGNATURE, [torch.rand(2, *PLACE_SIGNATURE.inputs["planes"].shape[1:])])
+        return Exported(PlaceLogOdds(self.network), PLACE_SIGNATURE, build_sample(PLACE_SIGNATURE))
 
     def scores(self) -> dict[str, float]:
         """Of the buildings that are watched."""

@@ -32,7 +32,7 @@ from topomerge.models.plan_unet import PlanProbabilities, PlanUNet
 from topomerge.networks.network import Run
 from topomerge.training.grid_noise import with_grid_noise
 from topomerge.training.loop import Say, State, made_beside, mixed
-from topomerge.training.networks import Exported, NetworkJob, run_network
+from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.scan_settings import GridSegmentation, PlanAugment, PlanLoss, PlanSegmentation
 from topomerge.types import Array
 
@@ -65,7 +65,7 @@ def fit(settings: PlanSegmentation, say: Say) -> dict[str, float]:
     return run_network(job, settings, settings.steps, say)
 
 
-class PlanJob(NetworkJob):
+class PlanJob(ExportedJob):
     """Crops of plans, larger plans more often."""
 
     def __init__(self, settings: PlanSegmentation, learned: Sequence[PlanExample], watched: Sequence[PlanExample]) -> None:

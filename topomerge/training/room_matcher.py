@@ -26,11 +26,11 @@ from topomerge.matching.scores import assign_certain, has_twin, pair_counts, par
 from topomerge.models.embedder import Embedder
 from topomerge.models.export import build_sample
 from topomerge.models.losses import NEVER_LOGIT
-from topomerge.models.room_matcher import MatcherStages, Partners, RoomMatcher
+from topomerge.models.room_matcher import Partners, RoomMatcher, build_stages
 from topomerge.models.weights import read_embedder
 from topomerge.training.batches import changed
 from topomerge.training.loop import Say, State, mixed
-from topomerge.training.networks import Exported, NetworkJob, run_network
+from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.packed import Graph, GraphPair, load_pairs
 from topomerge.training.settings import Augment
 from topomerge.training.task_settings import RoomMatching
@@ -113,7 +113,7 @@ def view(graph: Graph, network: Embedder, number: int, seed: int) -> View:
     return View(TurnedRows(rows.astype(np.float32), places[chosen], "", facts), chosen)
 
 
-class MatcherJob(NetworkJob):
+class MatcherJob(ExportedJob):
     """Pairs of maps, each at its true turn and at a wrong one.
 
     Args:
@@ -173,7 +173,7 @@ class MatcherJob(NetworkJob):
         """All its stages."""
         assert isinstance(self.network, RoomMatcher)
         signature = build_signature(self.network.rows.in_features, self.options.width, self.options.layers + 1)
-        return Exported(MatcherStages(self.network), signature, build_sample(signature))
+        return Exported(build_stages(self.network), signature, build_sample(signature))
 
     def scores(self) -> dict[str, float]:
         """Of the pairs that are watched."""

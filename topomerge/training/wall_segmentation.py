@@ -22,7 +22,7 @@ from topomerge.extraction.elevations.wall_network import PLACES, WALL_SIGNATURE,
 from topomerge.models.wall_network import WallNetwork, WallProbabilities
 from topomerge.networks.network import Run
 from topomerge.training.loop import Say, State, mixed
-from topomerge.training.networks import Exported, NetworkJob, run_network
+from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.scan_settings import WallAugment, WallSegmentation, WallTask
 from topomerge.types import Array
 
@@ -59,7 +59,7 @@ def learned_and_watched(scans: Sequence[ScanT], settings: WallTask) -> tuple[lis
     return learned, watched
 
 
-class WallJob(NetworkJob):
+class WallJob(ExportedJob):
     """Stretches of walls, most of them about a door or a window."""
 
     def __init__(self, settings: WallSegmentation, learned: Sequence[WallExample], watched: Sequence[WallExample]) -> None:
