@@ -141,7 +141,9 @@ class RoomMatcher(nn.Module):
 
     def forward(self, a: RoomsSeen, b: RoomsSeen) -> list[Partners]:
         maps = [Rooms(*(_tensor(part) for part in (m.rows, m.facts, m.places, m.heights))) for m in (a, b)]
-        likely, states, partners = self.first_guess(maps), [], []
+        likely = self.first_guess(maps)
+        states: list[Tensor] = []
+        partners: list[Partners] = []
         for k in range(len(self.head)):
             votes = _tensor(agreement(likely.detach().numpy().astype(float), a, b))
             states, of_stage = self.stage(k, maps, states, votes)
