@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
-from topomerge.extraction.elevations.colour_network import COLOUR_CLASSES, INPUTS
-from topomerge.extraction.elevations.wall_network import ALONG_LAYERS, DILATIONS, TAPS
+from topomerge.extraction.elevations.colour_network import ALONG_LAYERS, COLOUR_CLASSES, INPUTS
+from topomerge.extraction.elevations.wall_network import DILATIONS, TAPS
 from topomerge.types import Array
 
 

@@ -1,16 +1,14 @@
-"""The network of places in torch (`fusion.evidence.network` runs it in NumPy): convolutions over two maps laid on one another,
-with batch normalisation, which goes into the weights when they are exported."""
+"""The network of places in torch: convolutions over two maps laid on one another, with batch normalisation.
+`fusion.evidence.network` runs what is exported of it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import torch
-from topomerge.models.plan_unet import folded
 from torch import Tensor, nn
 
 from topomerge.registration.evidence.network import CONVOLUTIONS, PLANES
-from topomerge.types import Array
 
 
 class PlaceNetwork(nn.Module):
@@ -40,9 +38,14 @@ class PlaceNetwork(nn.Module):
         return odds
 
 
-def exported_weights(network: PlaceNetwork) -> dict[str, Array]:
-    """Weights for `place_log_odds`: (9 c, k) with the normalisation in them."""
-    weights = folded(network.layers)
-    for name, layer in (("f", network.hidden), ("out", network.out)):
-        weights[f"{name}.w"], weights[f"{name}.b"] = layer.weight.detach().cpu().numpy().T, layer.bias.detach().cpu().numpy()
-    return weights
+class PlaceLogOdds(nn.Module):
+    """The network on planes as the package has them: what is exported, for `PLACE_SIGNATURE`."""
+
+    def __init__(self, network: PlaceNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, planes: Tensor) -> Tensor:
+        """(n, side, side, PLANES) to (n,)."""
+        odds: Tensor = self.network(planes.permute(0, 3, 1, 2))
+        return odds

@@ -1,5 +1,5 @@
-"""The network of plans in torch (`extraction.plans.plan_network` runs it in NumPy): a U-Net (Ronneberger et al. 2015) with batch
-normalisation, which goes into the weights when they are exported."""
+"""The network of plans in torch: a U-Net (Ronneberger et al. 2015) with batch normalisation. `extraction.plans.plan_network` runs
+what is exported of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from topomerge.extraction.classified_storey import COLUMN_CLASSES
 from topomerge.extraction.plans.plan_network import DOWN_LEVELS, EVIDENCE_CHANNELS, UP_LEVELS
-from topomerge.types import Array
 
 
 def _layer(channels: int, width: int, stride: int = 1) -> nn.Sequential:
@@ -51,25 +50,14 @@ class PlanUNet(nn.Module):
         return scores
 
 
-def exported_weights(network: PlanUNet) -> dict[str, Array]:
-    """Weights for `plan_network.forward`: (9 c, k) with the normalisation in them."""
-    weights = folded(network.layers)
-    weights["out.w"] = network.out.weight.detach().cpu().numpy()[:, :, 0, 0].T
-    assert network.out.bias is not None
-    weights["out.b"] = network.out.bias.detach().cpu().numpy()
-    return weights
+class PlanProbabilities(nn.Module):
+    """The network with probabilities for scores: what is exported, for `plan_network.PLAN_SIGNATURE`."""
 
+    def __init__(self, network: PlanUNet) -> None:
+        super().__init__()
+        self.network = network
 
-def folded(layers: nn.ModuleDict) -> dict[str, Array]:
-    """Weights (9 c, k) and biases (k,) of convolutions for NumPy (`numpy_nn.convolution`), by name, with the batch normalisation
-    after each of them."""
-    weights: dict[str, Array] = {}
-    for name, layer in layers.items():
-        conv, norm, _ = list(layer.children())
-        assert isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)
-        assert norm.running_var is not None and norm.running_mean is not None
-        scale = (norm.weight / (norm.running_var + norm.eps).sqrt()).detach()
-        kernel = (conv.weight * scale[:, None, None, None]).detach().cpu().numpy()
-        weights[f"{name}.w"] = kernel.transpose(2, 3, 1, 0).reshape(-1, kernel.shape[0])
-        weights[f"{name}.b"] = (norm.bias - norm.running_mean * scale).detach().cpu().numpy()
-    return weights
+    def forward(self, evidence: Tensor) -> Tensor:
+        """(n, 11, nx, ny) to (n, 5, nx, ny)."""
+        probabilities: Tensor = self.network(evidence).softmax(dim=1)
+        return probabilities

@@ -1,5 +1,5 @@
-"""The network that matches the rooms of two maps, in torch (`matching.room_matcher` runs it in NumPy): attention within each map
-and across both, on the rows of an embedder."""
+"""The network that matches the rooms of two maps, in torch: attention within each map and across both, on rows of an embedder.
+`matching.room_matcher` runs what is exported of it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
+from topomerge.models.export import Branches
 from torch import Tensor, nn
 
 from topomerge.embedding.turns import FACTS
@@ -16,13 +16,16 @@ from topomerge.errors import InputError
 from topomerge.matching.room_matcher import (
     AGREEMENT,
     ATTENTION_HEADS,
+    CLIMB_UNIT,
     FIRST_SHARPNESS,
     LIKENESS_SCALE,
+    RING_WIDTH,
+    RINGS,
     UNUSUAL,
     WAY_FACTS,
+    WAY_SOFT,
     RoomsSeen,
     agreement,
-    ways,
 )
 from topomerge.types import Array
 
@@ -36,6 +39,7 @@ MATCHER_PARTS = {  # that an ablation leaves out, and the layers that tell of th
 WAY_HIDDEN = 32  # units between the way to a room and what is made of it
 LEAST_SPREAD = 1e-3  # of a fact that says something
 FAR_HEIGHT = 1e4  # m
+RING_DISTANCES: list[float] = RINGS.tolist()
 
 
 class Partners(NamedTuple):
@@ -43,6 +47,15 @@ class Partners(NamedTuple):
 
     rows: Tensor
     columns: Tensor
+
+
+class Rooms(NamedTuple):
+    """The rooms of a map as `RoomsSeen` has them."""
+
+    rows: Tensor
+    facts: Tensor
+    places: Tensor
+    heights: Tensor
 
 
 class MatcherLayer(nn.Module):
@@ -65,14 +78,17 @@ class MatcherLayer(nn.Module):
         return [s + self.drop(self.each_out(torch.relu(self.each_in(self.norm_each(s))))) for s in states]
 
     def _within(self, state: Tensor, way: Tensor) -> Tensor:
-        count = len(state)
-        query, key, value = self.within(self.norm_within(state)).chunk(3, dim=1)
-        way = self.way_out(torch.relu(self.way_in(way)))
-        query, key = (part.view(count, ATTENTION_HEADS, -1) for part in (query, key))
+        query, key, value = (p.unflatten(1, (ATTENTION_HEADS, -1)) for p in self.within(self.norm_within(state)).chunk(3, dim=1))
+        hidden = torch.relu(self.way_in(way))  # (R, R, WAY_HIDDEN)
+        weight, bias = self.way_out.weight, self.way_out.bias
         score = torch.einsum("ihd,jhd->ijh", query, key) / math.sqrt(self.size)
-        share = (score + way[..., :ATTENTION_HEADS]).softmax(dim=1)
-        seen = (value[None] + way[..., ATTENTION_HEADS:]).view(count, count, ATTENTION_HEADS, -1)
-        out: Tensor = state + self.drop(self.join_within((share[..., None] * seen).sum(dim=1).flatten(1)))
+        share = (score + nn.functional.linear(hidden, weight[:ATTENTION_HEADS], bias[:ATTENTION_HEADS])).softmax(dim=1)
+        # What a way adds to the value of a room is linear in `hidden`: summed first, it needs a third of the memory.
+        of_ways = torch.einsum("ijh,ijk->ihk", share, hidden)
+        value_weight = weight[ATTENTION_HEADS:].unflatten(0, (ATTENTION_HEADS, -1))
+        seen = torch.einsum("ijh,jhd->ihd", share, value) + torch.einsum("ihk,hdk->ihd", of_ways, value_weight)
+        seen = seen.flatten(1) + bias[ATTENTION_HEADS:]
+        out: Tensor = state + self.drop(self.join_within(seen))
         return out
 
     def _across(self, states: Sequence[Tensor], votes: Tensor) -> list[Tensor]:
@@ -124,18 +140,31 @@ class RoomMatcher(nn.Module):
         self.usual, self.spread = _tensor(usual), _tensor(spread)
 
     def forward(self, a: RoomsSeen, b: RoomsSeen) -> list[Partners]:
-        rows, facts = [_tensor(m.rows) for m in (a, b)], [_tensor(m.facts) for m in (a, b)]
-        each_way = [_tensor(ways(m.places, m.heights)) for m in (a, b)]
-        cosine = rows[0] @ rows[1].T
-        facts = [((f - self.usual) / self.spread).clamp(-UNUSUAL, UNUSUAL) for f in facts]
-        states = [self.rows(r) + self.facts(f) for r, f in zip(rows, facts, strict=True)]
-        likely = ((FIRST_SHARPNESS * cosine).softmax(dim=1) * (FIRST_SHARPNESS * cosine).softmax(dim=0)).sqrt()
-        partners = [self._partners(0, states, cosine, _votes(likely, a, b))]
-        for k, layer in enumerate(self.layers):
-            votes = _votes((0.5 * (partners[-1].rows[:, :-1] + partners[-1].columns[:, :-1].T)).exp(), a, b)
-            states = layer(states, each_way, votes)
-            partners.append(self._partners(k + 1, states, cosine, votes))
+        maps = [Rooms(*(_tensor(part) for part in (m.rows, m.facts, m.places, m.heights))) for m in (a, b)]
+        likely = self.first_guess(maps)
+        states: list[Tensor] = []
+        partners: list[Partners] = []
+        for k in range(len(self.head)):
+            votes = _tensor(agreement(likely.detach().numpy().astype(float), a, b))
+            states, of_stage = self.stage(k, maps, states, votes)
+            partners.append(of_stage)
+            likely = (0.5 * (of_stage.rows[:, :-1] + of_stage.columns[:, :-1].T)).exp()
         return partners
+
+    def first_guess(self, maps: Sequence[Rooms]) -> Tensor:
+        """How likely each pair of rooms is by their rows alone: what votes in the first stage."""
+        cosine = FIRST_SHARPNESS * (maps[0].rows @ maps[1].rows.T)
+        likely: Tensor = (cosine.softmax(dim=1) * cosine.softmax(dim=0)).sqrt()
+        return likely
+
+    def stage(self, k: int, maps: Sequence[Rooms], states: Sequence[Tensor], votes: Tensor) -> tuple[list[Tensor], Partners]:
+        """States of the rooms of both maps after a stage, and their partners by them. The first stage reads no states."""
+        if k:
+            after: list[Tensor] = self.layers[k - 1](states, [ways(m.places, m.heights) for m in maps], votes)
+        else:
+            facts = [((m.facts - self.usual) / self.spread).clamp(-UNUSUAL, UNUSUAL) for m in maps]
+            after = [self.rows(m.rows) + self.facts(f) for m, f in zip(maps, facts, strict=True)]
+        return after, self._partners(k, after, nn.functional.linear(maps[0].rows, maps[1].rows), votes)
 
     def _partners(self, k: int, states: Sequence[Tensor], cosine: Tensor, votes: Tensor) -> Partners:
         a, b = (nn.functional.normalize(self.head[k](state), dim=1) for state in states)
@@ -145,24 +174,33 @@ class RoomMatcher(nn.Module):
         return Partners(rows.log_softmax(dim=1), columns.log_softmax(dim=1))
 
 
-def exported_matcher(network: RoomMatcher, embedder: str) -> dict[str, Array]:
-    """Weights for `matching.room_matcher`, and the hash of the embedder whose rows it takes."""
-    out: dict[str, Array] = {}
-    for name, tensor in network.state_dict().items():
-        parts = name.split(".")
-        if parts[0] == "layers":  # layers.0.query.weight -> 1.query.w
-            parts = [str(int(parts[1]) + 1), *parts[2:]]
-        elif parts[0] in ("head", "alone", "agree"):  # head.0.weight -> 0.head.w
-            parts = [parts[1], parts[0], *parts[2:]]
-        array = tensor.detach().cpu().numpy()
-        parts = [{"weight": "w", "bias": "b"}.get(part, part) for part in parts]
-        out[".".join(parts)] = array.T if array.ndim == 2 else array
-    return out | {"embedder": np.frombuffer(embedder.encode(), np.uint8)}
+class MatcherStage(nn.Module):
+    """A stage of the network with inputs and outputs in the order of `matching.room_matcher.build_signature`, but which it is."""
+
+    def __init__(self, network: RoomMatcher, k: int) -> None:
+        super().__init__()
+        self.network, self.k = network, k
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """States of the rooms after the stage, and probabilities of their partners."""
+        (*a, state_a), (*b, state_b), votes = inputs[:5], inputs[5:10], inputs[10]
+        states, partners = self.network.stage(self.k, [Rooms(*a), Rooms(*b)], [state_a, state_b], votes)
+        return *states, partners.rows.exp(), partners.columns.exp()
+
+
+def build_stages(network: RoomMatcher) -> Branches:
+    """Make what is exported of a network: its stages, of which a call runs one."""
+    return Branches(MatcherStage(network, k) for k in range(len(network.head)))
+
+
+def ways(places: Tensor, heights: Tensor) -> Tensor:
+    """(R, R, WAY_FACTS) from each room of a map to each of its rooms: direction, distance in rings, climb."""
+    off = places[None] - places[:, None]
+    far = (off**2).sum(dim=2, keepdim=True).sqrt()
+    ring = [(-(((far - at) / (RING_WIDTH[0] + RING_WIDTH[1] * at)) ** 2)).exp() for at in RING_DISTANCES]
+    climb = ((heights[None] - heights[:, None]) / CLIMB_UNIT).clamp(-2, 2)[..., None]
+    return torch.cat([off / (far + WAY_SOFT), *ring, climb], dim=2)
 
 
 def _tensor(array: Array) -> Tensor:
     return torch.as_tensor(array, dtype=torch.float32)
-
-
-def _votes(likely: Tensor, a: RoomsSeen, b: RoomsSeen) -> Tensor:
-    return _tensor(agreement(likely.detach().numpy().astype(float), a, b))

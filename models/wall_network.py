@@ -1,19 +1,14 @@
-"""The network of elevations in torch (`extraction.elevations.wall_network` runs it in NumPy).
-
-Its batch normalisation goes into the weights when they are exported.
-"""
+"""The network of elevations in torch. `extraction.elevations.wall_network` runs what is exported of it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import torch
-from topomerge.models.plan_unet import folded
 from torch import Tensor, nn
 
 from topomerge.extraction.elevations.elevation import DEPTHS, STRIP_CHANNELS, WALL_CLASSES
-from topomerge.extraction.elevations.wall_network import ALONG_LAYERS, DILATIONS, PLACES, TAPS
-from topomerge.types import Array
+from topomerge.extraction.elevations.wall_network import DILATIONS, PLACES, TAPS
 
 
 class WallNetwork(nn.Module):
@@ -49,14 +44,14 @@ class WallNetwork(nn.Module):
         return scores
 
 
-def exported_network(network: WallNetwork) -> dict[str, Array]:
-    """Weights for `wall_network.place_probabilities`: (in, out), with the normalisation in them."""
-    weights = folded(network.layers)
-    for name, layer in (("depths", network.depths), ("out", network.out)):
-        weights[f"{name}.w"], weights[f"{name}.b"] = layer.weight.detach().cpu().numpy().T, layer.bias.detach().cpu().numpy()
-    for name, convolved in zip(ALONG_LAYERS, network.along, strict=True):
-        assert isinstance(convolved, nn.Conv1d) and convolved.bias is not None
-        taps = convolved.weight.detach().cpu().numpy()  # (out, in, taps)
-        weights[f"{name}.w"] = taps.transpose(2, 1, 0).reshape(-1, taps.shape[0])
-        weights[f"{name}.b"] = convolved.bias.detach().cpu().numpy()
-    return weights
+class WallProbabilities(nn.Module):
+    """The network on strips as the package has them, with probabilities for scores: what is exported, for `WALL_SIGNATURE`."""
+
+    def __init__(self, network: WallNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, strips: Tensor) -> Tensor:
+        """(n, w, 32, 17) to (n, w / 2, 7)."""
+        probabilities: Tensor = self.network(strips.permute(0, 3, 1, 2)).transpose(1, 2).softmax(dim=2)
+        return probabilities

@@ -53,8 +53,12 @@ def test_comments_docstrings_and_layout_keep_the_digest(before, after):
         ("topomerge.fusion.pipeline", "registration/calibration.json"),
         ("topomerge.embedding.engineered", "embedding/engineered.json"),
         ("topomerge.embedding.learned", "embedding/pretrained/embedder.safetensors"),
-        (EXTRACT, "extraction/plans/plan_network.npz"),
-        (EXTRACT, "extraction/elevations/wall_network.npz"),
+        (EXTRACT, "networks/plan_network.onnx"),
+        (EXTRACT, "networks/grid_network.onnx"),
+        (EXTRACT, "networks/wall_network.onnx"),
+        ("topomerge.matching.match", "networks/room_matcher.onnx"),
+        ("topomerge.matching.match", "networks/room_matcher.card.json"),
+        ("topomerge.fusion.merge", "networks/place_network.onnx"),
         (EXTRACT, "extraction/elevations/wall_doors.json"),
         (EXTRACT, "extraction/passages.json"),
         (EXTRACT, "extraction/room_odds.json"),
@@ -72,8 +76,8 @@ def test_packaged_data_changes_the_digest_of_its_readers(before, after, module, 
 @pytest.mark.longer
 def test_every_packaged_weight_and_table_is_seen(before):
     modules = [p for folder in ("topomerge", "datasets", "models") for p in (before.parent / folder).rglob("*.py")]
-    seen = {file for path in modules for file in data_files(path)}
-    packaged = {p for s in ("json", "npz", "safetensors", "txt") for p in before.parent.rglob(f"*.{s}")}
+    seen = {file for path in modules for file in data_files(path, before)}
+    packaged = {p for s in ("json", "npz", "onnx", "safetensors", "txt") for p in before.parent.rglob(f"*.{s}")}
     assert packaged and packaged <= seen, sorted(packaged - seen)
 
 

@@ -21,6 +21,7 @@ RANKS = {
     "structure": 1.5,  # what exports draw
     "io": 2,
     "numpy_nn": 2,
+    "networks": 2.5,
     "extraction": 3,
     "embedding": 4,
     "matching": 5,
@@ -40,6 +41,7 @@ RANKS = {
     "__main__": 15,
 }
 HEAVY = ("torch", "torch_geometric", "lightning_fabric", "hydra", "omegaconf", "open3d", "laspy", "pye57", "ifcopenshell")
+HEAVY += ("onnxruntime", "onnx")
 HEAVY += ("trimesh", "rosbags")
 
 

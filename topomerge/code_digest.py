@@ -14,7 +14,8 @@ The walk reads syntax trees and imports nothing, so that it needs no torch and c
 - ``import_module("topomerge.…")``, and where the name is put together (``f"topomerge.io.{name}"``) all modules of that package;
 - names of the library's lazy face (``topomerge.extract``, ``from topomerge import extract``) to their homes;
 - the `__init__` of every package on the way but the face;
-- data files: those beside a module, or in a folder beside it, whose name, or that of the folder, stands as a text in the module.
+- data files: those beside a module, or in a folder beside it, whose name, or that of the folder, stands as a text in the module;
+- networks that a module names (``"plan_network.onnx"``), and their cards: in `topomerge/networks`, wherever the module stands.
 
 Comments, docstrings and the layout of lines do not count. Python's own version and that of other libraries do not either.
 """
@@ -33,6 +34,7 @@ TOP = "topomerge"
 DATA_BESIDE = ("models", "datasets", "configs")  # installed below topomerge; in a checkout they stand next to it
 LENGTH = 16  # hexadecimal digits
 SKIPPED = (".py", ".pyc", ".pyi")
+NETWORKS, NETWORK, CARD = "networks", ".onnx", ".card.json"  # folder of the networks that ship; how they and their cards end
 
 
 @cache
@@ -48,13 +50,13 @@ def code_digest(*modules: str, package: Path = HERE) -> str:
     """
     files = reached(*modules, package=package)
     lines = [f"{name} {_source(path).hash}" for name, path in files.items()]
-    return _hash("\n".join([*lines, *_data_lines(files)]))
+    return _hash("\n".join([*lines, *_data_lines(files, package)]))
 
 
 @cache
 def data_digest(*modules: str, package: Path = HERE) -> str:
     """As `code_digest`, of the data files alone: weights and tables that were trained or measured."""
-    return _hash("\n".join(_data_lines(reached(*modules, package=package))))
+    return _hash("\n".join(_data_lines(reached(*modules, package=package), package)))
 
 
 @cache
@@ -76,8 +78,8 @@ def reached(*modules: str, package: Path = HERE) -> dict[str, Path]:
     return dict(sorted(files.items()))
 
 
-def data_files(path: Path) -> list[Path]:
-    """Data files that a module names, beside it or in a folder beside it; sorted."""
+def data_files(path: Path, package: Path = HERE) -> list[Path]:
+    """Data files that a module names, beside it, in a folder beside it, or among the networks; sorted."""
     texts = _source(path).texts
     files = []
     for entry in path.parent.iterdir():
@@ -87,17 +89,21 @@ def data_files(path: Path) -> list[Path]:
                 files += [p for p in inner if entry.name in texts or p.name in texts]
         elif entry.suffix not in SKIPPED and entry.name in texts:
             files.append(entry)
-    return sorted(files)
+    for name in (text for text in texts if text.endswith(NETWORK)):
+        network = package / NETWORKS / name
+        files += [p for p in (network, network.with_name(f"{network.stem}{CARD}")) if p.is_file()]
+    return sorted({*files})
 
 
-def _data_lines(files: dict[str, Path]) -> list[str]:
+def _data_lines(files: dict[str, Path], package: Path) -> list[str]:
     """A line for each data file: its place and its hash."""
     lines = set()
     for name, path in files.items():
         above = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        for file in data_files(path):
-            place = file.relative_to(path.parent).as_posix()
-            lines.add(f"{above}/{place} {hashlib.sha256(file.read_bytes()).hexdigest()}")
+        for file in data_files(path, package):
+            inside = file.is_relative_to(path.parent)
+            place = f"{above}/{file.relative_to(path.parent).as_posix()}" if inside else f"{TOP}.{NETWORKS}/{file.name}"
+            lines.add(f"{place} {hashlib.sha256(file.read_bytes()).hexdigest()}")
     return sorted(lines)
 
 

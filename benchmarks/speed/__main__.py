@@ -17,7 +17,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "extract_floor": {"points": 300_000, "most": 2},
     "merge_growth": {"rooms": [10]},
     "room_search": {"rooms": [2000]},
-    "plan_network": {"sides": (64,)},
+    "networks": {"sides": (64,), "strip": 40, "squares": 2},
     "build_pairs": {"pairs": 2, "rooms": 4},
     "bags": {"gigabytes": [0.02], "spacing": 0.1},
 }

@@ -22,7 +22,7 @@ from topomerge.embedding import graph
 from topomerge.io.listing import plain
 
 # Raise it when the same item gives other bytes, by whatever step: simulation, extraction, truth. It is part of the files' names.
-PAIR_FORMAT = 13
+PAIR_FORMAT = 14
 EXTRACTION = "topomerge.extraction.extract"
 MAKER = "topomerge.datasets.pairs.example"  # what makes the files
 UNDRAWN = ("niches",)  # of the difficulty: younger than the names of cached pairs, which hold what is drawn

@@ -29,7 +29,7 @@ from topomerge.extraction.scan import read_scan
 from topomerge.io import archive
 from topomerge.types import Array
 
-ROOM_EXAMPLE_FORMAT = 4  # raise it when the same item gives other bytes: it is part of the files' names
+ROOM_EXAMPLE_FORMAT = 5  # raise it when the same item gives other bytes: it is part of the files' names
 ANSWERS = ("one", "whole", "entered", "outside")
 
 

@@ -50,9 +50,9 @@ from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.embedding.rooms_around import CLIMB, KIND_COLUMNS
 from topomerge.errors import InputError
 from topomerge.models.embedder import Embedder
-from topomerge.models.onnx import sample
+from topomerge.models.export import build_embedder_sample
 network = Embedder(Network(Geometry(width=8), Node("gat", width=4), size=8))
-tensors = sample(network)
+tensors = build_embedder_sample(network)
 try:
     refused = load_embedder().network.size
 except InputError as error:

@@ -308,13 +308,13 @@ def test_check_takes_the_defaults():
 def test_onnx_agrees(parts, node, tmp_path):
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
-    from topomerge.models.onnx import sample, save_onnx
+    from topomerge.models.export import build_embedder_sample, export_embedder
 
     net = network(*parts, node=node)
-    save_onnx(net, tmp_path / "a.onnx")
+    export_embedder(net, tmp_path / "a.onnx")
     session = runtime.InferenceSession(tmp_path / "a.onnx", providers=["CPUExecutionProvider"])
     for rooms, edges, doors in ((6, 10, 12), (23, 50, 140), (1, 0, 0)):
-        tensors = sample(net, rooms, edges, doors, seed=rooms)
+        tensors = build_embedder_sample(net, rooms, edges, doors, seed=rooms)
         with torch.no_grad():
             wanted = net.turned(tensors)
         outputs = session.run(None, {name: tensor.numpy() for name, tensor in tensors.items()})

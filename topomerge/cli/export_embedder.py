@@ -20,9 +20,9 @@ def export_embedder_command(args: argparse.Namespace) -> int:
     with output_folder(args.output) as folder:
         save_embedder(network, folder, about)
         if args.onnx:
-            from topomerge.models.onnx import save_onnx
+            from topomerge.models.export import export_embedder
 
-            save_onnx(network, folder / "embedder.onnx")
+            export_embedder(network, folder / "embedder.onnx")
     if not args.quiet:
         count = sum(p.numel() for p in network.parameters())
         say_line(f"{count} weights, {network.network.size} numbers a room -> {folder}")

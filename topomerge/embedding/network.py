@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
+from topomerge.embedding.graph import POINTS_PER_ROOM
+from topomerge.embedding.schema import TABLES
 from topomerge.embedding.surroundings import CROP_PART, CROP_SHAPES, DOOR_PART, WIDE_PART
 from topomerge.errors import InputError
+from topomerge.networks.signature import Signature, Tensor
 
 TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> table of the graph that it reads
 POINT_PARTS = ("pointnet", "pointnet_local", "voxelcnn")  # these read the points
@@ -108,6 +111,30 @@ def tensors(network: Network) -> tuple[str, ...]:
     """Names of the tensors that a network reads."""
     ways = ("edge_way",) if network.node.ways and network.node.kind != "none" else ()
     return (*dict.fromkeys(needed(part) for part in network.geometry.parts), *GRAPH, *pair_tensors(network.node), *ways)
+
+
+def build_embedder_signature(network: Network) -> Signature:
+    """Describe an embedder as one call runs it, with all quarter turns where these matter."""
+    counted = {"edge_attr": "edges", "edge_way": "edges", "door_attr": "pairs", "near_attr": "pairs"}
+    inputs = {}
+    for name in tensors(network):
+        count = counted.get(name, "rooms")
+        if name in TABLES:
+            inputs[name] = Tensor((count, len(TABLES[name])), ", ".join(TABLES[name]))
+        elif name in CROP_SHAPES:
+            inputs[name] = Tensor((count, *CROP_SHAPES[name]), "what stands around each room, seen from above", "uint8")
+        elif name == "room_points":
+            inputs[name] = Tensor((count, POINTS_PER_ROOM, 3), "m, points of each room about its middle")
+        elif name == "edge_index":
+            inputs[name] = Tensor((2, "edges"), "rooms at both ends of each edge", "int64")
+        else:
+            inputs[name] = Tensor((2, "pairs"), "both edges of each pair of doors", "int64")
+    rows = ("rooms", network.size) if network.turns == 1 else ("rooms", network.turns, network.size)
+    outputs = {
+        "embedding": Tensor(rows, "rows of length 1, of the map turned by each of its quarter turns"),
+        "dustbin": Tensor(("rooms",), "logit of having no partner"),
+    }
+    return Signature("Says what each room of a map looks like, from itself and its neighbours.", inputs, outputs)
 
 
 def check(network: Network) -> None:

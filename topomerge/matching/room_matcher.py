@@ -1,4 +1,4 @@
-"""Which rooms of two maps are one: a small network that looks at both maps at once, in NumPy.
+"""Which rooms of two maps are one: a small network that looks at both maps at once.
 
 Each room starts as what it looks like (its rows, `embedding.turns`), then looks at the rooms of its own map and at those of the
 other one (attention within and across; Lindenberger et al. 2023, LightGlue). Both maps are turned into the direction of their
@@ -9,21 +9,22 @@ from one map to the other: how much of the matching so far agrees with the way o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from topomerge import numpy_nn as nn
 from topomerge.embedding.turns import FACTS, QUARTERS, Rows, TurnedRows, quarters_between
 from topomerge.errors import InputError
 from topomerge.io.weight_files import weights_file
 from topomerge.kernels.votes import summed_votes
+from topomerge.networks.network import WEIGHTS_PACKAGE, Run, load_network, read_card
+from topomerge.networks.signature import Signature, Tensor
 from topomerge.types import Array
 
-MATCHER_FILE = "room_matcher.npz"
+MATCHER_FILE = "room_matcher.onnx"
 ATTENTION_HEADS = 4
 RINGS = np.array([0.0, 2.0, 4.0, 7.0, 11.0, 16.0, 24.0])  # m: how far another room is
 RING_WIDTH = (0.5, 0.3)  # m, and share of the ring's distance
@@ -39,7 +40,24 @@ MOST_VOTED = 20_000  # pairs of rooms that are voted for, the likeliest ones
 FIRST_SHARPNESS = 25.0  # that cosines are multiplied with for the first votes
 LIKENESS_SCALE = 10.0  # that likeness is multiplied with, times what is learned
 UNUSUAL = 4.0  # standard deviations by which a fact differs from what is usual, at most
-ROWS_AT_ONCE = 64  # rooms
+MOST_SIZE = 4096  # of a network; more is a mistake, or a file that was made to take all memory
+
+
+@dataclass(frozen=True, eq=False)
+class Matcher:
+    """The network, and what is to be known to run it.
+
+    Args:
+        run: as of `build_signature`.
+        width: numbers of a room within the network.
+        stages: that it has.
+        embedder: hash of the embedder whose rows it takes.
+    """
+
+    run: Run
+    width: int
+    stages: int
+    embedder: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +113,9 @@ def room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOdds, ...]
     Raises:
         InputError: the network is damaged.
     """
-    weights = matcher_weights()
+    matcher = matcher_weights()
     for rows in (a, b):
-        if not isinstance(rows, TurnedRows) or not len(rows) or rows.facts is None or rows.embedder != embedder_of(weights):
+        if not isinstance(rows, TurnedRows) or not len(rows) or rows.facts is None or rows.embedder != matcher.embedder:
             return ()
     assert isinstance(a, TurnedRows) and isinstance(b, TurnedRows)
     if _order(b) < _order(a):  # rows are read as they are turned: the second map as the first one stands
@@ -105,8 +123,8 @@ def room_odds(a: Rows, b: Rows, likeliest: bool = False) -> tuple[RoomOdds, ...]
         return tuple(sorted(swapped, key=lambda turned: turned.quarters))
     if likeliest:
         k = quarters_between(a, b)
-        return (replace(odds_of(rooms_seen(a), rooms_seen(b, k), weights), quarters=k),)
-    return every_turn(rooms_seen(a), [rooms_seen(b, k) for k in range(QUARTERS)], weights)
+        return (replace(odds_of(rooms_seen(a), rooms_seen(b, k), matcher), quarters=k),)
+    return every_turn(rooms_seen(a), [rooms_seen(b, k) for k in range(QUARTERS)], matcher)
 
 
 def _order(rows: TurnedRows) -> tuple[int, float]:
@@ -135,39 +153,31 @@ def rooms_seen(rows: TurnedRows, quarters: int = 0) -> RoomsSeen:
     return RoomsSeen(rows.flat(quarters), places - places.mean(axis=0), rows.facts[:, -1], rows.facts)
 
 
-def every_turn(a: RoomsSeen, turned: Sequence[RoomsSeen], w: Mapping[str, Array]) -> tuple[RoomOdds, ...]:
+def every_turn(a: RoomsSeen, turned: Sequence[RoomsSeen], matcher: Matcher) -> tuple[RoomOdds, ...]:
     """The network on a map and another one in each of its quarter turns."""
-    return tuple(replace(odds_of(a, b, w), quarters=k) for k, b in enumerate(turned))
+    return tuple(replace(odds_of(a, b, matcher), quarters=k) for k, b in enumerate(turned))
 
 
-def odds_of(a: RoomsSeen, b: RoomsSeen, w: Mapping[str, Array]) -> RoomOdds:
-    """The network on two maps as they are turned. `models.room_matcher.RoomMatcher` is the same in torch."""
-    cosine = a.rows @ b.rows.T
-    facts = [np.clip((m.facts - w["usual"]) / w["spread"], -UNUSUAL, UNUSUAL) for m in (a, b)]
-    states = [
-        nn.linear(m.rows, w["rows.w"], w["rows.b"]) + nn.linear(f, w["facts.w"], w["facts.b"])
-        for m, f in zip((a, b), facts, strict=True)
-    ]
-    likely = np.sqrt(nn.softmax(FIRST_SHARPNESS * cosine) * nn.softmax(FIRST_SHARPNESS * cosine.T).T)
-    rows, columns = _partners(0, states, cosine, agreement(likely, a, b), w)
-    layer = 1
-    while f"{layer}.query.w" in w:
-        agreed = agreement(np.sqrt(rows[:, :-1] * columns[:, :-1].T), a, b)
-        states = [_within(f"{layer}", state, m, w) for state, m in zip(states, (a, b), strict=True)]
-        states = _across(f"{layer}", states, agreed, w)
-        states = [state + _each(f"{layer}", state, w) for state in states]
-        rows, columns = _partners(layer, states, cosine, agreed, w)
-        layer += 1
-    return RoomOdds(rows, columns)
+def odds_of(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
+    """Run the network on two maps as they are turned, stage by stage: before each of them, pairs of rooms vote (`agreement`)."""
+    feeds: dict[str, Array] = {}
+    for side, map in (("a", a), ("b", b)):
+        feeds |= {f"rows_{side}": map.rows, f"facts_{side}": map.facts, f"places_{side}": map.places - map.places.mean(axis=0)}
+        feeds |= {f"heights_{side}": map.heights - map.heights.mean(), f"state_{side}": np.zeros((len(map.rows), matcher.width))}
+    likely = first_guess(a.rows @ b.rows.T)
+    for stage in range(matcher.stages):
+        feeds |= {"stage": np.arange(matcher.stages) == stage, "votes": agreement(likely, a, b)}
+        feeds["state_a"], feeds["state_b"], rows, columns = matcher.run(**feeds)
+        likely = np.sqrt(rows[:, :-1] * columns[:, :-1].T)
+    return RoomOdds(rows.astype(float), columns.astype(float))
 
 
-def ways(places: Array, heights: Array, start: int = 0, stop: int | None = None) -> Array:
-    """(n, R, WAY_FACTS) from the rooms `start` to `stop` of a map to each of its rooms: direction, distance in rings, climb."""
-    off = places[None] - places[start:stop, None]
-    far = np.linalg.norm(off, axis=2)[..., None]
-    ring = np.exp(-(((far - RINGS) / (RING_WIDTH[0] + RING_WIDTH[1] * RINGS)) ** 2))
-    climb = np.clip((heights[None] - heights[start:stop, None]) / CLIMB_UNIT, -2, 2)[..., None]
-    return np.concatenate([off / (far + WAY_SOFT), ring, climb], axis=2)
+def first_guess(cosine: Array) -> Array:
+    """(R_a, R_b) how likely each pair of rooms is by their rows alone: what votes in the first stage."""
+    from scipy.special import softmax
+
+    likely: Array = np.sqrt(softmax(FIRST_SHARPNESS * cosine, axis=1) * softmax(FIRST_SHARPNESS * cosine, axis=0))
+    return likely
 
 
 def agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
@@ -188,89 +198,49 @@ def agreement(likely: Array, a: RoomsSeen, b: RoomsSeen) -> Array:
     return out.reshape(n, m, len(AGREEMENT))
 
 
-def _partners(layer: int, states: list[Array], cosine: Array, votes: Array, w: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Probabilities (R_a, R_b + 1) and (R_b, R_a + 1) after a layer."""
-    heads = [nn.linear(state, w[f"{layer}.head.w"], w[f"{layer}.head.b"]) for state in states]
-    a, b = (h / np.maximum(np.linalg.norm(h, axis=1, keepdims=True), 1e-12) for h in heads)
-    logits = LIKENESS_SCALE * w["sharpness"] * (a @ b.T) + LIKENESS_SCALE * w["likeness"] * (cosine - 1)
-    logits = logits + nn.linear(votes, w[f"{layer}.agree.w"], w[f"{layer}.agree.b"])[..., 0]
-    alone = [nn.linear(state, w[f"{layer}.alone.w"], w[f"{layer}.alone.b"]) for state in states]
-    return nn.softmax(np.concatenate([logits, alone[0]], axis=1)), nn.softmax(np.concatenate([logits.T, alone[1]], axis=1))
+@lru_cache(maxsize=8)
+def build_signature(numbers: int, width: int, stages: int) -> Signature:
+    """Describe a network that matches rooms.
+
+    Args:
+        numbers: of a room's rows, 4 D.
+        width: numbers of a room within the network.
+        stages: of the network, the first of which has no attention.
+    """
+    inputs = {"stage": Tensor((stages,), "1 for the one to run, else 0; the first one has no attention", "int64")}
+    for side in "ab":
+        rooms = f"rooms_{side}"
+        inputs |= {
+            f"rows_{side}": Tensor((rooms, numbers), "rows of the embedder for four quarter turns"),
+            f"facts_{side}": Tensor((rooms, FACTS), "logarithms of what is known of rooms, dustbin, height in m"),
+            f"places_{side}": Tensor((rooms, 2), "m, middles of the rooms in the direction of the walls"),
+            f"heights_{side}": Tensor((rooms,), "m"),
+            f"state_{side}": Tensor((rooms, width), "what the stage before gave; the first one reads none"),
+        }
+    inputs["votes"] = Tensor(("rooms_a", "rooms_b", len(AGREEMENT)), "log(1 + 3 times the votes of pairs that are moved alike)")
+    outputs = {f"next_{side}": Tensor((f"rooms_{side}", width), "state of the rooms after the stage") for side in "ab"}
+    for name, side in (("rows", "a"), ("columns", "b")):
+        outputs[name] = Tensor((f"rooms_{side}", "partners"), "probability that a room of the other map is it, then that none is")
+    return Signature("Says which rooms of two maps are one; each call runs one stage.", inputs, outputs)
 
 
-def _within(name: str, state: Array, rooms: RoomsSeen, w: Mapping[str, Array]) -> Array:
-    """Each room looks at all rooms of its own map, and at the ways to them."""
-    count, width = state.shape
-    size = width // ATTENTION_HEADS
-    normed = nn.layer_norm(state, w[f"{name}.norm_within.w"], w[f"{name}.norm_within.b"])
-    query, key, value = np.split(nn.linear(normed, w[f"{name}.within.w"], w[f"{name}.within.b"]), 3, axis=1)
-    query, key = query.reshape(count, ATTENTION_HEADS, size), key.reshape(count, ATTENTION_HEADS, size)
-    out = np.empty_like(state)
-    for start in range(0, count, ROWS_AT_ONCE):
-        rows = slice(start, start + ROWS_AT_ONCE)
-        way = ways(rooms.places, rooms.heights, start, start + ROWS_AT_ONCE)
-        way = nn.relu(nn.linear(way, w[f"{name}.way_in.w"], w[f"{name}.way_in.b"]))
-        way = nn.linear(way, w[f"{name}.way_out.w"], w[f"{name}.way_out.b"])
-        score = np.einsum("ihd,jhd->ijh", query[rows], key) / np.sqrt(size) + way[..., :ATTENTION_HEADS]
-        share = nn.softmax(score.transpose(0, 2, 1))
-        seen = (value[None] + way[..., ATTENTION_HEADS:]).reshape(-1, count, ATTENTION_HEADS, size)
-        out[rows] = np.einsum("ihj,ijhd->ihd", share, seen).reshape(-1, width)
-    return state + nn.linear(out, w[f"{name}.join_within.w"], w[f"{name}.join_within.b"])
+def matcher_weights() -> Matcher:
+    """Load the network that ships, or the one in its place (`io.weight_files`)."""
+    return read_matcher(weights_file(WEIGHTS_PACKAGE, MATCHER_FILE))
 
 
-def _across(name: str, states: list[Array], votes: Array, w: Mapping[str, Array]) -> list[Array]:
-    """Each room looks at the rooms of the other map, those first whose way is agreed upon."""
-    width = states[0].shape[1]
-    size = width // ATTENTION_HEADS
-    normed = [nn.layer_norm(s, w[f"{name}.norm_across.w"], w[f"{name}.norm_across.b"]) for s in states]
-    query = [nn.linear(s, w[f"{name}.query.w"], w[f"{name}.query.b"]).reshape(-1, ATTENTION_HEADS, size) for s in normed]
-    value = [nn.linear(s, w[f"{name}.value.w"], w[f"{name}.value.b"]).reshape(-1, ATTENTION_HEADS, size) for s in normed]
-    score = np.einsum("ihd,jhd->hij", *query) / np.sqrt(size)
-    score = score + nn.linear(votes, w[f"{name}.votes.w"], w[f"{name}.votes.b"]).transpose(2, 0, 1)
-    seen = (
-        np.einsum("hij,jhd->ihd", nn.softmax(score), value[1]),
-        np.einsum("hji,ihd->jhd", nn.softmax(score.transpose(0, 2, 1)), value[0]),
-    )
-    join = w[f"{name}.join_across.w"], w[f"{name}.join_across.b"]
-    return [state + nn.linear(other.reshape(-1, width), *join) for state, other in zip(states, seen, strict=True)]
-
-
-def _each(name: str, state: Array, w: Mapping[str, Array]) -> Array:
-    normed = nn.layer_norm(state, w[f"{name}.norm_each.w"], w[f"{name}.norm_each.b"])
-    hidden = nn.relu(nn.linear(normed, w[f"{name}.each_in.w"], w[f"{name}.each_in.b"]))
-    return nn.linear(hidden, w[f"{name}.each_out.w"], w[f"{name}.each_out.b"])
-
-
-def matcher_weights() -> dict[str, Array]:
-    """The weights that ship, or those in their place (`io.weight_files`)."""
-    return read_matcher(weights_file("topomerge.matching", MATCHER_FILE))
-
-
-def embedder_of(weights: Mapping[str, Array]) -> str:
-    """Hash of the embedder whose rows the network takes."""
-    return str(weights["embedder"].astype(np.uint8).tobytes().decode())
-
-
-@lru_cache(maxsize=4)
-def read_matcher(path: Path) -> dict[str, Array]:
-    """Weights as float64 by their names.
+def read_matcher(path: Path) -> Matcher:
+    """Load the network of a file.
 
     Raises:
         InputError: another file, or a damaged one.
     """
-    advice = "install topomerge again"
+    card = read_card(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            weights = {name: file[name].astype(np.float64) for name in file.files}
-    except Exception as error:  # zip, header and data each have their own errors
-        raise InputError(f"{path}: is no network that matches rooms ({error}); {advice}") from error
-    one = {name: np.zeros((1, *w.shape[:1])) for name, w in weights.items() if name.endswith(".w") and w.ndim == 2}
-    missing = {"rows.w", "facts.w", "usual", "spread", "sharpness", "likeness", "embedder", "0.head.w"} - set(weights)
-    if missing or not one or not all(np.isfinite(w).all() for w in weights.values()):
-        raise InputError(f"{path}: is no network that matches rooms (layer {min(missing, default='of no number')}); {advice}")
-    seen = RoomsSeen(one["rows.w"] * 0 + 1, np.zeros((1, 2)), np.zeros(1), np.zeros((1, FACTS)))
-    try:
-        odds_of(seen, seen, weights)
-    except (KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: is no network that matches rooms ({error}); {advice}") from error
-    return weights
+        numbers, width = int(card["inputs"]["rows_a"]["shape"][1]), int(card["settings"]["width"])
+        stages, embedder = int(card["settings"]["layers"]) + 1, str(card["data"]["embedder"])
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: its card is of no network that matches rooms ({error}); copy both files again") from error
+    if not 0 < width <= MOST_SIZE or not 0 < stages <= MOST_SIZE:
+        raise InputError(f"{path}: its card is of no network that matches rooms (width {width}); copy both files again")
+    return Matcher(load_network(path, build_signature(numbers, width, stages)), width, stages, embedder)

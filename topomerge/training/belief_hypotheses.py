@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from topomerge.datasets.pairs.grid_drawings import build_drawings
 from topomerge.datasets.pairs.grid_pairs import GridPair, GridRecipe, build_grids, load_grids
 from topomerge.matching.poses import wrapped
 from topomerge.metrics import pose_right
+from topomerge.networks.network import Network, Run
 from topomerge.registration.evidence.crops import CROP_ARRAYS, Crops
 from topomerge.registration.evidence.network import place_log_odds, read_weights
 from topomerge.registration.evidence.network import weights as place_weights
@@ -91,7 +92,7 @@ def belief_rows(recipe: GridRecipe, settings: MergeBelief, say: Any) -> list[Row
     return [row_of(path, networks) for path in hypothesis_files(recipe, settings, say)]
 
 
-def place_networks(settings: MergeBelief) -> list[Mapping[str, Array]]:
+def place_networks(settings: MergeBelief) -> list[Network]:
     """The networks of the runs that saw one half of the buildings each (`task=place_evidence half=1`, `half=2`); the one that
     ships where none are named.
 
@@ -103,7 +104,7 @@ def place_networks(settings: MergeBelief) -> list[Mapping[str, Array]]:
     return [read_weights(weights_of("place_evidence", run)) for run in settings.halves]
 
 
-def row_of(path: Path, networks: Sequence[Mapping[str, Array]]) -> Row:
+def row_of(path: Path, networks: Sequence[Run]) -> Row:
     """The row of a file, with what its places say (``place_mean`` and the like) by the network of the other half of the
     buildings: what it was trained on it knows too well."""
     data = read_derived(path)

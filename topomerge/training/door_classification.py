@@ -64,7 +64,7 @@ def fit(settings: DoorClassification, say: Say) -> dict[str, float]:
 def door_examples(recipe: PlanRecipe, settings: DoorClassification, say: Say) -> Doors:
     """Examples of a set of scans, cached."""
     paths, _ = build_plans(recipe, settings, say)
-    networks = (weights_file("topomerge.extraction.plans", name) for name in (PLAN_NETWORK_FILE, GRID_NETWORK_FILE))
+    networks = (weights_file("topomerge.networks", name) for name in (PLAN_NETWORK_FILE, GRID_NETWORK_FILE))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in networks)).hexdigest()[:16]
     files, _ = derive(f"{recipe.name}_doors", scan_doors, [[path] for path in paths], settings, {"plan_networks": digest}, say)
     scans = [read_derived(file) for file in files]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from topomerge.checkpoint import NETWORK_FILE, load_state, write_network
 from topomerge.errors import InputError
+from topomerge.models.export import export_network, run_with_torch
+from topomerge.networks.network import Run
+from topomerge.networks.signature import Signature
 from topomerge.training.log import Log
 from topomerge.training.loop import Job, Loop, Say, Schedule, State, pace
 from topomerge.training.run_folder import export_files, write_card, write_settings
@@ -19,8 +22,20 @@ from topomerge.training.shared_settings import NetworkTask
 from topomerge.training.tasks import TASKS
 
 
+class Exported(NamedTuple):
+    """A network as the package runs it.
+
+    Args:
+        sample: inputs that it is exported with.
+    """
+
+    module: torch.nn.Module
+    signature: Signature
+    sample: Sequence[torch.Tensor]
+
+
 class NetworkJob(ABC):
-    """A job without processes beside it; a task adds batches, steps, scores and the file of weights."""
+    """A job without processes beside it; a task adds batches, steps, scores and what is exported."""
 
     def __init__(self, settings: NetworkTask, network: torch.nn.Module, origin: Mapping[str, Any]) -> None:
         self.device = device_of(settings)
@@ -55,18 +70,45 @@ class NetworkJob(ABC):
 
     @abstractmethod
     def write_weights(self, path: Path) -> None:
-        """The weights as the package has them."""
+        """Write the weights as the package has them."""
+
+    def interface(self) -> dict[str, Any]:
+        """What a card says of inputs and outputs; nothing of weights that are no network of `topomerge.networks`."""
+        return {}
 
     def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
         """The file of weights and its card."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / TASKS[self.settings.task].file
         self.write_weights(path)
-        write_card(path, asdict(self.settings), self.origin, {k: v for k, v in row.items() if k.startswith("val/")})
+        metrics = {k: v for k, v in row.items() if k.startswith("val/")}
+        write_card(path, asdict(self.settings), self.origin, metrics, self.interface())
 
     def line(self, row: Mapping[str, Any]) -> str:
         """The score that is watched."""
         return f"{self.settings.watch} {row[f'val/{self.settings.watch}']:.3f}"
+
+
+class ExportedJob(NetworkJob):
+    """A job whose network `topomerge.networks` runs."""
+
+    @abstractmethod
+    def exported(self) -> Exported:
+        """The network as the package runs it."""
+
+    def run(self) -> Run:
+        """The network as it is, for those who call what is exported."""
+        module, signature, _ = self.exported()
+        return run_with_torch(module, signature)
+
+    def write_weights(self, path: Path) -> None:
+        """Write the weights as the package has them."""
+        module, signature, sample = self.exported()
+        export_network(module, signature, [tensor.to(self.device) for tensor in sample], path)
+
+    def interface(self) -> dict[str, Any]:
+        """What it does, inputs and outputs."""
+        return self.exported().signature.describe()
 
 
 def device_of(settings: NetworkTask) -> torch.device:

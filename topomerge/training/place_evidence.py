@@ -20,12 +20,12 @@ from torch.nn import functional
 from topomerge.datasets.core.derived import read_derived
 from topomerge.datasets.pairs.lookalikes import build_lookalikes
 from topomerge.errors import InputError
-from topomerge.io import archive
-from topomerge.models.place_network import PlaceNetwork, exported_weights
-from topomerge.registration.evidence.network import UPPER_PLANES, network_log_odds, planes, read_weights
+from topomerge.models.export import build_sample
+from topomerge.models.place_network import PlaceLogOdds, PlaceNetwork
+from topomerge.registration.evidence.network import PLACE_SIGNATURE, UPPER_PLANES, network_log_odds, planes, read_weights
 from topomerge.training.belief_hypotheses import fair, half_of, hypothesis_files, judged_files
 from topomerge.training.loop import Say, State, mixed
-from topomerge.training.networks import NetworkJob, run_network
+from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
 from topomerge.types import Array
 
@@ -99,7 +99,7 @@ def some(places: Places, pick: Array) -> Places:
     return Places(places.planes[pick], places.right[pick], places.weight[pick], places.building[pick], places.buildings)
 
 
-class PlaceJob(NetworkJob):
+class PlaceJob(ExportedJob):
     """Squares, right ones and wrong ones alike."""
 
     def __init__(self, settings: PlaceEvidence, learned: Places, watched: Places) -> None:
@@ -130,20 +130,14 @@ class PlaceJob(NetworkJob):
         """Squares."""
         return len(batch[0])
 
-    def weights(self) -> dict[str, Array]:
-        """As the package reads them: half precision, normalisation in them."""
+    def exported(self) -> Exported:
+        """The network with probabilities for scores."""
         assert isinstance(self.network, PlaceNetwork)
-        self.network.eval()
-        return {name: values.astype(np.float16) for name, values in exported_weights(self.network).items()}
+        return Exported(PlaceLogOdds(self.network), PLACE_SIGNATURE, build_sample(PLACE_SIGNATURE))
 
     def scores(self) -> dict[str, float]:
         """Of the buildings that are watched."""
-        weights = {name: values.astype(np.float32) for name, values in self.weights().items()}
-        return place_scores(network_log_odds(self.watched.planes, weights), self.watched.right, self.watched.weight)
-
-    def write_weights(self, path: Path) -> None:
-        """An archive of arrays."""
-        archive.write(self.weights(), path)
+        return place_scores(network_log_odds(self.watched.planes, self.run()), self.watched.right, self.watched.weight)
 
 
 def augmented(x: Array, augment: PlaceAugment, rng: np.random.Generator) -> Array:

@@ -21,12 +21,18 @@ from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 from topomerge.datasets.pairs.scan_items import FLAT_SENSOR_SHARES
 from topomerge.errors import InputError
 from topomerge.extraction.classified_storey import COLUMN_CLASSES
-from topomerge.extraction.plans.plan_network import column_probabilities, evidence, read_weights
-from topomerge.io import archive
-from topomerge.models.plan_unet import PlanUNet, exported_weights
+from topomerge.extraction.plans.plan_network import (
+    EVIDENCE_CHANNELS,
+    PLAN_SIGNATURE,
+    column_probabilities,
+    evidence,
+    read_weights,
+)
+from topomerge.models.plan_unet import PlanProbabilities, PlanUNet
+from topomerge.networks.network import Run
 from topomerge.training.grid_noise import with_grid_noise
 from topomerge.training.loop import Say, State, made_beside, mixed
-from topomerge.training.networks import NetworkJob, run_network
+from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.scan_settings import GridSegmentation, PlanAugment, PlanLoss, PlanSegmentation
 from topomerge.types import Array
 
@@ -59,7 +65,7 @@ def fit(settings: PlanSegmentation, say: Say) -> dict[str, float]:
     return run_network(job, settings, settings.steps, say)
 
 
-class PlanJob(NetworkJob):
+class PlanJob(ExportedJob):
     """Crops of plans, larger plans more often."""
 
     def __init__(self, settings: PlanSegmentation, learned: Sequence[PlanExample], watched: Sequence[PlanExample]) -> None:
@@ -97,20 +103,14 @@ class PlanJob(NetworkJob):
         """Crops."""
         return len(batch[0])
 
-    def weights(self) -> dict[str, Array]:
-        """As the package reads them: half precision, normalisation in them."""
+    def exported(self) -> Exported:
+        """The network with probabilities for scores."""
         assert isinstance(self.network, PlanUNet)
-        self.network.eval()
-        return {name: values.astype(np.float16) for name, values in exported_weights(self.network).items()}
+        return Exported(PlanProbabilities(self.network), PLAN_SIGNATURE, [torch.rand(2, EVIDENCE_CHANNELS, 64, 48)])
 
     def scores(self) -> dict[str, float]:
         """Of the scans that are watched."""
-        weights = {name: values.astype(np.float32) for name, values in self.weights().items()}
-        return class_scores(confusion(self.watched, weights))
-
-    def write_weights(self, path: Path) -> None:
-        """An archive of arrays."""
-        archive.write(self.weights(), path)
+        return class_scores(confusion(self.watched, self.run()))
 
 
 def as_grid(example: PlanExample, furnished: bool) -> PlanExample:
@@ -159,12 +159,12 @@ def crop(plan: PlanTensors, side: int, augment: PlanAugment, rng: np.random.Gene
     return x, truth, weight
 
 
-def confusion(examples: Sequence[PlanExample], weights: dict[str, Array]) -> Array:
+def confusion(examples: Sequence[PlanExample], network: Run) -> Array:
     """(5, 5) columns by true and by said class, of those of which something is known."""
     table = np.zeros((len(COLUMN_CLASSES), len(COLUMN_CLASSES)), np.int64)
     for example in examples:
         seen = example.plan.inside | example.plan.wall
-        said = column_probabilities(example.plan, weights).argmax(axis=-1)
+        said = column_probabilities(example.plan, network).argmax(axis=-1)
         np.add.at(table, (example.truth[seen], said[seen]), 1)
     return table
 

@@ -8,7 +8,7 @@ none has any. The turn is learned with it: matchings at the true turn are to be 
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,16 +21,16 @@ from torch.nn import functional
 from topomerge.embedding.turns import QUARTERS, TurnedRows, along_walls, room_facts
 from topomerge.embedding.weights import embedder_hash
 from topomerge.errors import InputError
-from topomerge.io import archive
-from topomerge.matching.room_matcher import RoomsSeen, every_turn, read_matcher, rooms_seen
+from topomerge.matching.room_matcher import Matcher, RoomsSeen, build_signature, every_turn, read_matcher, rooms_seen
 from topomerge.matching.scores import assign_certain, has_twin, pair_counts, partner_ranks
 from topomerge.models.embedder import Embedder
+from topomerge.models.export import build_sample
 from topomerge.models.losses import NEVER_LOGIT
-from topomerge.models.room_matcher import Partners, RoomMatcher, exported_matcher
+from topomerge.models.room_matcher import Partners, RoomMatcher, build_stages
 from topomerge.models.weights import read_embedder
 from topomerge.training.batches import changed
 from topomerge.training.loop import Say, State, mixed
-from topomerge.training.networks import NetworkJob, run_network
+from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.packed import Graph, GraphPair, load_pairs
 from topomerge.training.settings import Augment
 from topomerge.training.task_settings import RoomMatching
@@ -113,7 +113,7 @@ def view(graph: Graph, network: Embedder, number: int, seed: int) -> View:
     return View(TurnedRows(rows.astype(np.float32), places[chosen], "", facts), chosen)
 
 
-class MatcherJob(NetworkJob):
+class MatcherJob(ExportedJob):
     """Pairs of maps, each at its true turn and at a wrong one.
 
     Args:
@@ -169,20 +169,16 @@ class MatcherJob(NetworkJob):
         """Rooms."""
         return sum(len(example.a[0].present) + len(example.b[0].present) for example, _ in batch)
 
-    def weights(self) -> dict[str, Array]:
-        """As the package reads them: half precision."""
+    def exported(self) -> Exported:
+        """All its stages."""
         assert isinstance(self.network, RoomMatcher)
-        self.network.eval()
-        exported = exported_matcher(self.network, self.embedder)
-        return {name: values if name == "embedder" else values.astype(np.float16) for name, values in exported.items()}
+        signature = build_signature(self.network.rows.in_features, self.options.width, self.options.layers + 1)
+        return Exported(build_stages(self.network), signature, build_sample(signature))
 
     def scores(self) -> dict[str, float]:
         """Of the pairs that are watched."""
-        return matcher_scores(self.watched, {name: values.astype(float) for name, values in self.weights().items()})
-
-    def write_weights(self, path: Path) -> None:
-        """An archive of arrays."""
-        archive.write(self.weights(), path)
+        matcher = Matcher(self.run(), self.options.width, self.options.layers + 1, self.embedder)
+        return matcher_scores(self.watched, matcher)
 
 
 def deep_loss(layers: Sequence[Partners], links: Tensor) -> Tensor:
@@ -202,12 +198,12 @@ def sureness(partners: Partners) -> Tensor:
     return (partners.rows[:, :-1] + partners.columns[:, :-1].T).exp().sum()
 
 
-def matcher_scores(watched: Sequence[Example], weights: Mapping[str, Array]) -> dict[str, float]:
+def matcher_scores(watched: Sequence[Example], matcher: Matcher) -> dict[str, float]:
     """Scores as of `training.validate`, and the share of pairs with rooms in common whose turn is right (`turn`)."""
     ranks, twins, turns, counts = [], [], [], np.zeros((len(LEAST_CERTAINTIES), 4), int)
     for example in watched:
         a, b, matches = example.a[0], example.b[0], example.pair.matches.numpy()
-        odds = max(every_turn(a.seen(0), [b.seen(k) for k in range(QUARTERS)], weights), key=lambda turned: turned.sureness)
+        odds = max(every_turn(a.seen(0), [b.seen(k) for k in range(QUARTERS)], matcher), key=lambda turned: turned.sureness)
         counts += [pair_counts(assign_certain(odds.certainty, least), matches) for least in LEAST_CERTAINTIES]
         if len(matches) and example.quarters is not None:
             turns.append(odds.quarters == example.quarters)

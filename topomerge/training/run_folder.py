@@ -20,9 +20,9 @@ import topomerge
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 from topomerge.io.listing import plain
+from topomerge.networks.network import CARD
 
 PACKAGE = "package"  # export: into the package itself
-CARD = ".card.json"
 
 
 def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
@@ -43,17 +43,25 @@ def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
             beside.write_text(text, encoding="utf-8")
 
 
-def write_card(file: Path, settings: Mapping[str, Any], data: Mapping[str, Any], metrics: Mapping[str, Any]) -> Path:
+def write_card(
+    file: Path,
+    settings: Mapping[str, Any],
+    data: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    interface: Mapping[str, Any] | None = None,
+) -> Path:
     """Write the card of a file of weights beside it: what it is trained on, by which command and version, and how good it is.
 
     Args:
         settings: of the run.
         data: what was learned from: counts, names of sets.
         metrics: on what was held out of the training.
+        interface: what a network does, its inputs and outputs (`networks.signature`).
     """
     keys = (f"{k}={v}" for k, v in settings.items() if isinstance(v, int | float | str) and k in ("seed", "epochs"))
     command = f"python train.py task={settings['task']} {' '.join(keys)} export=package".replace("  ", " ")
     card = {
+        **(interface or {}),
         "file": file.name,
         "task": settings["task"],
         "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),

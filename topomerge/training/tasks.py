@@ -36,16 +36,16 @@ class Task:
 
 TASKS = {
     "plan_segmentation": Task(
-        "plan_segmentation", "PlanSegmentation", "topomerge.extraction.plans", "plan_network.npz", 5.0, "scan_settings"
+        "plan_segmentation", "PlanSegmentation", "topomerge.networks", "plan_network.onnx", 5.0, "scan_settings"
     ),
     "grid_segmentation": Task(
-        "plan_segmentation", "GridSegmentation", "topomerge.extraction.plans", "grid_network.npz", 1.2, "scan_settings"
+        "plan_segmentation", "GridSegmentation", "topomerge.networks", "grid_network.onnx", 1.2, "scan_settings"
     ),
     "door_classification": Task(
         "door_classification", "DoorClassification", "topomerge.extraction.plans", "door_classifier.json", 0.7, "scan_settings"
     ),
     "wall_segmentation": Task(
-        "wall_segmentation", "WallSegmentation", "topomerge.extraction.elevations", "wall_network.npz", 1.2, "scan_settings"
+        "wall_segmentation", "WallSegmentation", "topomerge.networks", "wall_network.onnx", 1.2, "scan_settings"
     ),
     "wall_colours": Task(
         "wall_colours", "WallColours", "topomerge.extraction.elevations", "colour_network.npz", 1.0, "scan_settings"
@@ -55,11 +55,11 @@ TASKS = {
     "room_odds": Task("room_odds", "RoomOdds", "topomerge.extraction", "room_odds.json", 0.5, "scan_settings"),
     "feature_scale": Task("feature_scale", "FeatureScale", "topomerge.embedding", "engineered.json", 0.3),
     "match_odds": Task("match_odds", "MatchOdds", "topomerge.matching", "odds.json", 0.3),
-    "place_evidence": Task("place_evidence", "PlaceEvidence", "topomerge.registration.evidence", "place_network.npz", 4.0),
+    "place_evidence": Task("place_evidence", "PlaceEvidence", "topomerge.networks", "place_network.onnx", 4.0),
     "match_belief": Task("match_belief", "MatchBelief", "topomerge.fusion", "match_belief.json", 0.3),
     "merge_belief": Task("merge_belief", "MergeBelief", "topomerge.registration", "calibration.json", 4.0),
     "embedding": Task("embedding", "", "topomerge.embedding.pretrained", "embedder.safetensors", 0.6),
-    "room_matcher": Task("room_matcher", "RoomMatching", "topomerge.matching", "room_matcher.npz", 0.3),
+    "room_matcher": Task("room_matcher", "RoomMatching", "topomerge.networks", "room_matcher.onnx", 0.3),
 }
 
 

@@ -18,11 +18,11 @@ from topomerge.datasets.pairs.wall_examples import WallExample, build_walls, loa
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.colour_network import COLOUR_CLASSES, coarse_classes
 from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, STRIP_CHANNELS, WALL_CLASSES
-from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities, read_network
-from topomerge.io import archive
-from topomerge.models.wall_network import WallNetwork, exported_network
+from topomerge.extraction.elevations.wall_network import PLACES, WALL_SIGNATURE, place_probabilities, read_network
+from topomerge.models.wall_network import WallNetwork, WallProbabilities
+from topomerge.networks.network import Run
 from topomerge.training.loop import Say, State, mixed
-from topomerge.training.networks import NetworkJob, run_network
+from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.scan_settings import WallAugment, WallSegmentation, WallTask
 from topomerge.types import Array
 
@@ -59,7 +59,7 @@ def learned_and_watched(scans: Sequence[ScanT], settings: WallTask) -> tuple[lis
     return learned, watched
 
 
-class WallJob(NetworkJob):
+class WallJob(ExportedJob):
     """Stretches of walls, most of them about a door or a window."""
 
     def __init__(self, settings: WallSegmentation, learned: Sequence[WallExample], watched: Sequence[WallExample]) -> None:
@@ -94,19 +94,14 @@ class WallJob(NetworkJob):
         """Stretches."""
         return len(batch[0])
 
-    def weights(self) -> dict[str, Array]:
-        """As the package reads them: half precision, normalisation in them."""
+    def exported(self) -> Exported:
+        """The network with probabilities for scores."""
         assert isinstance(self.network, WallNetwork)
-        self.network.eval()
-        return {name: values.astype(np.float16) for name, values in exported_network(self.network).items()}
+        return Exported(WallProbabilities(self.network), WALL_SIGNATURE, [torch.rand(2, 8, DEPTHS, STRIP_CHANNELS)])
 
     def scores(self) -> dict[str, float]:
         """Of the scans that are watched."""
-        return wall_scores(self.watched, {name: values.astype(np.float32) for name, values in self.weights().items()})
-
-    def write_weights(self, path: Path) -> None:
-        """An archive of arrays."""
-        archive.write(self.weights(), path)
+        return wall_scores(self.watched, self.run())
 
 
 def answers(truth: Array, strips: Array) -> tuple[Array, Array]:
@@ -153,14 +148,14 @@ def _spoilt(x: Array, augment: WallAugment, rng: np.random.Generator) -> Array:
     return np.ascontiguousarray(x)
 
 
-def wall_scores(examples: Sequence[WallExample], weights: dict[str, Array]) -> dict[str, float]:
+def wall_scores(examples: Sequence[WallExample], network: Run) -> dict[str, float]:
     """F1 of each class over the places where anything was seen, and the mean of those of doors, open or half open, and shut."""
     table = np.zeros((len(WALL_CLASSES), len(WALL_CLASSES)), np.int64)
     for scan in examples:
         for low, high in zip(scan.first[:-1], scan.first[1:], strict=True):
             strip = scan.strips[low:high] / np.float32(255)
             right, there = answers(scan.truth[low:high], strip)
-            np.add.at(table, (right[there], place_probabilities(strip, weights).argmax(axis=1)[there]), 1)
+            np.add.at(table, (right[there], place_probabilities(strip, network).argmax(axis=1)[there]), 1)
     coarse = np.zeros((len(COLOUR_CLASSES), len(COLOUR_CLASSES)), np.int64)
     np.add.at(coarse, np.ix_(COARSE_CLASS, COARSE_CLASS), table)
     return {**f1_scores(table, WALL_CLASSES), **class_scores(coarse)}

@@ -8,7 +8,6 @@ import pytest
 from tests.extraction.elevations.doors import SHUT_DOOR, cupboard_and_board, extracted, three_doors, wide_opening
 from tests.scenes import two_rooms
 from tests.training.tiny import two_doors
-from topomerge.errors import InputError
 from topomerge.extraction.elevations.doorways import (
     DOORWAY_DTYPE,
     HALF_OPEN,
@@ -20,7 +19,6 @@ from topomerge.extraction.elevations.doorways import (
 )
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_chance
-from topomerge.extraction.elevations.wall_network import read_network
 from topomerge.training.wall_doors import candidates_of_map
 from topomerge.types import Sim3, door_state
 
@@ -183,16 +181,6 @@ def test_a_mirrored_wall_has_the_same_doors_mirrored():
     strip = two_doors(0)[2] / np.float32(255)
     there = read_both_ways(strip)
     assert np.abs(there - read_both_ways(strip[::-1])[::-1]).max() < 1e-6 and np.ptp(there[:, OPEN] + there[:, SHUT]) > 0.3
-
-
-def test_damaged_weights_are_refused(tmp_path):
-    path = tmp_path / "wall_network.npz"
-    path.write_bytes(b"PK")
-    with pytest.raises(InputError, match="wall_network"):
-        read_network(path)
-    np.savez(path, **{"a.w": np.zeros((9, 4)), "a.b": np.zeros(4)})
-    with pytest.raises(InputError, match="walls"):
-        read_network(path)
 
 
 def test_a_wide_opening_of_the_plan_stays_though_walls_show_no_door():

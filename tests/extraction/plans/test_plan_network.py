@@ -1,13 +1,10 @@
-"""The network of the plans: NumPy against torch, what it says of a drawn plan, and files that are none."""
+"""What the network of the plans says of a drawn plan."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from topomerge.errors import InputError
 from topomerge.extraction.classified_storey import COLUMN_CLASSES, ClassifiedStorey, leads_through_wall
 from topomerge.extraction.plans import plan_network
 from topomerge.extraction.plans.plan import profile_bands
@@ -15,9 +12,6 @@ from topomerge.extraction.plans.plan_network import (
     EVIDENCE_CHANNELS,
     column_probabilities,
     evidence,
-    forward,
-    read_weights,
-    weights,
     without_furniture,
 )
 from topomerge.extraction.plans.storey_plan import StoreyPlan
@@ -45,21 +39,6 @@ def two_rooms() -> StoreyPlan:
     for i, j in ((70, 15), (70, 21), (82, 15), (82, 21)):
         wall[i, j] = True
     return drawn(wall)
-
-
-def test_numpy_as_torch() -> None:
-    torch = pytest.importorskip("torch")
-    from topomerge.models.plan_unet import PlanUNet, exported_weights
-
-    torch.manual_seed(0)
-    net = PlanUNet((16, 32, 40, 40, 40, 32, 16, 12))
-    net.train()
-    net(torch.rand(4, EVIDENCE_CHANNELS, 64, 64))  # gives the normalisation something to know
-    net.eval()
-    x = np.random.default_rng(0).random((EVIDENCE_CHANNELS, 80, 144)).astype(np.float32)
-    with torch.no_grad():
-        wanted = net(torch.from_numpy(x[None]))[0].numpy()
-    assert np.abs(forward(x, exported_weights(net)) - wanted).max() < 1e-4
 
 
 def test_what_it_sees(two_rooms: StoreyPlan) -> None:
@@ -110,27 +89,6 @@ def test_evidence(two_rooms: StoreyPlan) -> None:
     assert x.shape == (106, 46, EVIDENCE_CHANNELS) and x.dtype == np.float32 and np.isfinite(x).all()
     assert x[52, 5].tolist() == pytest.approx([0, 1, 1, 1, 1, 1, 1, 0, 1, -0.6, 0.5])
     assert x[20, 20].tolist() == pytest.approx([1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0.5])
-
-
-def test_damaged_weights(tmp_path: Path) -> None:
-    shipped = dict(weights())
-    for change in ({"a1.w": shipped["a1.w"][:-9]}, {"h1.b": shipped["h1.b"][:-1]}, {"out.b": shipped["out.b"] * np.nan}):
-        path = tmp_path / "other.npz"
-        np.savez(path, **{**shipped, **change})
-        read_weights.cache_clear()
-        with pytest.raises(InputError, match=r"other\.npz"):
-            read_weights(path)
-    np.savez(path, **{k: v for k, v in shipped.items() if k != "e1.w"})
-    with pytest.raises(InputError, match="e1"):
-        read_weights(path)
-    whole = path.read_bytes()
-    for broken in (b"", b"hello", whole[: len(whole) // 2]):
-        path.write_bytes(broken)
-        with pytest.raises(InputError):
-            read_weights(path)
-    np.savez(path, **{**shipped, "a1.w": np.array([{"no": 1}], object)})
-    with pytest.raises(InputError):
-        read_weights(path)
 
 
 @pytest.mark.parametrize("step", [(1500, 0), (-30, 1400), (500, 500)])

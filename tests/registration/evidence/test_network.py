@@ -6,10 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.errors import InputError
-from topomerge.io import archive
 from topomerge.registration.evidence.crops import LOOKED, PARTS, SIDE, Crops
-from topomerge.registration.evidence.network import PLANES, place_log_odds, planes, read_weights, weights
+from topomerge.registration.evidence.network import PLANES, place_log_odds, planes
 from topomerge.registration.evidence.places import MOST_ODDS, Places
 from topomerge.types import Sim3
 
@@ -71,30 +69,3 @@ def test_the_mean_and_the_worst_of_places_by_hand():
     assert found["place_worst"] == pytest.approx((-MOST_ODDS + 1) / 2)  # the worst third of the floor
     back = Places(crops, np.arange(4.0)).inverse(Sim3(0.0, (1.0, 0.0, 0.0)))
     assert (back.crops.parts == crops.parts[:, ::-1]).all() and (back.crops.middle[:, 0] == -1).all()
-
-
-def flipped(data: bytes) -> bytes:
-    """One byte in the middle, amid weights, changed."""
-    k = len(data) // 2
-    return data[:k] + bytes([data[k] ^ 0x55]) + data[k + 1 :]
-
-
-def test_a_file_that_is_no_network_is_refused(tmp_path):
-    good = {name: values.astype(np.float16) for name, values in weights().items()}
-    spoils = {
-        "cut": lambda p: p.write_bytes(p.read_bytes()[:-200]),
-        "layer": lambda p: archive.write({k: v for k, v in good.items() if k != "b.w"}, p),
-        "nan": lambda p: archive.write({**good, "a.b": good["a.b"] * np.float16(np.nan)}, p),
-        "shape": lambda p: archive.write({**good, "out.w": good["out.w"][1:]}, p),
-        "text": lambda p: p.write_text("weights"),
-        "empty": lambda p: p.write_bytes(b""),
-        "flipped": lambda p: p.write_bytes(flipped(p.read_bytes())),
-    }
-    for name, spoil in spoils.items():
-        path = tmp_path / f"{name}.npz"
-        archive.write(good, path)
-        assert set(read_weights(path)) == set(good)
-        read_weights.cache_clear()
-        spoil(path)
-        with pytest.raises(InputError, match="is no network of places"):
-            read_weights(path)

@@ -11,15 +11,16 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from scipy.special import softmax
 
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import BANDS, WALL_CLASSES
-from topomerge.extraction.elevations.wall_network import ALONG_LAYERS, DILATIONS, PLACES, TAPS, neighbours
+from topomerge.extraction.elevations.wall_network import DILATIONS, PLACES, TAPS
 from topomerge.io.weight_files import read_layers, weights_file
-from topomerge.numpy_nn import linear, relu, softmax
 from topomerge.types import Array
 
 COLOUR_NETWORK_FILE = "colour_network.npz"
+ALONG_LAYERS = ("along1", "along2", "along3")
 COLOUR_CHANNELS = 4  # of `Elevations.colours`
 LEAST_CHANCE = 1e-4  # probability: what shape says is not taken for surer
 COLOUR_CLASSES = ("wall", "open", "shut", "window")  # that colours tell apart: the first ones of `WALL_CLASSES`
@@ -61,10 +62,17 @@ def with_colours(colours: Array, classes: Array, network: dict[str, Array] | Non
         return classes
     w = weights() if network is None else network
     x, scores = colour_inputs(colours, classes)
-    x = relu(linear(x, w["in.w"], w["in.b"]))
+    x = np.maximum(x @ w["in.w"] + w["in.b"], 0)
     for name, dilation in zip(ALONG_LAYERS, DILATIONS, strict=True):
-        x = relu(linear(neighbours(x, dilation), w[f"{name}.w"], w[f"{name}.b"]))
-    return np.where(seen[:, None], softmax(scores + linear(x, w["out.w"], w["out.b"])), classes).astype(np.float32)
+        x = np.maximum(neighbours(x, dilation) @ w[f"{name}.w"] + w[f"{name}.b"], 0)
+    return np.where(seen[:, None], softmax(scores + x @ w["out.w"] + w["out.b"], axis=-1), classes).astype(np.float32)
+
+
+def neighbours(x: Array, dilation: int) -> Array:
+    """(..., n, 5 c) of each row (..., n, c) those around it, `dilation` apart; zeros past the ends."""
+    reach, count = TAPS // 2 * dilation, x.shape[-2]
+    padded = np.pad(x, [(0, 0)] * (x.ndim - 2) + [(reach, reach), (0, 0)])
+    return np.concatenate([padded[..., k * dilation : k * dilation + count, :] for k in range(TAPS)], axis=-1)
 
 
 def weights() -> dict[str, Array]:

@@ -1,6 +1,5 @@
 """What probably stands in each column of a plan: a convolutional network, trained on simulated scans of training buildings
-(`train.py task=plan_segmentation`; for robots' grids and drawings `task=grid_segmentation`), in NumPy (`numpy_nn`; beyond the
-thesis: docs/adr/0005).
+(`train.py task=plan_segmentation`; for robots' grids and drawings `task=grid_segmentation`; beyond the thesis: docs/adr/0005).
 
 A U-Net (Ronneberger et al. 2015) over what the plan knows of each column. It sees a few metres around, so that it may take the
 legs of a table for furniture, a stub of wall for the jamb of a door, and a gap between two stubs for a doorway.
@@ -9,21 +8,19 @@ legs of a table for furniture, a stub of wall for the jamb of a door, and a gap 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
-from topomerge.errors import InputError
 from topomerge.extraction.classified_storey import COLUMN_CLASSES, INSIDE_CLASS
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.io.weight_files import read_layers, weights_file
-from topomerge.numpy_nn import convolution, softmax
+from topomerge.networks.network import Network, Run, load_network, load_shipped_network
+from topomerge.networks.signature import Signature, Tensor
 from topomerge.types import Array
 
-PLAN_NETWORK_FILE = "plan_network.npz"
-GRID_NETWORK_FILE = "grid_network.npz"  # smaller: larger ones learn how grids are simulated
+PLAN_NETWORK_FILE = "plan_network.onnx"
+GRID_NETWORK_FILE = "grid_network.onnx"  # smaller: larger ones learn how grids are simulated
 EVIDENCE_HEIGHTS = ((0.1, 0.5), (0.5, 1.2), (1.2, 2.0), (2.0, 2.4))  # m
 EVIDENCE_CHANNELS = 11
 COARSEST_STRIDE = 16  # columns a side, of an element of the coarsest level
@@ -33,6 +30,19 @@ SIZE_CHANNEL = EVIDENCE_CHANNELS - 1  # the last one, which is the same everywhe
 NETWORK_REACH = 4  # strides: the network sees 60 columns to each side
 WORTH_PARTING = 0.8  # of a plan's area: its parts are looked at one by one where their boxes have less
 FURNITURE_CHANCE = 0.6, 0.95  # of the inside of a room, from which on what looked like wall is none: without and with a ceiling
+
+
+PLAN_SIGNATURE = Signature(
+    "Says what probably stands in each column of a plan.",
+    {
+        "evidence": Tensor(
+            ("plans", EVIDENCE_CHANNELS, "nx", "ny"),
+            "of each column, sides multiples of 16: known, wall, how full four bands of heights are (0 to 1), "
+            "floor, lintel, ceiling, height of the ceiling less 2.5 m, a column's side times 5, m",
+        )
+    },
+    {"probability": Tensor(("plans", len(COLUMN_CLASSES), "nx", "ny"), f"of {', '.join(COLUMN_CLASSES)}")},
+)
 
 
 def evidence(plan: StoreyPlan) -> Array:
@@ -52,7 +62,7 @@ def evidence(plan: StoreyPlan) -> Array:
     )
 
 
-def column_probabilities(plan: StoreyPlan, network: dict[str, Array] | None = None) -> Array:
+def column_probabilities(plan: StoreyPlan, network: Run | None = None) -> Array:
     """(nx, ny, 5) float32 probability of each of `COLUMN_CLASSES` in each column, by the weights that ship or by others.
 
     The mean over the plan turned by quarters: what the network says of a door hangs on how its walls lie on the columns, and
@@ -76,11 +86,11 @@ def column_probabilities(plan: StoreyPlan, network: dict[str, Array] | None = No
     return np.ascontiguousarray(mean[margin : margin + nx, margin : margin + ny])
 
 
-def _mean_of_turns(x: Array, w: dict[str, Array]) -> Array:
+def _mean_of_turns(x: Array, network: Run) -> Array:
     """(nx, ny, 5) mean probability over (11, nx, ny) evidence turned by quarters."""
-    turned = (softmax(np.moveaxis(forward(np.rot90(x, k, (1, 2)), w), 0, -1)) for k in range(4))
-    mean: Array = np.mean([np.rot90(probability, -k) for k, probability in enumerate(turned)], axis=0)
-    return mean
+    turned = (forward(np.rot90(x, k, (1, 2)), network) for k in range(4))
+    mean: Array = np.mean([np.rot90(probability, -k, (1, 2)) for k, probability in enumerate(turned)], axis=0)
+    return np.moveaxis(mean, 0, -1)
 
 
 def _separate_parts(known: Array) -> list[tuple[tuple[slice, slice], Array]] | None:
@@ -123,47 +133,25 @@ def without_furniture(plan: StoreyPlan, probability: Array) -> StoreyPlan:
     return replace(plan, wall=plan.wall & ~furniture, inside=plan.inside | furniture)
 
 
-def forward(x: Array, w: dict[str, Array]) -> Array:
-    """(5, nx, ny) float32 scores from (11, nx, ny) evidence; both sides are multiples of 16."""
-    skips = [x]
-    for name in DOWN_LEVELS:
-        x = convolution(x, w[f"{name}1.w"], w[f"{name}1.b"], 2)
-        x = convolution(x, w[f"{name}2.w"], w[f"{name}2.b"])
-        skips.append(x)
-    x = skips.pop()
-    for name in UP_LEVELS:
-        x = convolution(_beside(x, skips.pop()), w[f"{name}1.w"], w[f"{name}1.b"])
-    scores: Array = np.tensordot(w["out.w"], x, (0, 0)) + w["out.b"][:, None, None]
-    return scores
+def forward(x: Array, network: Run) -> Array:
+    """Compute (5, nx, ny) float32 probabilities from (11, nx, ny) evidence; both sides are multiples of 16."""
+    (probability,) = network(evidence=x[None])
+    return np.asarray(probability[0])
 
 
-def _beside(coarse: Array, fine: Array) -> Array:
-    """(c + d, nx, ny) of coarse (c, nx / 2, ny / 2), each element four times, and fine (d, nx, ny)."""
-    channels, nx, ny = coarse.shape
-    out = np.empty((channels + len(fine), *fine.shape[1:]), np.float32)
-    out[:channels].reshape(channels, nx, 2, ny, 2)[:] = coarse[:, :, None, :, None]
-    out[channels:] = fine
-    return out
-
-
-def weights(raised: bool = False) -> dict[str, Array]:
-    """The weights that ship, or those in their place (`io.weight_files`).
+def weights(raised: bool = False) -> Network:
+    """Load the network that ships, or the one in its place (`io.weight_files`).
 
     Args:
-        raised: those for robots' grids and drawings, whose walls were all raised alike.
+        raised: that of robots' grids and drawings, whose walls were all raised alike.
     """
-    return read_weights(weights_file("topomerge.extraction.plans", GRID_NETWORK_FILE if raised else PLAN_NETWORK_FILE))
+    return load_shipped_network(GRID_NETWORK_FILE if raised else PLAN_NETWORK_FILE, PLAN_SIGNATURE)
 
 
-@lru_cache(maxsize=4)
-def read_weights(path: Path) -> dict[str, Array]:
-    """Weights as float32 by their names.
+def read_weights(path: Path) -> Network:
+    """Load the network of a file.
 
     Raises:
         InputError: not the network that this version knows, or damaged.
     """
-    names = [f"{n}{k}" for n in DOWN_LEVELS for k in (1, 2)] + [f"{n}1" for n in UP_LEVELS]
-    layers = read_layers(path, "plans", dict.fromkeys(names, 9) | {"out": 1})
-    if layers["a1.w"].shape[0] != 9 * EVIDENCE_CHANNELS or layers["out.w"].shape[1] != len(COLUMN_CLASSES):
-        raise InputError(f"{path}: was trained with other inputs or outputs; install topomerge again")
-    return layers
+    return load_network(path, PLAN_SIGNATURE)

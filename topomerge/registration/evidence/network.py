@@ -1,21 +1,18 @@
-"""How much two squares from above speak for one place: a small convolutional network in NumPy (`numpy_nn`), trained on places of
+"""How much two squares from above speak for one place: a small convolutional network, trained on places of
 simulated maps under right and wrong poses (`train.py task=place_evidence`; docs/adr/0015)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from topomerge.errors import InputError
-from topomerge.io.weight_files import read_layers, weights_file
-from topomerge.numpy_nn import convolution, linear, relu
-from topomerge.registration.evidence.crops import CEILINGS, PARTS, Crops
+from topomerge.networks.network import Network, Run, load_network, load_shipped_network
+from topomerge.networks.signature import Signature, Tensor
+from topomerge.registration.evidence.crops import CEILINGS, PARTS, SIDE, Crops
 from topomerge.types import Array
 
-PLACE_NETWORK_FILE = "place_network.npz"
+PLACE_NETWORK_FILE = "place_network.onnx"
 CONVOLUTIONS = {"a": 1, "b": 2, "c": 2}  # layer -> stride
 POOLED = 4  # pixels a side that become one
 SLACK = 2  # pixels: what is that near is not told apart, as bent maps still are that far off
@@ -25,6 +22,18 @@ BITS = {name: 1 << k for k, name in enumerate(PARTS)}
 HEIGHT_PARTS = ("low", "middle", "high")
 PLANES = 22
 UPPER_PLANES = (11, 12, 13, 14, 15, 16, 17, 18)  # high things, what hangs, ceilings
+
+
+PLACE_SIGNATURE = Signature(
+    "Says how much two squares from above speak for one place.",
+    {
+        "planes": Tensor(
+            ("squares", SIDE // POOLED, SIDE // POOLED, PLANES),
+            "what both maps show, what one misses (`planes`); 0.4 m",
+        )
+    },
+    {"log_odds": Tensor(("squares",), "that they are one place, before any prior")},
+)
 
 
 def planes(parts: Array, ceiling: Array, looked: Array) -> Array:
@@ -94,39 +103,26 @@ def _widened(bits: Array) -> Array:
     return bits
 
 
-def place_log_odds(crops: Crops, network: Mapping[str, Array] | None = None) -> Array:
-    """(k,) log odds that the two squares are one place and no look-alike, before any prior; by the weights that ship or
-    others."""
+def place_log_odds(crops: Crops, network: Run | None = None) -> Array:
+    """Compute (k,) log odds that the two squares are one place and no look-alike, before any prior; by the network that ships or
+    another."""
     return network_log_odds(planes(crops.parts, crops.ceiling, crops.looked), weights() if network is None else network)
 
 
-def network_log_odds(seen: Array, w: Mapping[str, Array]) -> Array:
-    """(k,) log odds of planes (k, side, side, PLANES)."""
-    out = np.zeros(len(seen))
-    for i, x in enumerate(np.moveaxis(seen, -1, 1).astype(np.float32)):
-        for name, stride in CONVOLUTIONS.items():
-            x = convolution(x, w[f"{name}.w"], w[f"{name}.b"], stride)
-        pooled = np.concatenate([x.mean(axis=(1, 2)), x.max(axis=(1, 2))])
-        out[i] = linear(relu(linear(pooled, w["f.w"], w["f.b"])), w["out.w"], w["out.b"])[0]
-    return out
+def network_log_odds(seen: Array, network: Run) -> Array:
+    """Compute (k,) log odds of planes (k, side, side, PLANES), one after the other: what else is asked for changes none."""
+    return np.array([network(planes=x[None])[0][0] for x in seen], float)
 
 
-def weights() -> dict[str, Array]:
-    """The weights that ship, or those in their place (`io.weight_files`)."""
-    return read_weights(weights_file("topomerge.registration.evidence", PLACE_NETWORK_FILE))
+def weights() -> Network:
+    """Load the network that ships, or the one in its place (`io.weight_files`)."""
+    return load_shipped_network(PLACE_NETWORK_FILE, PLACE_SIGNATURE)
 
 
-@lru_cache(maxsize=4)
-def read_weights(path: Path) -> dict[str, Array]:
-    """Weights as float32 by their names.
+def read_weights(path: Path) -> Network:
+    """Load the network of a file.
 
     Raises:
         InputError: not the network that this version knows, or damaged.
     """
-    layers = read_layers(path, "places", {**dict.fromkeys(CONVOLUTIONS, 9), "f": 2, "out": 1})
-    wide = PLANES
-    for name in (*CONVOLUTIONS, "f", "out"):
-        if layers[f"{name}.w"].shape[0] != {"f": 2 * wide, "out": wide}.get(name, 9 * wide):
-            raise InputError(f"{path}: is no network of places (layer {name}); install topomerge again")
-        wide = layers[f"{name}.b"].shape[0]
-    return layers
+    return load_network(path, PLACE_SIGNATURE)

@@ -1,0 +1,208 @@
+"""Networks of torch as ONNX files (`topomerge.networks` runs them), and as what the package calls before they are exported."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from topomerge.models.embedder import Embedder
+from torch import Tensor, nn
+
+from topomerge.embedding.network import build_embedder_signature
+from topomerge.errors import InputError
+from topomerge.io.atomic import replacing
+from topomerge.networks.network import Run
+from topomerge.networks.signature import Signature
+from topomerge.types import Array
+
+ONNX_OPSET = 18
+
+
+def export_network(module: nn.Module, signature: Signature, sample: Sequence[Tensor], path: str | Path) -> None:
+    """Write a network; the same weights give the same bytes.
+
+    Args:
+        module: its arguments are the inputs of the signature, in order; it returns the outputs, in order.
+        sample: inputs that the graph is traced with; sizes with names must be 2 or more there.
+
+    Raises:
+        InputError: onnx is not installed, a weight is no finite number, or the path can't be written.
+    """
+    try:
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise InputError("ONNX needs onnx and onnxscript: pip install topomerge[learn]") from error
+    if not all(torch.isfinite(value).all() for value in module.state_dict().values()):
+        raise InputError(f"{path}: weights are no finite numbers; training diverged, take another run")
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(), replacing(path) as beside:
+        warnings.simplefilter("ignore")
+        if isinstance(module, Branches):
+            model = _joined([_traced(branch, signature, sample, 1) for branch in module.branches], next(iter(signature.inputs)))
+        else:
+            model = _traced(module, signature, sample)
+        beside.write_bytes(model.SerializeToString(deterministic=True))
+
+
+def _traced(module: nn.Module, signature: Signature, sample: Sequence[Tensor], start: int = 0) -> Any:
+    """The model of ONNX of a network whose inputs are those of the signature from `start` on."""
+    inputs = dict(list(signature.inputs.items())[start:])
+    shapes = tuple(
+        {axis: torch.export.Dim.DYNAMIC for axis, size in enumerate(tensor.shape) if isinstance(size, str)}
+        for tensor in inputs.values()
+    )
+    program = torch.onnx.export(
+        _Positional(module.eval()), tuple(sample[start:]), dynamo=True, opset_version=ONNX_OPSET, verbose=False, optimize=False,
+        input_names=list(inputs), output_names=list(signature.outputs), dynamic_shapes=(shapes,),
+    )  # fmt: skip
+    assert program is not None
+    model = program.model_proto
+    _strip(model.graph)
+    for function in model.functions:
+        _strip(function)
+    return model
+
+
+def _joined(models: Sequence[Any], choice: str) -> Any:
+    """Join models of the same inputs and outputs: of them runs which an input names by a 1. Weights stand in it once."""
+    from onnx import TensorProto, compose, helper
+
+    weights = {w.name: w for model in models for w in model.graph.initializer}
+    outputs = [output.name for output in models[0].graph.output]
+    branches = []
+    for k, model in enumerate(models):
+        of_branch = compose.add_prefix_graph(model.graph, f"{k}/", rename_inputs=False, rename_initializers=False)
+        del of_branch.input[:], of_branch.initializer[:]
+        branches.append(of_branch)
+    joined = helper.make_model(
+        helper.make_graph([], "branches", list(models[0].graph.input), list(models[0].graph.output), list(weights.values())),
+        opset_imports=models[0].opset_import, ir_version=models[0].ir_version, functions=models[0].functions,
+    )  # fmt: skip
+    joined.graph.input.insert(0, helper.make_tensor_value_info(choice, TensorProto.INT64, [len(models)]))
+    chosen = branches[-1]
+    for k in reversed(range(len(models) - 1)):
+        index = helper.make_tensor(f"index_{k}", TensorProto.INT64, [1], [k])
+        joined.graph.initializer.append(index)
+        names = outputs if k == 0 else [f"from_{k}/{name}" for name in outputs]
+        nodes = [
+            helper.make_node("Gather", [choice, index.name], [f"one_{k}"]),
+            helper.make_node("Cast", [f"one_{k}"], [f"is_{k}"], to=TensorProto.BOOL),
+            helper.make_node("If", [f"is_{k}"], names, then_branch=branches[k], else_branch=chosen),
+        ]
+        values = [helper.make_value_info(name, output.type) for name, output in zip(names, models[0].graph.output, strict=True)]
+        chosen = helper.make_graph(nodes, f"from_{k}", [], values)
+    joined.graph.node.extend(chosen.node)
+    return joined
+
+
+def _strip(graph: Any) -> None:
+    """Remove what tells of the machine: stack traces with paths of files."""
+    del graph.metadata_props[:]
+    for node in (*graph.node, *getattr(graph, "input", ()), *getattr(graph, "output", ()), *getattr(graph, "initializer", ())):
+        if hasattr(node, "metadata_props"):
+            del node.metadata_props[:]
+    del graph.value_info[:]
+
+
+def build_sample(signature: Signature) -> list[Tensor]:
+    """Random inputs of a signature, in which sizes of different names differ."""
+    names = sorted({size for tensor in signature.inputs.values() for size in tensor.shape if isinstance(size, str)})
+    sizes = {name: 5 + 2 * k for k, name in enumerate(names)}
+    shapes = [[sizes[n] if isinstance(n, str) else n for n in t.shape] for t in signature.inputs.values()]
+    dtypes = [getattr(torch, t.dtype) for t in signature.inputs.values()]
+    return [torch.rand(shape).to(dtype) for shape, dtype in zip(shapes, dtypes, strict=True)]
+
+
+def build_embedder_sample(
+    network: Embedder, rooms: int = 6, edges: int = 10, pairs: int = 12, seed: int = 0
+) -> dict[str, Tensor]:
+    """Random tensors of a map, of the shapes that an embedder reads."""
+    generator, sizes = torch.Generator().manual_seed(seed), {"rooms": rooms, "edges": edges, "pairs": pairs}
+    sample = {}
+    for name, tensor in build_embedder_signature(network.network).inputs.items():
+        shape = [sizes[n] if isinstance(n, str) else n for n in tensor.shape]
+        if tensor.dtype == "int64":
+            sample[name] = torch.randint(0, max(rooms if name == "edge_index" else edges, 1), shape, generator=generator)
+        else:
+            values = torch.rand(shape, generator=generator) * 3
+            sample[name] = (80 * values).to(torch.uint8) if tensor.dtype == "uint8" else values
+    return sample
+
+
+def export_embedder(network: Embedder, path: str | Path) -> None:
+    """Write an embedder, as `embedding.network.build_embedder_signature` describes it.
+
+    Raises:
+        InputError: as `export_network`.
+    """
+    sample = list(build_embedder_sample(network).values())
+    export_network(Turned(network), build_embedder_signature(network.network), sample, path)
+
+
+def run_with_torch(module: nn.Module, signature: Signature) -> Run:
+    """A network as `topomerge.networks.Network` would run it: what training is scored with, before anything is exported."""
+
+    @torch.no_grad()
+    def run(outputs: Sequence[str] | None = None, /, **inputs: Array) -> list[Array]:
+        module.eval()
+        device = next(module.parameters()).device
+        # Copies: of a map with one room, views of its table count as contiguous with steps that torch refuses.
+        feeds = (torch.from_numpy(np.array(inputs[n], t.dtype, order="C")).to(device) for n, t in signature.inputs.items())
+        computed = module(*feeds)
+        arrays = [t.cpu().numpy() for t in (computed if isinstance(computed, Sequence) else (computed,))]
+        named = dict(zip(signature.outputs, arrays, strict=True))
+        return list(named.values()) if outputs is None else [named[name] for name in outputs]
+
+    return run
+
+
+def read_weights(path: str | Path) -> dict[str, Tensor]:
+    """The weights of an exported network by their names in the module: what a training goes on with."""
+    import onnx
+
+    model = onnx.load(str(path), load_external_data=False)
+    prefix = "network."
+    arrays = {i.name: onnx.numpy_helper.to_array(i) for i in model.graph.initializer}
+    return {n.removeprefix(prefix): torch.from_numpy(a.copy()) for n, a in arrays.items() if n.startswith(prefix)}
+
+
+class Branches(nn.Module):
+    """Networks of the same inputs and outputs, of which a call runs one: that which its first input, an int64, has a 1 for."""
+
+    def __init__(self, branches: Iterable[nn.Module]) -> None:
+        super().__init__()
+        self.branches = nn.ModuleList(branches)
+
+    def forward(self, choice: Tensor, *inputs: Tensor) -> Sequence[Tensor]:
+        """Run the one."""
+        outputs: Sequence[Tensor] = self.branches[int(choice.argmax())](*inputs)
+        return outputs
+
+
+class Turned(nn.Module):
+    """An embedder on all quarter turns of a map (`Embedder.turned`), with its tensors in order."""
+
+    def __init__(self, network: Embedder) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows and dustbins."""
+        return self.network.turned(dict(zip(self.network.tensors, tensors, strict=True)))
+
+
+class _Positional(nn.Module):
+    """A network whose inputs come as a tuple, whatever their number."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *tensors: Tensor) -> Tensor | Sequence[Tensor]:
+        outputs: Tensor | Sequence[Tensor] = self.network(*tensors)
+        return outputs
