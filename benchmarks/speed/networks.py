@@ -6,7 +6,7 @@ Run from the root: ``python -m benchmarks.speed.networks``. Lines: `name ours pe
 from __future__ import annotations
 
 import numpy as np
-from topomerge.fusion.evidence.network import PLACE_NETWORK_FILE, PLACE_SIGNATURE
+from topomerge.registration.evidence.network import PLACE_NETWORK_FILE, PLACE_SIGNATURE
 from topomerge.models.export import read_weights, run_with_torch
 from topomerge.models.place_network import PlaceLogOdds, PlaceNetwork
 from topomerge.models.plan_unet import PlanProbabilities, PlanUNet

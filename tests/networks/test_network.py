@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topomerge.fusion.evidence.network import PLACE_SIGNATURE
+from topomerge.registration.evidence.network import PLACE_SIGNATURE
 
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.wall_network import WALL_SIGNATURE, place_probabilities
