@@ -19,6 +19,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "room_search": {"rooms": [2000]},
     "networks": {"sides": (64,), "strip": 40, "squares": 2},
     "build_pairs": {"pairs": 2, "rooms": 4},
+    "training": {"batches": (2,), "steps": 1},
     "bags": {"gigabytes": [0.02], "spacing": 0.1},
 }
 

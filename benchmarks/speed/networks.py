@@ -6,7 +6,6 @@ Run from the root: ``python -m benchmarks.speed.networks``. Lines: `name ours pe
 from __future__ import annotations
 
 import numpy as np
-from topomerge.registration.evidence.network import PLACE_NETWORK_FILE, PLACE_SIGNATURE
 from topomerge.models.export import read_weights, run_with_torch
 from topomerge.models.place_network import PlaceLogOdds, PlaceNetwork
 from topomerge.models.plan_unet import PlanProbabilities, PlanUNet
@@ -16,6 +15,7 @@ from benchmarks.speed.bench import best, line
 from topomerge.extraction.elevations.wall_network import WALL_NETWORK_FILE, WALL_SIGNATURE
 from topomerge.extraction.plans.plan_network import PLAN_NETWORK_FILE, PLAN_SIGNATURE
 from topomerge.networks.network import load_shipped_network
+from topomerge.registration.evidence.network import PLACE_NETWORK_FILE, PLACE_SIGNATURE
 
 AGREE = 1e-5
 MODULES = {

@@ -1,22 +1,27 @@
 """How fast the embedder trains: rooms a second, share of the time that goes into making batches, and how busy the card is.
 
-``python -m benchmarks.speed.training MANIFEST --accelerator cuda --batch 32 128`` trains the network that ships on a set of pairs
+``python -m benchmarks.speed.training MANIFEST --accelerator cuda --batches 32 128`` trains the network that ships on a set of pairs
 (`topomerge.datasets.pairs.build`), for some steps, with batches made on the host and on the device.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import statistics
 import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from topomerge.datasets.pairs.build import Build, build
 from topomerge.models.embedder import Embedder
 
+from topomerge.config import compose
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.training.embedding import EmbeddingJob, start_fabric
 from topomerge.training.loop import State
@@ -87,29 +92,44 @@ def synchronize(device: torch.device) -> None:
         torch.cuda.synchronize()
 
 
-def main() -> None:
-    """Measure."""
+def main(
+    manifest: str = "", accelerator: str = "cpu", batches: Sequence[int] = (32, 128), steps: int = 20, threads: int = 1
+) -> None:
+    """Measure.
+
+    Args:
+        manifest: of a set of pairs; empty: four small procedural ones are made.
+        batches: pairs a step.
+        threads: that make batches on the host.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(manifest) if manifest else build_small_set(Path(folder))
+        pairs = load_pairs(path, ["sheet"], around=SURROUNDINGS.node.around)
+    print(f"{len(pairs)} pairs, {sum(len(t) for p in pairs for t in p.true) / len(pairs):.1f} rooms each")
+    for batch, where in itertools.product(batches, ("host", "device")):
+        common = {"accelerator": accelerator, "threads": threads, "network": SURROUNDINGS}
+        settings = Training(**common, batch=batch, batches=where, epochs=1)
+        repeated = list(pairs) * ((WARM_UP + steps) * batch // len(pairs) + 1)
+        print(measure_training(repeated, settings, steps), flush=True)
+
+
+def build_small_set(folder: Path) -> Path:
+    """Build four procedural pairs and return their manifest."""
+    words = ["data=procedural", "data.pairs=4", "data.rooms=[4,5]", f"cache={folder}", "jobs=1"]
+    build(compose("build", Build, words), lambda text: None)
+    return folder / "procedural.jsonl"
+
+
+def parse_words(words: Sequence[str]) -> dict[str, Any]:
+    """Return the arguments of `main`."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed.training", description=__doc__)
-    parser.add_argument("manifest", type=Path)
+    parser.add_argument("manifest", nargs="?", default="")
     parser.add_argument("--accelerator", default="cpu")
-    parser.add_argument("--precision", default="auto")
-    parser.add_argument("--batch", nargs="+", type=int, default=[32])
-    parser.add_argument("--batches", nargs="+", default=["host", "device"])
+    parser.add_argument("--batches", nargs="+", type=int, default=[32, 128], metavar="PAIRS")
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--threads", type=int, default=1)
-    args = parser.parse_args()
-    pairs = load_pairs(args.manifest, ["sheet"], print, around=SURROUNDINGS.node.around)
-    print(f"{len(pairs)} pairs, {sum(len(t) for p in pairs for t in p.true) / len(pairs):.1f} rooms each")
-    for batch in args.batch:
-        for where in args.batches:
-            settings = Training(
-                accelerator=args.accelerator, precision=args.precision, threads=args.threads, network=SURROUNDINGS, batch=batch,
-                batches=where,
-            )  # fmt: skip
-            needed = (WARM_UP + args.steps) * batch
-            repeated = list(pairs) * (needed // len(pairs) + 1)
-            print(measure_training(repeated, replace(settings, epochs=1), args.steps), flush=True)
+    return vars(parser.parse_args(words))
 
 
 if __name__ == "__main__":
-    main()
+    main(**parse_words(sys.argv[1:]))

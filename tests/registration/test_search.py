@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from topomerge.matching.plan_fields import direction_profile
+from topomerge.matching.plan_fields import DIRECTION_STEP, direction_profile
 from topomerge.matching.poses import PoseHypothesis
 from topomerge.matching.refinement import storeys_at
 from topomerge.registration.search import SEARCH, height_offsets, scale_candidates, strongest
@@ -61,7 +61,8 @@ def walls_of(corridors: tuple[float, ...], rows: tuple[float, ...], scale: float
     parts += [np.column_stack([along, np.full(len(along), y)]) for y in rows]
     c, s = np.cos(turn), np.sin(turn)
     walls = np.concatenate(parts) @ np.array([[c, s], [-s, c]]) * scale
-    return SimpleNamespace(walls=walls, profile=direction_profile(walls, 0.1))
+    profile = direction_profile(walls, 0.1)
+    return SimpleNamespace(walls=walls, profile=profile, main_direction=np.radians(profile.argmax() * DIRECTION_STEP))
 
 
 @pytest.mark.parametrize("scale", [0.62, 1.0, 1.7])
