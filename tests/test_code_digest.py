@@ -58,7 +58,7 @@ def test_comments_docstrings_and_layout_keep_the_digest(before, after):
         (EXTRACT, "networks/wall_network.onnx"),
         ("topomerge.matching.match", "networks/room_matcher.onnx"),
         ("topomerge.matching.match", "networks/room_matcher.card.json"),
-        ("topomerge.fusion.merge", "networks/place_network.onnx"),
+        ("topomerge.fusion.pipeline", "networks/place_network.onnx"),
         (EXTRACT, "extraction/elevations/wall_doors.json"),
         (EXTRACT, "extraction/passages.json"),
         (EXTRACT, "extraction/room_odds.json"),

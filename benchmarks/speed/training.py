@@ -1,7 +1,7 @@
 """How fast the embedder trains: rooms a second, share of the time that goes into making batches, and how busy the card is.
 
-``python -m benchmarks.speed.training MANIFEST --accelerator cuda --batches 32 128`` trains the network that ships on a set of pairs
-(`topomerge.datasets.pairs.build`), for some steps, with batches made on the host and on the device.
+``python -m benchmarks.speed.training MANIFEST --accelerator cuda --batches 32 128`` trains the network that ships for some steps
+on a set of pairs (`topomerge.datasets.pairs.build`), with batches made on the host and on the device.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.io import archive
 from topomerge.types import Array
 
-PASSAGE_FORMAT = "passages 1"  # raise it when the same item gives other bytes: it is part of the files' names
+PASSAGE_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
 MAP_CELL = 0.1  # m
 PURE = 0.7  # share of a segment in its true room; segments between rooms are no example
 

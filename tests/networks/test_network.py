@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from topomerge.registration.evidence.network import PLACE_SIGNATURE
 
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.wall_network import WALL_SIGNATURE, place_probabilities
@@ -20,6 +19,7 @@ from topomerge.extraction.plans.plan_network import GRID_NETWORK_FILE, PLAN_NETW
 from topomerge.io.weight_files import weights_file
 from topomerge.networks.network import WEIGHTS_PACKAGE, load_network, load_shipped_network, read_card
 from topomerge.networks.signature import Signature, Tensor
+from topomerge.registration.evidence.network import PLACE_SIGNATURE
 from topomerge.training.tasks import TASKS
 from topomerge.types import Array
 

@@ -32,6 +32,7 @@ from topomerge.extraction.plans.plan_network import column_probabilities, weight
 from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.extraction.plans.upper_sides import without_upper_sides
 from topomerge.extraction.scan import Scan
+from topomerge.extraction.slices import is_raised
 from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import Array, VoxelGrid
@@ -125,10 +126,11 @@ def rasterise_storeys(scan: Scan, navigable: VoxelGrid, standing_height: float) 
     factor = max(round(PLAN_CELL / grid.edge), 1)
     coarse, floor, of_coarse = _coarsen(grid, navigable, storey, factor)
     numbers = [k for k in range(len(storeys)) if (of_coarse == k).any() and not _is_upper_side(storeys[k], storeys[:k])]
+    raised = not scan.flat and is_raised(grid)  # with a floor that was assumed, a scan of the upper half of rooms is none
     plans, probabilities = [], []
     for k in numbers:
         plan = storey_plan(coarse, floor, of_coarse, k, scan.crossed)
-        probability = column_probabilities(plan, weights(scan.raised))
+        probability = column_probabilities(plan, weights(raised))
         plans.append(without_furniture(plan, probability))
         probabilities.append(probability)
     return RasterisedStoreys(coarse, storeys, storey, factor, tuple(numbers), tuple(plans), tuple(probabilities))
