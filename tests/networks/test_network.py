@@ -171,7 +171,7 @@ def test_inputs_that_the_graph_can_not_take_are_an_error_of_one_line_and_nothing
 
 def test_importing_the_library_does_not_import_the_runtime() -> None:
     code = (
-        "import sys, topomerge, topomerge.extraction.extract, topomerge.fusion.merge, topomerge.matching.match\n"
+        "import sys, topomerge, topomerge.extraction.extract, topomerge.fusion.pipeline, topomerge.matching.match\n"
         "print([m for m in ('onnxruntime', 'onnx', 'torch') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -33,7 +33,7 @@ from topomerge.registration.verify import model
 from topomerge.types import Array
 
 WALLS_ALONE = "walls alone"  # way of merging
-CODE = tuple(f"topomerge.{name}" for name in ("embedding.embedders", "matching.costs", "matching.match", "fusion.merge"))
+CODE = tuple(f"topomerge.{name}" for name in ("embedding.embedders", "matching.costs", "matching.match", "fusion.pipeline"))
 
 
 def predict(path: Path, target: Path, settings: Evaluation) -> str:
