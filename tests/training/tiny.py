@@ -48,17 +48,12 @@ def plan_files(folder: Path, count: int) -> list[Path]:
 
 
 def wall_files(folder: Path, count: int) -> list[Path]:
-    """Files of scans of two rooms, the wall between them with an open door and a shut one, 0.1 m farther along in each; every
-    third one has no colours."""
+    """Files of scans of two rooms, the wall between them with an open door and a shut one, 0.1 m farther along in each."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for k in range(count):
         map, faces, strips, truth, doors = two_doors(2 * k)
-        colours = np.zeros((len(truth), BANDS, 4), np.float16)
-        colours[..., 0], colours[truth == 2, :10, 1:] = 1, (-0.5, 0.4, 0.3)
-        example = WallExample(
-            np.array([0, len(truth)]), strips, truth, doors, map, (), faces, "tls/procedural", colours if k % 3 else None
-        )
+        example = WallExample(np.array([0, len(truth)]), strips, truth, doors, map, (), faces, "tls/procedural")
         path = folder / f"{k}.npz"
         archive.write(wall_arrays(WallItem(k, "procedural", 0, "", ""), example), path)
         paths.append(path)

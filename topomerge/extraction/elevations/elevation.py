@@ -27,9 +27,6 @@ FREE_ALONG, FREE_ACROSS = 2, 4  # elements that share an answer: cells that rays
 STRIP_CHANNELS = BANDS + 1 + len(FREE_HEIGHTS)  # and where one can walk, and where rays went
 FULL = 0.75  # of the cells of a flat surface that make an element full
 SIDE_REACH = (0.15, 0.6)  # m from a face: where its room's floor lies
-SURFACE = (-0.1, 0.3)  # m from a face: what has a colour there is of the wall, or of a leaf in it
-LEAST_SHADE = 0.25  # points
-DARKEST, HUE_STEP, MOST_CONTRAST = 15.0, 64.0, 2.0  # of 255; of a difference of 1
 # Of a place along a wall: a door that stands open, is shut, a window, a door that stands half open, a recess, and what stands
 # before the wall; "wall" where there is none, too.
 WALL_CLASSES = ("wall", "open", "shut", "window", "half", "niche", "cupboard")
@@ -56,14 +53,11 @@ class Elevations:
         strips: (n, 32, 17) float32 0..1 of each place along all strips: how full its elements are across the wall, from before it
             to behind it, in each band of heights; then where one can walk, and where rays went at three heights (0 everywhere
             where the sensor's places are unknown).
-        colours: (n, 13, 4) float32 in each band of heights: was its colour seen (0 or 1), and by how much it is lighter, redder
-            and yellower than most of its wall; None of a scan without colours.
     """
 
     faces: Array
     first: Array
     strips: Array
-    colours: Array | None = None
 
 
 def unroll(faces: Array, navigable: VoxelGrid, cells: VoxelGrid, crossed: VoxelGrid | None = None) -> Elevations:
@@ -111,27 +105,6 @@ def crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array) -> Arr
             went += crossed.contains(crossed.locate(at.reshape(-1, 3))).reshape(went.shape) / np.float32(len(heights))
         out[..., k] = went.repeat(FREE_ALONG, axis=0).repeat(FREE_ACROSS, axis=1)
     return out
-
-
-def strip_colours(walls: Elevations, points: Array, colours: Array) -> Array:
-    """(n, 13, 4) float32 `Elevations.colours`, of points (k, 3) m and their colours (k, 3) uint8.
-
-    Lightness is compared as a ratio, so that neither light nor the unit of an intensity matters; hues as differences.
-    """
-    faces, sizes = walls.faces, np.diff(walls.first)
-    frames = np.column_stack([faces["start"] + SURFACE[0] * faces["out"], faces["along"], faces["out"], faces["floor"] + LOWEST])
-    step, values = np.array([ALONG, SURFACE[1] - SURFACE[0], UPWARDS]), np.column_stack([np.ones(len(points)), colours])
-    sums = fill_strips(np.asarray(points, float), frames, sizes, (1, BANDS), step, TILE, values.astype(float))[:, 0].astype(float)
-    seen = sums[..., 0] > LEAST_SHADE
-    red, green, blue = (sums[..., k] / np.maximum(sums[..., 0], LEAST_SHADE) for k in (1, 2, 3))
-    light = np.log((red + green + blue) / 3 + DARKEST)
-    out = np.stack([seen, light, (red - green) / HUE_STEP, ((red + green) / 2 - blue) / HUE_STEP], axis=-1)
-    for low, high in zip(walls.first[:-1], walls.first[1:], strict=True):
-        strip, there = out[low:high], seen[low:high]
-        if there.any():
-            strip[..., 1:] -= np.median(strip[there][:, 1:], axis=0)
-    out[~seen] = 0
-    return np.asarray(np.clip(out, -MOST_CONTRAST, MOST_CONTRAST), np.float32)
 
 
 def face_rows(room: int, lines: Sequence[Line], floor: Array, level: float) -> list[tuple[object, ...]]:

@@ -1,4 +1,4 @@
-"""Stretches of walls that show one thing, a window or a fixture: where they begin and end, and whether two show the same one."""
+"""Stretches of walls that show one thing, a window for example: where they begin and end, and whether two show the same one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHARED_WIDTH = 0.5  # share of the narrower of two that lies in the other one, f
 SAME_WALL, STRETCH_LEVEL = 0.6, 0.75  # m across and in height, to be in one wall
 SIDES = (0.3, 1.0)  # m from a stretch: where its rooms have their floors, which reach a little into walls
 BESIDE = 5  # places beside a stretch that show how full its wall is, and where it stands
-BESIDE_BANDS, ABOVE_BANDS = slice(5, 12), slice(11, 13)  # in which walls show beside windows and fixtures, and above most
+BESIDE_BANDS, ABOVE_BANDS = slice(5, 12), slice(11, 13)  # in which walls show beside windows, and above most
 LEAST_FILL = 0.15  # of the elements of a surface: in emptier ones nothing shows where it begins or ends
 
 
