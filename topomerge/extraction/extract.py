@@ -140,7 +140,7 @@ def gather_evidence(
     walls = unroll_walls(scan, navigable, rasters, storeys) if p.walls else None
     if walls is not None:
         storeys, walls = split_at_doorways(storeys, walls)
-    return Evidence(rasters, find_passages(storeys, walls, places, p.walls and not parts), walls)
+    return Evidence(rasters, find_passages(storeys, walls, p.walls and not parts), walls)
 
 
 def cut_rooms(

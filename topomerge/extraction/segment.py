@@ -201,14 +201,8 @@ def split_segments(storey: SegmentedStorey, doorways: Array) -> SegmentedStorey:
     return replace(storey, segment=segment, passages=passages, split=frozenset(pairs))
 
 
-def find_segments(
-    storeys: Sequence[SegmentedStorey], places: Array, up: tuple[float, float] = (-SAME_LEVEL, SAME_LEVEL)
-) -> Array:
-    """(n,) int64 segment under each place (n, 3) m, numbered on from storey to storey, -1 none.
-
-    Args:
-        up: m, between which a place lies above the floor.
-    """
+def find_segments(storeys: Sequence[SegmentedStorey], places: Array) -> Array:
+    """Find the (n,) int64 segment on whose floor each place (n, 3) m lies, numbered on from storey to storey, -1 none."""
     out, nearest = np.full(len(places), -1, np.int64), np.full(len(places), np.inf)
     first = 0
     for storey in storeys:
@@ -217,7 +211,7 @@ def find_segments(
         inside = np.flatnonzero(((at >= 0) & (at < plan.wall.shape)).all(axis=1))
         column = tuple(at[inside].T)
         above = places[inside, 2] - plan.floor[column]
-        own = (above > up[0]) & (above < up[1]) & (np.abs(above) < nearest[inside])
+        own = (np.abs(above) < SAME_LEVEL) & (np.abs(above) < nearest[inside])
         here = storey.segment[column]
         nearest[inside[own]] = np.abs(above[own])
         out[inside[own]] = np.where(here[own] >= 0, here[own] + first, -1)

@@ -2,8 +2,8 @@
 
 Spaces, floors, ceilings and walls are extruded polygons. An IfcOpeningElement voids the wall that carries a door or a window,
 and the door or the window, a box, fills it. An opening without a door is an IfcVirtualElement, stairs and ramps are a plate
-from their lower to their upper end. IfcRelSpaceBoundary says which spaces a door joins. The site is placed where the map lies, so that all else has small coordinates. Source: ISO 16739-1, IFC4
-ADD2 TC1.
+from their lower to their upper end. IfcRelSpaceBoundary says which spaces a door joins. The site is placed where the map lies,
+so that all else has small coordinates. Source: ISO 16739-1, IFC4 ADD2 TC1.
 """
 
 from __future__ import annotations
