@@ -1,4 +1,4 @@
-"""The network of elevations in torch (`extraction.elevations.wall_network` runs it in NumPy).
+"""The network of elevations in torch (`extraction.elevations.elevation` runs it in NumPy).
 
 Its batch normalisation goes into the weights when they are exported.
 """
@@ -11,8 +11,7 @@ import torch
 from topomerge.models.plan_unet import folded
 from torch import Tensor, nn
 
-from topomerge.extraction.elevations.elevation import DEPTHS, STRIP_CHANNELS, WALL_CLASSES
-from topomerge.extraction.elevations.wall_network import ALONG_LAYERS, DILATIONS, PLACES, TAPS
+from topomerge.extraction.elevations.elevation import ALONG_LAYERS, DEPTHS, DILATIONS, PLACES, STRIP_CHANNELS, TAPS, WALL_CLASSES
 from topomerge.types import Array
 
 

@@ -22,8 +22,7 @@ from topomerge.datasets.plans import splits
 from topomerge.datasets.simulation.scanner import moved
 
 from topomerge.errors import InputError
-from topomerge.extraction.free_space import with_crossed_cells
-from topomerge.extraction.navigable import navigable_volume
+from topomerge.extraction.navigable import navigable_volume, with_crossed_cells
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.plan import columns_of, profile_bands, storey_plan
 from topomerge.extraction.plans.storey_plan import StoreyPlan

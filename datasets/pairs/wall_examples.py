@@ -35,10 +35,10 @@ from topomerge.datasets.simulation.spoils import drift_between, exact_sensor
 from topomerge.datasets.simulation.walk import part
 
 from topomerge.errors import InputError
-from topomerge.extraction.classified_storey import ClassifiedStorey
 from topomerge.extraction.elevations.elevation import DEPTHS, FACE_DTYPE, STRIP_CHANNELS, Elevations
 from topomerge.extraction.extract import cut_rooms, read_navigable
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
+from topomerge.extraction.plans.storey_plan import ClassifiedStorey
 from topomerge.extraction.scan import FINE_CELL
 from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.topology import topometric_map

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.extraction.classified_storey import COLUMN_CLASSES, ClassifiedStorey
 from topomerge.extraction.partition import partition_rooms
 from topomerge.extraction.plans.passages import Pair, Passage
 from topomerge.extraction.plans.plan import profile_bands
-from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, ClassifiedStorey, StoreyPlan
 from topomerge.extraction.segment import Scorer, SegmentedStorey
 from topomerge.types import Array
 

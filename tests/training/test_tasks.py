@@ -18,6 +18,7 @@ import pytest
 from tests.training import tiny
 from topomerge.embedding.engineered import scaled
 from topomerge.errors import InputError
+from topomerge.extraction.elevations.elevation import place_probabilities
 from topomerge.extraction.elevations.wall_doors import (
     SOURCES,
     WALL_DOOR_FEATURES,
@@ -25,9 +26,8 @@ from topomerge.extraction.elevations.wall_doors import (
     DoorCandidates,
     door_chance,
 )
-from topomerge.extraction.elevations.wall_network import place_probabilities
 from topomerge.extraction.passages import choose_scorer
-from topomerge.extraction.plans.door_classifier import door_probability
+from topomerge.extraction.plans.passages import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
 from topomerge.extraction.plans.plan_network import weights as plan_weights
 from topomerge.extraction.room_odds import room_weights

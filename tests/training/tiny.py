@@ -21,7 +21,7 @@ from topomerge.extraction.passages import EVIDENCE
 from topomerge.extraction.plans.passages import Passage
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.extraction.room_features import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
+from topomerge.extraction.room_odds import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
 from topomerge.fusion.match_belief import BELIEVED_METHODS
 from topomerge.io import archive
 from topomerge.matching.odds import hypothesis_features

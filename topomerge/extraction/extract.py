@@ -9,9 +9,7 @@ from typing import Any
 from topomerge.blas import one_blas_thread
 from topomerge.extraction.attributes import estimate_attributes
 from topomerge.extraction.elevations.doorways import StoreyWalls
-from topomerge.extraction.floor import Floor
-from topomerge.extraction.free_space import free_space, with_crossed_cells
-from topomerge.extraction.navigable import navigable_volume
+from topomerge.extraction.navigable import free_space, navigable_volume, with_crossed_cells
 from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, chosen_parameters
 from topomerge.extraction.partition import (
     FLAT_LEAST_AREA,
@@ -24,6 +22,7 @@ from topomerge.extraction.partition import (
 from topomerge.extraction.passages import choose_scorer, find_passages
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.plans.storey_floor import floor_of_storeys
+from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.scan import Scan, read_scan
 from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, rasterise_storeys, segment_storey
 from topomerge.extraction.slices import is_slice, with_raised_slice

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.extraction.classified_storey import ClassifiedStorey
 from topomerge.extraction.plans.passages import Pair, pair_of
-from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.storey_plan import ClassifiedStorey, StoreyPlan
 from topomerge.extraction.segment import GrowingRooms, Scorer, SegmentedStorey
 from topomerge.types import Array
 

@@ -15,8 +15,7 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.doorways import StoreyWalls
 from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, door_candidates
-from topomerge.extraction.plans.door_classifier import door_probability
-from topomerge.extraction.plans.passages import Pair, Passage, door_features, pair_of
+from topomerge.extraction.plans.passages import Pair, Passage, door_features, door_probability, pair_of
 from topomerge.extraction.segment import Scorer, SegmentedStorey, log_odds, score_by_plan
 from topomerge.io.weight_files import read_weights_json
 from topomerge.numpy_nn import sigmoid

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.extraction.lattice_cells import LatticeCells
+from topomerge.extraction.cleaning import COARSEST_CELL, without_gaps
 from topomerge.extraction.levelling import LevelledChunks
-from topomerge.extraction.sparsity import COARSEST_CELL, without_gaps
-from topomerge.extraction.voxels import voxelise
+from topomerge.extraction.voxels import LatticeCells, voxelise
 from topomerge.types import Array, PointCloud, VoxelGrid
 
 FINEST_CELL = 0.02  # m

@@ -12,27 +12,24 @@ from heapq import heappop, heappush
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.ceilings import NOWHERE
-from topomerge.extraction.classified_storey import ClassifiedStorey
 from topomerge.extraction.completeness import outline_seen
-from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.part_rooms import PartRooms, door_log_odds, laid_rooms, parted_columns
 from topomerge.extraction.plans.passages import (
     Pair,
     Passage,
     clearance_of,
     door_features,
+    door_probability,
     find_passages,
     joined,
     pair_of,
     regions_of,
 )
-from topomerge.extraction.plans.plan import columns_of, storey_plan
+from topomerge.extraction.plans.plan import columns_of, storey_plan, without_upper_sides
 from topomerge.extraction.plans.plan_network import column_probabilities, weights, without_furniture
-from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.extraction.plans.upper_sides import without_upper_sides
+from topomerge.extraction.plans.storey_plan import ClassifiedStorey, StoreyPlan
 from topomerge.extraction.scan import Scan
-from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
+from topomerge.extraction.storeys import NOWHERE, find_storeys, floor_to_ceiling
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import Array, VoxelGrid
 

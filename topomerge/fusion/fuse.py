@@ -17,9 +17,9 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.cell_means import with_means
+from topomerge.extraction.attributes import rooms_at
+from topomerge.extraction.cleaning import with_means
 from topomerge.extraction.convolution import convolve, moore
-from topomerge.extraction.distinct_doors import rooms_at
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.part_rooms import PartRooms

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topomerge.extraction.distinct_doors import LEVEL_KINDS, distinct_doors, rooms_at
+from topomerge.extraction.attributes import LEVEL_KINDS, distinct_doors, rooms_at
 from topomerge.extraction.elevations.windows import in_map, same_windows
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, Array, Placement, TopometricMap

@@ -20,8 +20,8 @@ from topomerge.datasets.pairs.plan_examples import PlanExample, PlanRecipe, buil
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 from topomerge.datasets.pairs.scan_items import FLAT_SENSOR_SHARES
 from topomerge.errors import InputError
-from topomerge.extraction.classified_storey import COLUMN_CLASSES
 from topomerge.extraction.plans.plan_network import column_probabilities, evidence, read_weights
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES
 from topomerge.io import archive
 from topomerge.models.plan_unet import PlanUNet, exported_weights
 from topomerge.training.grid_noise import with_grid_noise

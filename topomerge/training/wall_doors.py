@@ -18,8 +18,7 @@ from sklearn.linear_model import LogisticRegression
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import build_walls, load_walls
 from topomerge.errors import InputError
-from topomerge.extraction.classified_storey import ClassifiedStorey
-from topomerge.extraction.distinct_doors import LEVEL_KINDS, rooms_at
+from topomerge.extraction.attributes import LEVEL_KINDS, rooms_at
 from topomerge.extraction.elevations.doorways import StoreyWalls, door_places, place_classes
 from topomerge.extraction.elevations.elevation import Elevations
 from topomerge.extraction.elevations.wall_doors import (
@@ -30,6 +29,7 @@ from topomerge.extraction.elevations.wall_doors import (
     door_candidates,
     door_chance,
 )
+from topomerge.extraction.plans.storey_plan import ClassifiedStorey
 from topomerge.extraction.walls import find_doorways
 from topomerge.io.weight_files import read_weights_json
 from topomerge.metrics import match_places

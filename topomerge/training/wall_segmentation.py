@@ -1,4 +1,4 @@
-"""Task `wall_segmentation`: the network that says what is in each place along a wall (`extraction.elevations.wall_network`).
+"""Task `wall_segmentation`: the network that says what is in each place along a wall (`extraction.elevations.elevation`).
 
 Stretches of the walls of simulated scans, mirrored, seen from a little nearer or farther, with points taken away now and then.
 Every n-th scan is watched.
@@ -16,8 +16,15 @@ from torch.nn import functional
 
 from topomerge.datasets.pairs.wall_examples import WallExample, build_walls, load_walls
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, STRIP_CHANNELS, WALL_CLASSES
-from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities, read_network
+from topomerge.extraction.elevations.elevation import (
+    BANDS,
+    DEPTHS,
+    PLACES,
+    STRIP_CHANNELS,
+    WALL_CLASSES,
+    place_probabilities,
+    read_network,
+)
 from topomerge.io import archive
 from topomerge.models.wall_network import WallNetwork, exported_network
 from topomerge.training.loop import Say, State, mixed

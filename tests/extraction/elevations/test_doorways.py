@@ -18,9 +18,8 @@ from topomerge.extraction.elevations.doorways import (
     joined_openings,
     read_both_ways,
 )
-from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations
+from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations, read_network
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_chance
-from topomerge.extraction.elevations.wall_network import read_network
 from topomerge.training.wall_doors import candidates_of_map
 from topomerge.types import Sim3, door_state
 

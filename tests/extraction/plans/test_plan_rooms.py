@@ -7,13 +7,20 @@ import pytest
 
 from tests import scenes
 from tests.extraction.segments import rooms_of_segments
-from topomerge.extraction.assumed_floor import has_floor
 from topomerge.extraction.extract import extract
+from topomerge.extraction.floors import has_floor
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
 from topomerge.extraction.partition import FLAT_LEAST_AREA, ROOM_LEAST_AREA
-from topomerge.extraction.plans.door_classifier import door_probability
-from topomerge.extraction.plans.passages import DOOR_FEATURES, Passage, clearance_of, door_features, find_passages, regions_of
+from topomerge.extraction.plans.passages import (
+    DOOR_FEATURES,
+    Passage,
+    clearance_of,
+    door_features,
+    door_probability,
+    find_passages,
+    regions_of,
+)
 from topomerge.extraction.plans.plan import _box_around, storey_plan
 from topomerge.extraction.plans.plan_network import COARSEST_STRIDE, column_probabilities
 from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, joined_floor

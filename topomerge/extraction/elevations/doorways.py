@@ -12,8 +12,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse.csgraph import connected_components
 
-from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, WALL_CLASSES, Elevations
-from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities
+from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, PLACES, WALL_CLASSES, Elevations, place_probabilities
 from topomerge.types import Array
 
 DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of a doorway, and of one of them

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
-from topomerge.extraction.doors import DOOR_MOST_WIDTH
 from topomerge.extraction.elevations.doorways import STRAIGHT, StoreyWalls, joined_openings
-from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
-from topomerge.extraction.elevations.wall_network import PLACES
+from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, PLACES, Elevations
+from topomerge.extraction.plans.storey_plan import PLAN_SIGNS, ClassifiedStorey, plan_signs
+from topomerge.extraction.topology import DOOR_MOST_WIDTH
 from topomerge.io.weight_files import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap

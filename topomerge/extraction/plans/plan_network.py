@@ -16,8 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.classified_storey import COLUMN_CLASSES, INSIDE_CLASS
-from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, INSIDE_CLASS, StoreyPlan
 from topomerge.io.weight_files import read_layers, weights_file
 from topomerge.numpy_nn import convolution, softmax
 from topomerge.types import Array
