@@ -51,7 +51,7 @@ class PassageExamples:
     Args:
         features: (n, 17) `DOOR_FEATURES`.
         plan: (n,) log odds of a door by the plan alone.
-        evidence: (n, 2) `EVIDENCE`.
+        evidence: (n, 3) `EVIDENCE`.
         parted: (n,) bool, do they part two true rooms?
         kind: "walls", or "" of a scan that shows none at heights (`passages.choose_scorer`).
     """

@@ -99,7 +99,7 @@ def test_doorways_that_walls_show_raise_the_score() -> None:
         choose_scorer(True),
         np.tile(np.array([0.8, 0.4, 0.3, 0.5, 1, 1, 0.2, 0.3, 1, 1, 0, 1, 1, 0.8, 0.9, 2, 3.0]), (4, 1)),
     )
-    rows = [(0.0, 0), (1.0, 0), (3.0, 0), (0.0, 1)]
+    rows = [(0.0, 0, 0), (1.0, 0, 0), (3.0, 0, 0), (0.0, 1, 0)]
     none, shown, surely, within = score(x, [replace(PASSAGE, evidence=row) for row in rows]).tolist()
     assert none < shown < surely and none < within
 

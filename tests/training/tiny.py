@@ -240,7 +240,7 @@ def passage_scans(count: int) -> list[PassageExamples]:
     scans = []
     for k in range(count):
         rng = np.random.default_rng(k)
-        evidence = np.column_stack([np.maximum(rng.normal(0, 3, 40), 0), rng.random(40) < 0.3]).astype(float)
+        evidence = np.column_stack([np.maximum(rng.normal(0, 3, 40), 0), rng.random(40) < 0.3, np.zeros(40)]).astype(float)
         parted = evidence[:, 0] + rng.normal(0, 0.5, 40) > 0.5
         plan = np.where(parted, 1.0, -1.0) + rng.normal(0, 2, 40)
         scans.append(PassageExamples(rng.random((40, 17)), plan, evidence, parted, "walls"))

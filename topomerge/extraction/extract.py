@@ -12,10 +12,8 @@ from topomerge.extraction.elevations.doorways import StoreyWalls
 from topomerge.extraction.navigable import free_space, navigable_volume, with_crossed_cells
 from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, chosen_parameters
 from topomerge.extraction.partition import (
-    FLAT_LEAST_AREA,
-    FLAT_LEAST_HALF_WIDTH,
-    ROOM_LEAST_AREA,
-    ROOM_LEAST_HALF_WIDTH,
+    FLAT_LEAST,
+    ROOM_LEAST,
     partition_rooms,
     rooms_of_segments,
 )
@@ -155,8 +153,8 @@ def cut_rooms(
     weigh = p.walls and not parts
     score = choose_scorer(weigh and found.walls is not None)
     door = p.slice_door if scan.flat else p.door
-    least, half_width = (FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH) if scan.flat else (ROOM_LEAST_AREA, ROOM_LEAST_HALF_WIDTH)
-    cut = [partition_rooms(storey, score, door, least, half_width) for storey in found.storeys]  # 2.6
+    least = FLAT_LEAST if scan.flat else ROOM_LEAST
+    cut = [partition_rooms(storey, score, door, least) for storey in found.storeys]  # 2.6
     floor = floor_of_storeys(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)
     if found.walls is None:
         return floor, None

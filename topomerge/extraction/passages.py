@@ -14,7 +14,7 @@ import numpy as np
 
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.doorways import StoreyWalls
-from topomerge.extraction.elevations.wall_doors import WALL_DOOR_FEATURES, door_candidates
+from topomerge.extraction.elevations.wall_doors import SUREST, WALL_DOOR_FEATURES, door_candidates, door_chance
 from topomerge.extraction.plans.passages import Pair, Passage, door_features, door_probability, pair_of
 from topomerge.extraction.segment import Scorer, SegmentedStorey, log_odds, score_by_plan
 from topomerge.io.weight_files import read_weights_json
@@ -22,9 +22,9 @@ from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, Array
 
 # Of a passage, beside the plan: log odds of a doorway that walls show there, on average along it, 0 where they show none or speak
-# against one; 0 or 1: a doorway split the segment.
-EVIDENCE = ("shown", "within")
-SCORE_INPUTS = ("constant", "plan", *EVIDENCE)  # what the score weighs; of the plan its log odds
+# against one; 0 or 1: a doorway split the segment; log odds of a door by plan and plan network, of scans that show no walls.
+EVIDENCE = ("shown", "within", "door")
+SCORE_INPUTS = ("constant", "plan", "shown", "within")  # what the score weighs; of the plan its log odds
 KINDS = ("walls",)  # of scans that have a model: walls show at heights
 PASSAGES_FILE = "passages.json"
 MOST_LOG_ODDS = 8.0
@@ -35,15 +35,16 @@ def find_passages(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None,
 
     Args:
         walls: None of a scan that shows none at heights.
-        weigh: do walls have a say? Of joined maps the rooms of their parts have it.
+        weigh: do walls and plan network have a say? Of joined maps the rooms of their parts have it.
     """
-    shown = _score_doorways(storeys, walls) if weigh and walls is not None else {}
+    told = _score_doors(storeys, walls) if weigh else {}
     out, first = [], 0
     for storey in storeys:
         passages = {}
         for (a, b), passage in storey.passages.items():
             pair = (a + first, b + first)
-            passages[a, b] = replace(passage, evidence=(shown.get(pair, 0.0), float((a, b) in storey.split)))
+            odds, within = told.get(pair, 0.0), float((a, b) in storey.split)
+            passages[a, b] = replace(passage, evidence=(0.0, within, odds) if walls is None else (odds, within, 0.0))
         out.append(replace(storey, passages=passages))
         first += storey.count
     return out
@@ -83,25 +84,29 @@ def compute_inputs(plan: Array, evidence: Array) -> Array:
 
     Args:
         plan: (n,) log odds of a door by the plan alone.
-        evidence: (n, 2) `EVIDENCE`.
+        evidence: (n, 3) `EVIDENCE`.
     """
     plan = np.clip(plan, -MOST_LOG_ODDS, MOST_LOG_ODDS)
-    return np.column_stack([np.ones(len(plan)), plan, evidence])
+    return np.column_stack([np.ones(len(plan)), plan, evidence[:, :2]])
 
 
-def _score_doorways(storeys: Sequence[SegmentedStorey], walls: StoreyWalls) -> dict[Pair, float]:
-    """Log odds of the surest doorway that walls show between each two segments, none below 0."""
+def _score_doors(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None) -> dict[Pair, float]:
+    """Log odds of the surest doorway that walls show between each two segments, none below 0; of the likeliest door by plan and
+    plan network, where no walls show."""
     edges, first = [np.zeros(0, EDGE_DTYPE)], 0
     for storey in storeys:
         edges.append(_edges_of(storey, first))
         first += storey.count
     complete = np.concatenate([np.zeros(0), *(storey.completeness for storey in storeys)])
     candidates = door_candidates(np.concatenate(edges), complete, [storey.classes for storey in storeys], walls)
-    mean = candidates.features[:, WALL_DOOR_FEATURES.index("wall_mean")]
-    shown: dict[Pair, float] = {}
-    for rooms, odds in zip(candidates.edges["rooms"].tolist(), mean.tolist(), strict=True):
-        shown[pair_of(*rooms)] = max(shown.get(pair_of(*rooms), 0.0), odds)
-    return shown
+    if walls is None:
+        odds = log_odds(np.clip(door_chance(candidates), SUREST, 1 - SUREST))
+    else:
+        odds = np.maximum(candidates.features[:, WALL_DOOR_FEATURES.index("wall_mean")], 0)
+    told: dict[Pair, float] = {}
+    for rooms, value in zip(candidates.edges["rooms"].tolist(), odds.tolist(), strict=True):
+        told[pair_of(*rooms)] = max(told.get(pair_of(*rooms), -np.inf), value)
+    return told
 
 
 def _edges_of(storey: SegmentedStorey, first: int) -> Array:
