@@ -15,6 +15,7 @@ from topomerge.types import Array
 SURE_PARTED = 0.8  # probability of a door from which on what is small, but not tiny, stays a room: toilets and stores
 SURE_SHOWN = 2.3  # log odds, on average along a doorway that walls show: likewise (as `walls.SURE_WITHIN`)
 NO_DOOR = -0.85  # log odds of a door below which there is probably none
+CRACK = 0.45  # m: nobody walks through less; a room behind a crack, of a door that is ajar, stays one
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def find_too_small(rooms: GrowingRooms, least: LeastSize) -> Pair | None:
         parted = probability >= SURE_PARTED or shown >= SURE_SHOWN
         if size < least.tiny or (size < least.small and not parted):
             found.append((0, probability, pair))
-        elif size < least.open and door < NO_DOOR:
+        elif size < least.open and door < NO_DOOR and rooms.passages[pair].width >= CRACK:
             found.append((1, door, pair))
     return min(found)[2] if found else None
 
