@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from topomerge.extraction.classified_storey import COLUMN_CLASSES
 from topomerge.extraction.plans.plan_network import DOWN_LEVELS, EVIDENCE_CHANNELS, UP_LEVELS
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES
 
 
 def _layer(channels: int, width: int, stride: int = 1) -> nn.Sequential:

@@ -1,4 +1,4 @@
-"""The network of elevations in torch. `extraction.elevations.wall_network` runs what is exported of it."""
+"""The network of elevations in torch. `extraction.elevations.elevation` runs what is exported of it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from topomerge.extraction.elevations.elevation import DEPTHS, STRIP_CHANNELS, WALL_CLASSES
-from topomerge.extraction.elevations.wall_network import DILATIONS, PLACES, TAPS
+from topomerge.extraction.elevations.elevation import DEPTHS, DILATIONS, PLACES, STRIP_CHANNELS, TAPS, WALL_CLASSES
 
 
 class WallNetwork(nn.Module):

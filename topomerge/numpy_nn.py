@@ -1,6 +1,6 @@
 """Layers of neural networks in NumPy: the networks that ship are run with them, so that nobody waits for torch to be imported.
 
-Each network keeps its architecture (`embedding.learned`, `extraction.plans.plan_network`, `extraction.plans.door_classifier`);
+Each network keeps its architecture (`embedding.learned`, `extraction.plans.plan_network`, `extraction.plans.passages`);
 the functions compute in the type of what they are given. Matrices of weights are (in, out) here; torch keeps them (out, in).
 """
 

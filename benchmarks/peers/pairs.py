@@ -21,7 +21,7 @@ from topomerge.datasets.pairs.recipe import Library
 from topomerge.errors import InputError
 from topomerge.evaluation.grid_pairs import iterate_real_pairs, make_pair_files, read_recipe
 from topomerge.evaluation.merge_report import modality
-from topomerge.extraction.cell_means import cell_middles
+from topomerge.extraction.cleaning import cell_middles
 from topomerge.types import Array, VoxelGrid
 
 HELDOUT = Path("cache/evaluation/heldout.jsonl")

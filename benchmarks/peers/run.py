@@ -41,7 +41,7 @@ from benchmarks.peers.methods import CALL_SECONDS, GuardedWork
 from benchmarks.peers.pairs import PEER_SPLITS, PeerPair, described, peer_pairs, scaled
 from topomerge.errors import InputError
 from topomerge.evaluation.grid_pairs import SCALELESS, find_places, upright
-from topomerge.extraction.cell_means import cell_middles
+from topomerge.extraction.cleaning import cell_middles
 from topomerge.training.belief_hypotheses import error
 from topomerge.types import Array, PointCloud, VoxelGrid
 

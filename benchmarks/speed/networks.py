@@ -12,7 +12,7 @@ from topomerge.models.plan_unet import PlanProbabilities, PlanUNet
 from topomerge.models.wall_network import WallNetwork, WallProbabilities
 
 from benchmarks.speed.bench import best, line
-from topomerge.extraction.elevations.wall_network import WALL_NETWORK_FILE, WALL_SIGNATURE
+from topomerge.extraction.elevations.elevation import WALL_NETWORK_FILE, WALL_SIGNATURE
 from topomerge.extraction.plans.plan_network import PLAN_NETWORK_FILE, PLAN_SIGNATURE
 from topomerge.networks.network import load_shipped_network
 from topomerge.registration.evidence.network import PLACE_NETWORK_FILE, PLACE_SIGNATURE

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.speed.bench import best, line
 from topomerge.extraction.convolution import sphere
-from topomerge.extraction.octree import SparseVoxelOctree
+from topomerge.extraction.views.visibility import SparseVoxelOctree
 from topomerge.kernels.lookup import row
 from topomerge.types import VoxelGrid
 

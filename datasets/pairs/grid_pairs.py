@@ -22,7 +22,7 @@ from topomerge.datasets.pairs.pairs import Pair
 from topomerge.datasets.pairs.recipe import Library, Recipe, check, library
 
 from topomerge.errors import InputError
-from topomerge.extraction.cell_means import with_means
+from topomerge.extraction.cleaning import with_means
 from topomerge.extraction.voxels import voxelise
 from topomerge.io import archive
 from topomerge.types import Array, PointCloud, Sim3, VoxelGrid

@@ -29,7 +29,7 @@ from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.io import archive
 from topomerge.types import Array
 
-PASSAGE_FORMAT = 1  # raise it when the same item gives other bytes: it is part of the files' names
+PASSAGE_FORMAT = 2  # raise it when the same item gives other bytes: it is part of the files' names
 MAP_CELL = 0.1  # m
 PURE = 0.7  # share of a segment in its true room; segments between rooms are no example
 
@@ -51,7 +51,7 @@ class PassageExamples:
     Args:
         features: (n, 17) `DOOR_FEATURES`.
         plan: (n,) log odds of a door by the plan alone.
-        evidence: (n, 4) `EVIDENCE`.
+        evidence: (n, 3) `EVIDENCE`.
         parted: (n,) bool, do they part two true rooms?
         kind: "walls", or "" of a scan that shows none at heights (`passages.choose_scorer`).
     """

@@ -22,8 +22,7 @@ from topomerge.datasets.plans import splits
 from topomerge.datasets.simulation.scanner import moved
 
 from topomerge.errors import InputError
-from topomerge.extraction.free_space import with_crossed_cells
-from topomerge.extraction.navigable import navigable_volume
+from topomerge.extraction.navigable import navigable_volume, with_crossed_cells
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.plan import columns_of, profile_bands, storey_plan
 from topomerge.extraction.plans.storey_plan import StoreyPlan
@@ -49,7 +48,7 @@ class PlanRecipe:
         scans: how many; seed: of the first one, from the beginning of the split's range on.
         folder: of the real data; empty: procedural buildings only.
         flat: slices, robots' grids and drawings alone; sparse: share of scans that lose most of their points, there;
-            painted: share of scans with colours or intensities, there.
+            frameless: share of scans whose doors mostly have no frame, there.
         surroundings: do the buildings stand in the open, so that sensors see gardens, streets and fans of rays (`open_scans`)?
     """
 
@@ -60,7 +59,7 @@ class PlanRecipe:
     folder: str = ""
     flat: bool = False
     sparse: float = 0.0
-    painted: float = 0.0
+    frameless: float = 0.0
     surroundings: bool = False
 
 

@@ -24,7 +24,7 @@ from topomerge.datasets.simulation.room_truth import room_truth
 from topomerge.datasets.simulation.scanner import moved
 
 from topomerge.extraction.extract import extract
-from topomerge.extraction.room_features import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES, pose_features, room_features
+from topomerge.extraction.room_odds import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES, pose_features, room_features
 from topomerge.extraction.scan import read_scan
 from topomerge.io import archive
 from topomerge.types import Array

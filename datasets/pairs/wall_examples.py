@@ -35,16 +35,10 @@ from topomerge.datasets.simulation.spoils import drift_between, exact_sensor
 from topomerge.datasets.simulation.walk import part
 
 from topomerge.errors import InputError
-from topomerge.extraction.classified_storey import ClassifiedStorey
-from topomerge.extraction.elevations.elevation import (
-    DEPTHS,
-    FACE_DTYPE,
-    STRIP_CHANNELS,
-    Elevations,
-    strip_colours,
-)
+from topomerge.extraction.elevations.elevation import DEPTHS, FACE_DTYPE, STRIP_CHANNELS, Elevations
 from topomerge.extraction.extract import cut_rooms, read_navigable
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
+from topomerge.extraction.plans.storey_plan import ClassifiedStorey
 from topomerge.extraction.scan import FINE_CELL
 from topomerge.extraction.stopwatch import Stopwatch
 from topomerge.extraction.topology import topometric_map
@@ -53,7 +47,7 @@ from topomerge.io import archive
 from topomerge.io.listing import plain
 from topomerge.types import ROOM_DTYPE, Array, PointCloud, Sim3, TopometricMap, VoxelGrid
 
-WALL_FORMAT = 7  # raise it when the same item gives other bytes: it is part of the files' names
+WALL_FORMAT = 8  # raise it when the same item gives other bytes: it is part of the files' names
 SOURCE_SHARES = {"procedural": 0.6, "r2v": 0.25, "campus": 0.15}
 SENSOR_SHARES = {"tls": 0.35, "depth": 0.25, "lidar": 0.2, "tablet": 0.12, "mono": 0.08}
 MAP_CELL = 0.1  # m
@@ -62,8 +56,7 @@ FINER = (0.5, 1.0)  # of a sensor's spacing
 COARSE_SHARE = 0.15  # of the scans that are seen in the cells of the map
 DRAWN_EVERY = 8  # seeds: one is a grid map of the plan, as robots and draughtsmen make them
 EXACT_SHARE = 0.5  # of the scans without drift
-INTENSITY_SHARE = 0.35  # of the painted scans: they have no colours
-FRAMES, FRAMES_PAINTED = (0.3, 1.0), (0.0, 0.8)  # share of the doors with a frame and handles; colour helps where there is none
+FRAMES, FRAMELESS = (0.3, 1.0), (0.0, 0.8)  # share of the doors with a frame and handles
 SLICE_SHARE, POSED_SHARE = 0.6, 0.6  # of flat maps by a 2D laser, and of these with the sensor's places
 LOST_BY_CHANCE, SHARE_LEFT = 0.5, (0.03, 0.3)
 SPACING_LEFT = (0.05, 0.2)  # m
@@ -76,11 +69,11 @@ NO_WALLS = Elevations(np.zeros(0, FACE_DTYPE), np.zeros(1, np.int64), np.zeros((
 @dataclass(frozen=True)
 class WallItem(PlanItem):
     """As of plans: all that the bytes of one file depend on; is it a slice or a grid map, does it lose most of its points,
-    and has it colours or intensities (`paint.SHADES`)?"""
+    and do its doors mostly have no frame?"""
 
     flat: bool = False
     sparse: bool = False
-    shades: str = ""
+    frameless: bool = False
 
     @property
     def name(self) -> str:
@@ -101,7 +94,6 @@ class WallExample:
         storeys: what probably stands in the columns of its plans.
         faces: (F,) FACE_DTYPE.
         source: sensor/where the building is from.
-        colours: (n, 13, 4) float16, as of `Elevations`; None: it has none.
     """
 
     first: Array
@@ -112,14 +104,13 @@ class WallExample:
     storeys: tuple[ClassifiedStorey, ...]
     faces: Array
     source: str
-    colours: Array | None = None
 
     @property
     def elevations(self) -> Elevations | None:
         """The walls as the extraction has them; None of a flat map."""
         if not len(self.faces):
             return None
-        return Elevations(self.faces, self.first, (self.strips / np.float32(255)).astype(np.float32), self.colours)
+        return Elevations(self.faces, self.first, (self.strips / np.float32(255)).astype(np.float32))
 
 
 def build_walls(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> tuple[list[Path], Report]:
@@ -130,9 +121,8 @@ def build_walls(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: No
 def draw_wall_item(seed: int, plans: Plans, recipe: PlanRecipe) -> WallItem:
     """The item of a seed; `make_walls` draws the same numbers again."""
     rng = np.random.default_rng([seed, 7])
-    sparse, painted, bright = (np.random.default_rng([seed, k]).random() for k in (9, 11, 12))
-    shades = "" if painted >= recipe.painted else "intensity" if bright < INTENSITY_SHARE else "colour"
-    kind = recipe.flat, bool(sparse < recipe.sparse), shades
+    sparse, frameless = (np.random.default_rng([seed, k]).random() for k in (9, 11))
+    kind = recipe.flat, bool(sparse < recipe.sparse), bool(frameless < recipe.frameless)
     source = str(rng.choice(list(SOURCE_SHARES), p=list(SOURCE_SHARES.values())))
     entries = plans.get(source, ())
     if not entries:
@@ -152,8 +142,6 @@ def wall_arrays(item: WallItem, example: WallExample) -> dict[str, Array]:
     arrays: dict[str, Any] = {name: getattr(example, name) for name in WALL_ARRAYS}
     arrays |= {f"map.{name}": getattr(example.map, name) for name in MAP_ARRAYS}
     arrays |= {f"rooms.{name}": example.map.rooms[name] for name in ROOMS_HELD}
-    if example.colours is not None:
-        arrays["colours"] = example.colours
     for k, storey in enumerate(example.storeys):
         arrays[f"plan{k}.classes"] = np.rint(255 * storey.probability).astype(np.uint8)
         arrays[f"plan{k}.frame"] = np.array([*storey.origin, storey.edge, storey.height])
@@ -181,14 +169,14 @@ def load_walls(path: Path) -> WallExample:
         x, y, edge, height = arrays[f"plan{k}.frame"].tolist()
         plans.append(ClassifiedStorey(arrays[f"plan{k}.classes"] / np.float32(255), np.array([x, y]), edge, height))
     walls = {name: arrays[name] for name in WALL_ARRAYS}
-    return WallExample(**walls, map=map, storeys=tuple(plans), source=str(arrays["source"]), colours=arrays.get("colours"))
+    return WallExample(**walls, map=map, storeys=tuple(plans), source=str(arrays["source"]))
 
 
 def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     """The walls of one scan."""
     seed = item.seed
     rng = np.random.default_rng([seed, 8])
-    frames = FRAMES_PAINTED if item.shades else FRAMES
+    frames = FRAMELESS if item.frameless else FRAMES
     difficulty = replace(draw_difficulty(rng), frames=float(rng.uniform(*frames)))
     if not item.flat:  # what a slice shows of a recess is the same wall elsewhere
         difficulty = replace(difficulty, niches=float(np.random.default_rng([seed, 13]).uniform(0, NICHES)))
@@ -211,17 +199,12 @@ def make_walls(item: WallItem, plan: Plan | None) -> WallExample:
     walls = NO_WALLS if seen is None or item.flat else seen.elevations
     if not item.flat and not len(walls.faces):
         raise InputError(f"{seed}: no wall was seen")
-    if scan.shades is not None and not item.flat:
-        walls = replace(walls, colours=strip_colours(walls, *scan.shades))
     strips, truth = np.rint(255 * walls.strips).astype(np.uint8), true_classes(building, walls, frame, shift)
     doors = building.doors["centre"]
     if shift is not None:
         doors = doors - shift[1][cKDTree(shift[0] + shift[1]).query(doors)[1]]
     source = f"{name}/{item.source}"
-    colours = None if walls.colours is None else walls.colours.astype(np.float16)
-    return WallExample(
-        walls.first, strips, truth, frame.apply(doors), map, floor.classified_storeys, walls.faces, source, colours
-    )
+    return WallExample(walls.first, strips, truth, frame.apply(doors), map, floor.classified_storeys, walls.faces, source)
 
 
 def _flat(building: Building, visited: Array, seed: int, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
@@ -235,7 +218,6 @@ def _flat(building: Building, visited: Array, seed: int, rng: np.random.Generato
 def _seen(building: Building, visited: Array, item: WallItem, rng: np.random.Generator) -> tuple[str, PointCloud, Any]:
     """How a building was seen, its cloud, and places of it with what undoes its drift there (None: it has none)."""
     sensor, seed = get_sensor(str(rng.choice(list(SENSOR_SHARES), p=list(SENSOR_SHARES.values())))), item.seed
-    sensor = replace(sensor, shades=item.shades)
     if seed % DRAWN_EVERY == DRAWN_EVERY - 1:
         return "drawn", drawn_map(building, visited, rng), None
     if rng.random() < EXACT_SHARE:

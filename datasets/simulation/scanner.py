@@ -9,7 +9,6 @@ import numpy as np
 from scipy import ndimage
 from topomerge.datasets.core.building import SURFACES, Building
 from topomerge.datasets.simulation.floors import draw_floors
-from topomerge.datasets.simulation.paint import painted
 from topomerge.datasets.simulation.rays import Hits, cast, placed
 from topomerge.datasets.simulation.sensors import Sensor, get_sensor
 from topomerge.datasets.simulation.trajectory import drifted, sensor_poses
@@ -69,14 +68,9 @@ def scan(
     if not budget:
         rows = _thin(points, spacing)
         points, hits = points[rows], hits.take(rows)
-    labels, colors = _rooms_of(building, poses, hits), None
-    if kind.shades:  # drawn from a generator of its own: the points are the same with and without
-        light = np.random.default_rng([len(points), 22])
-        colors = painted(building, hits, placed(poses, hits, hits.ranges), labels, kind.shades, light)
     cloud = PointCloud(
         points.astype(np.float32),
-        colors=colors,
-        labels=labels,
+        labels=_rooms_of(building, poses, hits),
         poses=estimated,
         pose_of=hits.pose.astype(np.int32),
         rooms=building.rooms,

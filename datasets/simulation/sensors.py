@@ -38,7 +38,6 @@ class Sensor:
         plain: share of the points on floors, ceilings and walls that are kept (cameras need texture).
         lowest: points lower than this above the floor are missing.
         metric: the scale of its maps is known.
-        shades: what it tells of a surface beside its place, one of `paint.SHADES`, or nothing.
     """
 
     name: str
@@ -67,7 +66,6 @@ class Sensor:
     mixed: float = 0.3
     plain: float = 1.0
     lowest: float = -1.0
-    shades: str = ""
 
     def rays(self, number: int) -> tuple[Array, tuple[int, int]]:
         """About `number` directions (rows * columns, 3), x ahead, z up, as an image; and its rows and columns."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.extraction.classified_storey import COLUMN_CLASSES, ClassifiedStorey
-from topomerge.extraction.partition import partition_rooms
+from topomerge.extraction.partition import LeastSize, partition_rooms
 from topomerge.extraction.plans.passages import Pair, Passage
 from topomerge.extraction.plans.plan import profile_bands
-from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, ClassifiedStorey, StoreyPlan
 from topomerge.extraction.segment import Scorer, SegmentedStorey
 from topomerge.types import Array
+
+ANY_WIDTH = LeastSize(0.8, 0.8, 0.0, 0.0)
 
 
 def storey_of(
@@ -31,8 +32,8 @@ def rooms_of_segments(
     clearance: Array,
     passages: dict[Pair, Passage],
     score: Scorer,
-    least: tuple[float, float] = (0.8, 0.8),
+    least: LeastSize = ANY_WIDTH,
     edge: float = 0.1,
 ) -> Array:
     """(n,) room of each segment."""
-    return partition_rooms(storey_of(segment, passages, clearance, edge), score, 0.5, least, 0.0).room_of_segment
+    return partition_rooms(storey_of(segment, passages, clearance, edge), score, 0.5, least).room_of_segment

@@ -9,7 +9,7 @@ import pytest
 
 import topomerge as tm
 from tests.scenes import Scene
-from topomerge.extraction.distinct_doors import ONE_DOORWAY, distinct_doors, rooms_at
+from topomerge.extraction.attributes import ONE_DOORWAY, distinct_doors, rooms_at
 from topomerge.types import TopometricMap
 
 

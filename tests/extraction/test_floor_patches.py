@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.scenes_map import building
-from topomerge.extraction.floor_patches import PATCH_AREA, without_patches
+from topomerge.extraction.attributes import PATCH_AREA, without_patches
 from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, TopometricMap
 
 NOWHERE = np.zeros((0, 3))

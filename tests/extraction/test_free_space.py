@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from topomerge.extraction.distance_field import horizontal_distance_field
-from topomerge.extraction.free_space import VIEW_CLEARANCE, VIEW_HEIGHT, free_space, views_of_tiles
+from topomerge.extraction.morphology import horizontal_distance_field
+from topomerge.extraction.navigable import VIEW_CLEARANCE, VIEW_HEIGHT, free_space, views_of_tiles
 from topomerge.extraction.scan import Scan
 from topomerge.types import VoxelGrid
 

@@ -10,8 +10,17 @@ from scipy.spatial.transform import Rotation
 
 import topomerge as tm
 from tests import scenes
-from topomerge.extraction.levelling import LevelledChunks, levelled_cloud, levelled_grid, rotation_about
-from topomerge.extraction.tilt import LARGEST_TILT, LEAST_TILT, degrees_from_z, find_up, rotation_to_z
+from topomerge.extraction.levelling import (
+    LARGEST_TILT,
+    LEAST_TILT,
+    LevelledChunks,
+    degrees_from_z,
+    find_up,
+    levelled_cloud,
+    levelled_grid,
+    rotation_about,
+    rotation_to_z,
+)
 from topomerge.types import PointCloud, VoxelGrid, transformed
 
 FAR = np.array([431_000.0, 5_812_000.0, 40.0])  # m, in a national grid

@@ -7,15 +7,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csgraph
 
-from topomerge.extraction.ceilings import without_ceilings
-from topomerge.extraction.components import connected_components, spread_labels
 from topomerge.extraction.convolution import Kernel, circle, convolve, moore, stick, von_neumann
-from topomerge.extraction.dilation import dilate_upwards
-from topomerge.extraction.distance_field import horizontal_distance_field
 from topomerge.extraction.floors import floor_components, largest_component
-from topomerge.extraction.gaps import bridge_gaps
-from topomerge.extraction.unobstructed import unobstructed
-from topomerge.extraction.views.views import local_maxima, raise_views
+from topomerge.extraction.morphology import (
+    bridge_gaps,
+    connected_components,
+    dilate_upwards,
+    horizontal_distance_field,
+    spread_labels,
+    unobstructed,
+)
+from topomerge.extraction.storeys import without_ceilings
+from topomerge.extraction.views.view_rooms import local_maxima, raise_views
 from topomerge.types import VoxelGrid
 
 

@@ -13,15 +13,16 @@ from PIL import Image
 from tests import scenes
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
-from topomerge.extraction.room_features import (
+from topomerge.extraction.room_odds import (
     GRID_FEATURES,
     POSE_FEATURES,
     ROOM_FEATURES,
+    ROOM_ODDS_FILE,
     pose_features,
     room_features,
     thin_share,
+    with_room_odds,
 )
-from topomerge.extraction.room_odds import ROOM_ODDS_FILE, with_room_odds
 from topomerge.io import read_points
 from topomerge.io.weight_files import VARIABLE, weights_file
 from topomerge.kernels.sight import seen_from

@@ -11,13 +11,10 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.cell_means import cell_middles, with_means
-from topomerge.extraction.lattice_cells import LatticeCells
+from topomerge.extraction.cleaning import cell_middles, grouped, with_means, without_gaps
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import with_raised_slice
-from topomerge.extraction.sparsity import without_gaps
-from topomerge.extraction.strays import grouped
-from topomerge.extraction.voxels import voxelise
+from topomerge.extraction.voxels import LatticeCells, voxelise
 from topomerge.kernels import voxelise as kernel
 from topomerge.types import PointCloud, VoxelGrid
 

@@ -10,8 +10,8 @@ import pytest
 
 from tests.extraction.elevations.doors import SHUT_DOOR, flush_door
 from tests.scenes import Scene, two_rooms
+from topomerge.extraction.attributes import SHUT_LATER_CHANCE, room_changes, rooms_under, with_walked_doors
 from topomerge.extraction.extract import extract
-from topomerge.extraction.walked_doors import SHUT_LATER_CHANCE, room_changes, rooms_under, with_walked_doors
 from topomerge.types import PointCloud, TopometricMap
 
 HEIGHT = 1.4

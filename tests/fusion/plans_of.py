@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.scenes import HEIGHT, Scene
-from topomerge.extraction.cell_means import with_means
+from topomerge.extraction.cleaning import with_means
 from topomerge.types import Sim3, VoxelGrid
 
 MOVE = Sim3(2.1, (7.0, -3.0, 0.4))

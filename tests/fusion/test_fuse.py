@@ -12,7 +12,7 @@ import topomerge as tm
 from tests.fusion.atlas.atlas_scenes import office_map, truth
 from tests.scenes import two_rooms
 from topomerge.errors import InputError
-from topomerge.extraction.cell_means import cell_middles
+from topomerge.extraction.cleaning import cell_middles
 from topomerge.fusion.fuse import _JoinedCells, fuse, rooms_in_common
 from topomerge.fusion.resampling import laid_means, resampled
 from topomerge.registration.storeys import extruded

@@ -325,6 +325,19 @@ def test_maps_that_tell_no_half_open_doors_open(saved: Path, scene: TopometricMa
     assert all((opened[name] == scene.edges[name]).all() for name in OLDER_EDGE_DTYPE.names or ())
 
 
+def test_fixtures_of_earlier_versions_are_not_read(saved: Path, scene: TopometricMap, tmp_path: Path) -> None:
+    columns = [("kind", "U8"), ("room", "i4"), ("centre", "f8", 3), *((n, "f8") for n in ("width", "depth", "bottom", "top"))]
+    arrays = archive.read(saved, "map")
+    about = json.loads(arrays["about"].item())
+    about["arrays"].append("fixtures")
+    arrays["about"] = np.array(json.dumps(about).encode())
+    arrays["fixtures"] = np.array([("niche", 0, (1.0, 2.0, 0.0), 0.9, 0.1, 0.5, 2.0)] * 3, columns)
+    archive.write(arrays, tmp_path / "older.tmap")
+    assert same(load_map(tmp_path / "older.tmap"), scene)
+    save_map(load_map(tmp_path / "older.tmap"), tmp_path / "again.tmap")
+    assert (tmp_path / "again.tmap").read_bytes() == saved.read_bytes()
+
+
 @pytest.mark.parametrize("name", ROOM_ODDS)
 @pytest.mark.parametrize("value", [-0.01, 1.01, np.nan, np.inf])
 def test_odds_that_are_none_are_refused(name: str, value: float, saved: Path, tmp_path: Path) -> None:

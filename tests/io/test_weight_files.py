@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.extraction.plans.door_classifier import read_classifier
+from topomerge.extraction.plans.passages import read_classifier
 from topomerge.io.weight_files import VARIABLE, weights_file
 from topomerge.matching.odds import hypothesis_probability
 from topomerge.registration.verify import model

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.wall_network import WALL_SIGNATURE, place_probabilities
+from topomerge.extraction.elevations.elevation import WALL_SIGNATURE, place_probabilities
 from topomerge.extraction.plans.plan_network import GRID_NETWORK_FILE, PLAN_NETWORK_FILE, PLAN_SIGNATURE
 from topomerge.io.weight_files import weights_file
 from topomerge.networks.network import WEIGHTS_PACKAGE, load_network, load_shipped_network, read_card

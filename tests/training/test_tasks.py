@@ -18,7 +18,7 @@ import pytest
 from tests.training import tiny
 from topomerge.embedding.engineered import scaled
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.colour_network import weights as colour_weights
+from topomerge.extraction.elevations.elevation import place_probabilities
 from topomerge.extraction.elevations.wall_doors import (
     SOURCES,
     WALL_DOOR_FEATURES,
@@ -26,9 +26,8 @@ from topomerge.extraction.elevations.wall_doors import (
     DoorCandidates,
     door_chance,
 )
-from topomerge.extraction.elevations.wall_network import place_probabilities
 from topomerge.extraction.passages import choose_scorer
-from topomerge.extraction.plans.door_classifier import door_probability
+from topomerge.extraction.plans.passages import door_probability
 from topomerge.extraction.plans.plan_network import column_probabilities
 from topomerge.extraction.plans.plan_network import weights as plan_weights
 from topomerge.extraction.room_odds import room_weights
@@ -45,7 +44,6 @@ from topomerge.training import (
     place_evidence,
     plan_segmentation,
     room_matcher,
-    wall_colours,
     wall_doors,
     wall_segmentation,
 )
@@ -63,7 +61,6 @@ NETWORKS = {
     "grid_segmentation": ["epochs=2", "steps=2", "batch=2", "crop=32", "hold_out=2", "widths=[4,4,4,4,4,4,4,4]"],
     "door_classification": ["epochs=2", "batch=64", "hidden=4", "networks=2"],
     "wall_segmentation": ["epochs=2", "steps=2", "batch=4", "length=32", "hold_out=2", "widths=[4,4,8,8]"],
-    "wall_colours": ["epochs=2", "steps=2", "batch=4", "length=32", "hold_out=2", "width=8"],
     "place_evidence": ["epochs=2", "steps=2", "batch=8", "widths=[4,4,4]", "hold_out=2", "lookalikes=false"],
     "room_matcher": ["epochs=2", "steps=2", "batch=2", "width=8", "layers=1"],
 }
@@ -83,7 +80,6 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(door_classification, "door_examples", lambda *_: tiny.door_tables(320))
     walls = tiny.wall_files(tmp_path / "walls", 6)
     monkeypatch.setattr(wall_segmentation, "build_walls", lambda *_: (walls, None))
-    monkeypatch.setattr(wall_colours, "build_walls", lambda *_: (walls, None))
     monkeypatch.setattr(wall_doors, "build_walls", lambda *_: (walls, None))
     monkeypatch.setattr(passages, "read_scans", lambda *_: tiny.passage_scans(10))
     places = tiny.place_files(tmp_path / "places")
@@ -130,7 +126,6 @@ def read(task: str) -> Any:
         "place_evidence": lambda: place_weights()(planes=np.ones((1, 16, 16, 22)))[0],
         "room_matcher": matched_rows,
         "wall_segmentation": lambda: place_probabilities(tiny.two_doors(0)[2] / np.float32(255)),
-        "wall_colours": lambda: colour_weights()["out.w"],
         "passages": lambda: choose_scorer(True)(np.ones((2, 17)), tiny.passages(2)),
         "wall_doors": lambda: door_chance(DoorCandidates(np.zeros(4, EDGE_DTYPE), signs, np.arange(4))),
         "merge_belief": lambda: np.array(model()["solid"]["pose"]["weight"]),
@@ -171,7 +166,7 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
 def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> None:
     jobs = dict.fromkeys(("plan_segmentation", "grid_segmentation"), plan_segmentation.PlanJob)
     jobs |= {"door_classification": door_classification.DoorJob}
-    jobs |= {"wall_segmentation": wall_segmentation.WallJob, "wall_colours": wall_colours.ColourJob}
+    jobs |= {"wall_segmentation": wall_segmentation.WallJob}
     kind = {**jobs, "place_evidence": place_evidence.PlaceJob, "room_matcher": room_matcher.MatcherJob}[task]
     train(settings_of(words(task, "name=whole")), quiet)
     step, seen = kind.step, []
@@ -222,8 +217,7 @@ def test_fits_learn_what_is_so(words) -> None:
         (["task=door_classification", "accelerator=cuda"], "accelerator"),
         (["task=wall_segmentation", "length=31"], "length"),
         (["task=wall_segmentation", "widths=[4,4]"], "widths"),
-        (["task=wall_colours", "length=31"], "length"),
-        (["task=wall_colours", "classes=[1,2]"], "classes"),
+        (["task=wall_segmentation", "classes=[1,2]"], "classes"),
         (["task=plan_segmentation", "loss.classes=[1,2]"], "loss.classes"),
         (["task=door_classification", "networks=0"], "networks"),
         (["task=merge_belief", "risk=0"], "risk"),
@@ -262,13 +256,13 @@ def test_batches_made_beside_are_the_same() -> None:
 
 def test_a_source_with_hardly_any_door_keeps_its_model() -> None:
     rng = np.random.default_rng(0)
-    sources = np.repeat([SOURCES.index("wall"), SOURCES.index("colour")], [60, 20]).astype(np.int8)
+    sources = np.repeat([SOURCES.index("wall"), SOURCES.index("flat")], [60, 20]).astype(np.int8)
     features = rng.normal(size=(80, len(WALL_DOOR_FEATURES)))
     right = (features[:, 0] > 0) & (sources == SOURCES.index("wall"))
-    right[-2:] = True  # two doors by colours alone
+    right[-2:] = True  # two doors of plans without walls
     model = wall_doors.doors_model([(DoorCandidates(np.zeros(80, EDGE_DTYPE), features, sources), right)], 1.0)
     shipped = read_weights_json("topomerge.extraction.elevations", WALL_DOORS_FILE)
-    assert model["colour"] == shipped["colour"] and model["wall"] != shipped["wall"] and model["wall"][1] > 0.5
+    assert model["flat"] == shipped["flat"] and model["wall"] != shipped["wall"] and model["wall"][1] > 0.5
 
 
 def test_scores_of_classes_and_doors() -> None:
@@ -298,11 +292,10 @@ SIMULATED = {
     "plan_segmentation": [*NETWORKS["plan_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "door_classification": ["data=plan_scans", "data.scans=4", "data.seed=0", "epochs=2", "hold_out=2", "heldout.scans=1"],
     "wall_segmentation": [*NETWORKS["wall_segmentation"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
-    "wall_colours": [*NETWORKS["wall_colours"], "data.scans=4", "data.seed=0", "heldout.scans=1"],
     "passages": ["data=plan_scans", "data.scans=6", "data.seed=0", "folds=2", "heldout=plan_scans_heldout", "heldout.scans=4"],
     "wall_doors": [
-        *(f"{of}.scans=2" for of in ("data", "painted", "flat", "heldout", "heldout_painted", "heldout_flat")),
-        *(f"{of}.seed=0" for of in ("data", "painted", "flat")), "folds=2",
+        *(f"{of}.scans=2" for of in ("data", "frameless", "flat", "heldout", "heldout_frameless", "heldout_flat")),
+        *(f"{of}.seed=0" for of in ("data", "frameless", "flat")), "folds=2",
     ],
     "room_odds": [
         "data=plan_scans", "data.scans=4", "open.scans=2", "closed.scans=2", "grids.scans=2", "folds=2",

@@ -21,7 +21,7 @@ from topomerge.extraction.passages import EVIDENCE
 from topomerge.extraction.plans.passages import Passage
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.extraction.room_features import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
+from topomerge.extraction.room_odds import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES
 from topomerge.fusion.match_belief import BELIEVED_METHODS
 from topomerge.io import archive
 from topomerge.matching.odds import hypothesis_features
@@ -48,17 +48,12 @@ def plan_files(folder: Path, count: int) -> list[Path]:
 
 
 def wall_files(folder: Path, count: int) -> list[Path]:
-    """Files of scans of two rooms, the wall between them with an open door and a shut one, 0.1 m farther along in each; every
-    third one has no colours."""
+    """Files of scans of two rooms, the wall between them with an open door and a shut one, 0.1 m farther along in each."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for k in range(count):
         map, faces, strips, truth, doors = two_doors(2 * k)
-        colours = np.zeros((len(truth), BANDS, 4), np.float16)
-        colours[..., 0], colours[truth == 2, :10, 1:] = 1, (-0.5, 0.4, 0.3)
-        example = WallExample(
-            np.array([0, len(truth)]), strips, truth, doors, map, (), faces, "tls/procedural", colours if k % 3 else None
-        )
+        example = WallExample(np.array([0, len(truth)]), strips, truth, doors, map, (), faces, "tls/procedural")
         path = folder / f"{k}.npz"
         archive.write(wall_arrays(WallItem(k, "procedural", 0, "", ""), example), path)
         paths.append(path)
@@ -245,8 +240,8 @@ def passage_scans(count: int) -> list[PassageExamples]:
     scans = []
     for k in range(count):
         rng = np.random.default_rng(k)
-        evidence = np.column_stack([rng.normal(0, 3, (40, 2)), rng.random((40, 2)) < 0.3]).astype(float)
-        parted = evidence[:, 0] + rng.normal(0, 0.5, 40) > 0
+        evidence = np.column_stack([np.maximum(rng.normal(0, 3, 40), 0), rng.random(40) < 0.3, np.zeros(40)]).astype(float)
+        parted = evidence[:, 0] + rng.normal(0, 0.5, 40) > 0.5
         plan = np.where(parted, 1.0, -1.0) + rng.normal(0, 2, 40)
         scans.append(PassageExamples(rng.random((40, 17)), plan, evidence, parted, "walls"))
     return scans

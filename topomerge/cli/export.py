@@ -131,7 +131,7 @@ EXPORT = Command(
             "--min-confidence",
             type=share,
             metavar="P",
-            help="leave out rooms, doors, stairs, windows and fixtures that are less likely than P, 0 to 1 (default 0: none)",
+            help="leave out rooms, doors, stairs and windows that are less likely than P, 0 to 1 (default 0: none)",
         ),
         quiet(),
     ),

@@ -69,7 +69,6 @@ def joined(map: TopometricMap, members: Array) -> TopometricMap:
         navigable_area=None,
         narrows=np.zeros(0, EDGE_DTYPE),
         windows=map.windows[:0],
-        fixtures=map.fixtures[:0],
         free=None,
         provenance=None,
     )

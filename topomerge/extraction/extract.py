@@ -9,21 +9,18 @@ from typing import Any
 from topomerge.blas import one_blas_thread
 from topomerge.extraction.attributes import estimate_attributes
 from topomerge.extraction.elevations.doorways import StoreyWalls
-from topomerge.extraction.floor import Floor
-from topomerge.extraction.free_space import free_space, with_crossed_cells
-from topomerge.extraction.navigable import navigable_volume
+from topomerge.extraction.navigable import free_space, navigable_volume, with_crossed_cells
 from topomerge.extraction.parameters import DefaultParameters, Parameters, ThesisParameters, chosen_parameters
 from topomerge.extraction.partition import (
-    FLAT_LEAST_AREA,
-    FLAT_LEAST_HALF_WIDTH,
-    ROOM_LEAST_AREA,
-    ROOM_LEAST_HALF_WIDTH,
+    FLAT_LEAST,
+    ROOM_LEAST,
     partition_rooms,
     rooms_of_segments,
 )
 from topomerge.extraction.passages import choose_scorer, find_passages
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.plans.storey_floor import floor_of_storeys
+from topomerge.extraction.plans.storey_plan import Floor
 from topomerge.extraction.scan import Scan, read_scan
 from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, rasterise_storeys, segment_storey
 from topomerge.extraction.slices import is_slice, with_raised_slice
@@ -140,7 +137,7 @@ def gather_evidence(
     walls = unroll_walls(scan, navigable, rasters, storeys) if p.walls else None
     if walls is not None:
         storeys, walls = split_at_doorways(storeys, walls)
-    return Evidence(rasters, find_passages(storeys, walls, places, p.walls and not parts), walls)
+    return Evidence(rasters, find_passages(storeys, walls, p.walls and not parts), walls)
 
 
 def cut_rooms(
@@ -156,8 +153,8 @@ def cut_rooms(
     weigh = p.walls and not parts
     score = choose_scorer(weigh and found.walls is not None)
     door = p.slice_door if scan.flat else p.door
-    least, half_width = (FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH) if scan.flat else (ROOM_LEAST_AREA, ROOM_LEAST_HALF_WIDTH)
-    cut = [partition_rooms(storey, score, door, least, half_width) for storey in found.storeys]  # 2.6
+    least = FLAT_LEAST if scan.flat else ROOM_LEAST
+    cut = [partition_rooms(storey, score, door, least) for storey in found.storeys]  # 2.6
     floor = floor_of_storeys(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)
     if found.walls is None:
         return floor, None

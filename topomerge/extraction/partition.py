@@ -7,16 +7,36 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.extraction.classified_storey import ClassifiedStorey
 from topomerge.extraction.plans.passages import Pair, pair_of
-from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.storey_plan import ClassifiedStorey, StoreyPlan
 from topomerge.extraction.segment import GrowingRooms, Scorer, SegmentedStorey
 from topomerge.types import Array
 
-ROOM_LEAST_AREA = 0.8, 0.3  # m2 of floor that was seen; the second where doors surely part it
-ROOM_LEAST_HALF_WIDTH = 0.2  # m: what is nowhere wider is the edge of a facade or of a slab
-FLAT_LEAST_AREA, FLAT_LEAST_HALF_WIDTH = (0.8, 0.8), 0.35  # in slices, where legs look like walls
 SURE_PARTED = 0.8  # probability of a door from which on what is small, but not tiny, stays a room: toilets and stores
+SURE_SHOWN = 2.3  # log odds, on average along a doorway that walls show: likewise (as `walls.SURE_WITHIN`)
+NO_DOOR = -0.85  # log odds of a door below which there is probably none
+CRACK = 0.45  # m: nobody walks through less; a room behind a crack, of a door that is ajar, stays one
+
+
+@dataclass(frozen=True)
+class LeastSize:
+    """What is too small for a room of its own.
+
+    Args:
+        tiny: m2 of floor that was seen; smaller ones are parts of a neighbour, or of no room.
+        small: m2, smaller ones are parts of a neighbour where no door surely parts them from it.
+        open: m2, smaller ones likewise where there is probably no door.
+        half_width: m, what is nowhere farther from a wall is none.
+    """
+
+    tiny: float
+    small: float
+    open: float
+    half_width: float
+
+
+ROOM_LEAST = LeastSize(0.3, 0.8, 0.0, 0.2)  # narrower ones are the edge of a facade or of a slab
+FLAT_LEAST = LeastSize(0.8, 0.8, 6.0, 0.35)  # in slices, where legs look like walls
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,37 +63,22 @@ class PartitionedStorey:
     door_probability: dict[Pair, float]
 
 
-def partition_rooms(
-    storey: SegmentedStorey,
-    score: Scorer,
-    door: float,
-    least_area: tuple[float, float] = ROOM_LEAST_AREA,
-    half_width: float = ROOM_LEAST_HALF_WIDTH,
-) -> PartitionedStorey:
+def partition_rooms(storey: SegmentedStorey, score: Scorer, door: float, least: LeastSize = ROOM_LEAST) -> PartitionedStorey:
     """Merge the segments of a storey, the least likely door first, until only likely doors part them: this cuts the rooms, once.
 
     Args:
         score: tells doors from narrowings of a room, by all evidence.
         door: probability from which on two rooms stay apart.
-        least_area: m2, smaller rooms are given to the neighbour from which the least likely door parts them, and those above the
-            second only where that door is less likely than `SURE_PARTED`.
-        half_width: m, rooms that are nowhere farther from a wall are none.
+        least: what is smaller is given to a neighbour.
     """
     segment, edge = storey.segment, storey.plan.edge
     rooms = GrowingRooms(segment, storey.clearance, storey.passages, edge, score)
     while rooms.door_probability and rooms.door_probability[pair := rooms.weakest()] <= door:
         rooms.merge(pair)
-    small = {int(r) for r in np.unique(rooms.of_region) if rooms.area[r] < least_area[0]}
-    while small:
-        near = [(p, min(rooms.area[r] for r in p)) for p in rooms.door_probability if p[0] in small or p[1] in small]
-        near = [(p, size) for p, size in near if size < least_area[1] or rooms.door_probability[p] < SURE_PARTED]
-        if not near:
-            break
-        pair = min((p for p, _ in near), key=lambda p: (rooms.door_probability[p], p))
-        rooms.merge(pair)
-        small = {r for r in small - {pair[1]} if rooms.area[r] < least_area[0]}
+    while (small := find_too_small(rooms, least)) is not None:
+        rooms.merge(small)
     large = np.unique(rooms.of_region)
-    large = large[(rooms.area[large] >= least_area[1]) & (rooms.peak[large] >= half_width)]
+    large = large[(rooms.area[large] >= least.tiny) & (rooms.peak[large] >= least.half_width)]
     number = np.full(len(rooms.of_region) + 1, -1)
     number[large] = np.arange(len(large))
     room_of_segment = number[rooms.of_region]
@@ -94,6 +99,20 @@ def partition_rooms(
         room_of_segment,
         doors,
     )
+
+
+def find_too_small(rooms: GrowingRooms, least: LeastSize) -> Pair | None:
+    """Find the least surely parted two rooms of which one is too small; None: none is."""
+    found: list[tuple[int, float, Pair]] = []
+    for pair, probability in rooms.door_probability.items():
+        size = min(rooms.area[pair[0]], rooms.area[pair[1]])
+        shown, _, door = rooms.passages[pair].evidence or (0.0, 0.0, 0.0)
+        parted = probability >= SURE_PARTED or shown >= SURE_SHOWN
+        if size < least.tiny or (size < least.small and not parted):
+            found.append((0, probability, pair))
+        elif size < least.open and door < NO_DOOR and rooms.passages[pair].width >= CRACK:
+            found.append((1, door, pair))
+    return min(found)[2] if found else None
 
 
 def rooms_of_segments(storeys: Sequence[PartitionedStorey], numbers: Array) -> Array:

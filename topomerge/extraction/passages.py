@@ -1,7 +1,7 @@
 """Passages between segments: all evidence of a door in each, gathered before anything is cut (beyond the thesis: docs/adr/0024).
 
 A passage is where two segments meet. What the plan shows of it is measured (`plans.passages`). Here comes what its walls show,
-what the plan network sees about it, and whether the sensor was carried through it. One score decides.
+and whether a doorway split a segment there. One score decides.
 """
 
 from __future__ import annotations
@@ -15,48 +15,36 @@ import numpy as np
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.doorways import StoreyWalls
 from topomerge.extraction.elevations.wall_doors import SUREST, WALL_DOOR_FEATURES, door_candidates, door_chance
-from topomerge.extraction.plans.door_classifier import door_probability
-from topomerge.extraction.plans.passages import Pair, Passage, door_features, pair_of
-from topomerge.extraction.segment import Scorer, SegmentedStorey, find_segments, log_odds, score_by_plan
-from topomerge.extraction.walked_doors import SENSOR_HEIGHT, WAY_STEP
+from topomerge.extraction.plans.passages import Pair, Passage, door_features, door_probability, pair_of
+from topomerge.extraction.segment import Scorer, SegmentedStorey, log_odds, score_by_plan
 from topomerge.io.weight_files import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, Array
 
-# Of a passage, beside the plan: log odds of a door by walls, plan network and plan together (`door_chance`), and of a doorway
-# that walls show there, on average along it; 0 or 1: the sensor was carried through, a doorway split the segment.
-EVIDENCE = ("door", "shown", "walked", "within")
-# What the score weighs: log odds by the plan, of a doorway that walls show, and against a door where somebody walked; 0 or 1.
-SCORE_INPUTS = ("constant", "plan", "shown", "walked without door", "within")
+# Of a passage, beside the plan: log odds of a doorway that walls show there, on average along it, 0 where they show none or speak
+# against one; 0 or 1: a doorway split the segment; log odds of a door by plan and plan network, of scans that show no walls.
+EVIDENCE = ("shown", "within", "door")
+SCORE_INPUTS = ("constant", "plan", "shown", "within")  # what the score weighs; of the plan its log odds
 KINDS = ("walls",)  # of scans that have a model: walls show at heights
 PASSAGES_FILE = "passages.json"
 MOST_LOG_ODDS = 8.0
-WAY_SAMPLE = 0.05  # m along the sensor's way
 
 
-def find_passages(
-    storeys: Sequence[SegmentedStorey],
-    walls: StoreyWalls | None,
-    places: Array,
-    weigh: bool = True,
-) -> list[SegmentedStorey]:
+def find_passages(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None, weigh: bool = True) -> list[SegmentedStorey]:
     """Gather the evidence of every passage of all storeys; they come back with it.
 
     Args:
         walls: None of a scan that shows none at heights.
-        places: (n, 3) m, where the sensor was, in its order; may be empty.
         weigh: do walls and plan network have a say? Of joined maps the rooms of their parts have it.
     """
-    door, shown = _score_doors(storeys, walls) if weigh else ({}, {})
-    walked = find_crossings(storeys, places)
+    told = _score_doors(storeys, walls) if weigh else {}
     out, first = [], 0
     for storey in storeys:
         passages = {}
         for (a, b), passage in storey.passages.items():
             pair = (a + first, b + first)
-            flags = float(pair in walked), float((a, b) in storey.split)
-            evidence = (door.get(pair, 0.0), shown.get(pair, 0.0), *flags)
-            passages[a, b] = replace(passage, evidence=evidence)
+            odds, within = told.get(pair, 0.0), float((a, b) in storey.split)
+            passages[a, b] = replace(passage, evidence=(0.0, within, odds) if walls is None else (odds, within, 0.0))
         out.append(replace(storey, passages=passages))
         first += storey.count
     return out
@@ -67,7 +55,7 @@ def score_passages(x: Array, passages: Sequence[Passage], weights: Array) -> Arr
 
     Args:
         x: (n, 17) `DOOR_FEATURES` of the sides as they have grown.
-        weights: (5,) of `SCORE_INPUTS`.
+        weights: (4,) of `SCORE_INPUTS`.
     """
     evidence = np.array([passage.evidence for passage in passages], float)
     return sigmoid(compute_inputs(log_odds(door_probability(x)), evidence) @ weights)
@@ -92,58 +80,33 @@ def choose_scorer(walls: bool) -> Scorer:
 
 
 def compute_inputs(plan: Array, evidence: Array) -> Array:
-    """(n, 5) `SCORE_INPUTS` of passages.
+    """(n, 4) `SCORE_INPUTS` of passages.
 
     Args:
         plan: (n,) log odds of a door by the plan alone.
-        evidence: (n, 4) `EVIDENCE`.
+        evidence: (n, 3) `EVIDENCE`.
     """
     plan = np.clip(plan, -MOST_LOG_ODDS, MOST_LOG_ODDS)
-    door, shown, walked, within = evidence.T
-    return np.column_stack([np.ones(len(plan)), plan, np.maximum(shown, 0), walked * np.minimum(door, 0), within])
+    return np.column_stack([np.ones(len(plan)), plan, evidence[:, :2]])
 
 
-def find_crossings(storeys: Sequence[SegmentedStorey], places: Array) -> set[Pair]:
-    """Find the pairs of segments between which the sensor was carried."""
-    places = np.asarray(places, np.float64)
-    places = places[np.isfinite(places).all(axis=1)]
-    if len(places) < 2:
-        return set()
-    step = np.hypot(*(places[1:] - places[:-1])[:, :2].T)
-    ways = []
-    for a, b, length in zip(places[:-1], places[1:], step.tolist(), strict=True):
-        if length <= WAY_STEP:
-            ways.append(a + np.linspace(0, 1, max(int(np.ceil(length / WAY_SAMPLE)), 1), endpoint=False)[:, None] * (b - a))
-        ways.append(np.full((0 if length <= WAY_STEP else 1, 3), np.nan))
-    way = np.concatenate([*ways, places[-1:]])
-    broken = np.isnan(way[:, 0])
-    segment = find_segments(storeys, np.where(broken[:, None], -1e9, way), SENSOR_HEIGHT)
-    segment[broken] = -2
-    segment = segment[segment != -1]
-    change = (segment[1:] != segment[:-1]) & (segment[1:] >= 0) & (segment[:-1] >= 0)
-    return {pair_of(int(a), int(b)) for a, b in zip(segment[:-1][change], segment[1:][change], strict=True)}
-
-
-def _score_doors(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None) -> tuple[dict[Pair, float], dict[Pair, float]]:
-    """Log odds of the likeliest door between each two segments, of all that anything shows; and of the surest doorway that walls
-    show."""
+def _score_doors(storeys: Sequence[SegmentedStorey], walls: StoreyWalls | None) -> dict[Pair, float]:
+    """Log odds of the surest doorway that walls show between each two segments, none below 0; of the likeliest door by plan and
+    plan network, where no walls show."""
     edges, first = [np.zeros(0, EDGE_DTYPE)], 0
     for storey in storeys:
         edges.append(_edges_of(storey, first))
         first += storey.count
     complete = np.concatenate([np.zeros(0), *(storey.completeness for storey in storeys)])
     candidates = door_candidates(np.concatenate(edges), complete, [storey.classes for storey in storeys], walls)
-    chance = np.clip(door_chance(candidates), SUREST, 1 - SUREST)
-    mean = candidates.features[:, WALL_DOOR_FEATURES.index("wall_mean")]
-    door: dict[Pair, float] = {}
-    shown: dict[Pair, float] = {}
-    for rooms, odds, seen in zip(
-        candidates.edges["rooms"].tolist(), np.log(chance / (1 - chance)).tolist(), mean.tolist(), strict=True
-    ):
-        pair = pair_of(*rooms)
-        door[pair] = max(door.get(pair, -np.inf), odds)
-        shown[pair] = max(shown.get(pair, 0.0), seen)
-    return door, shown
+    if walls is None:
+        odds = log_odds(np.clip(door_chance(candidates), SUREST, 1 - SUREST))
+    else:
+        odds = np.maximum(candidates.features[:, WALL_DOOR_FEATURES.index("wall_mean")], 0)
+    told: dict[Pair, float] = {}
+    for rooms, value in zip(candidates.edges["rooms"].tolist(), odds.tolist(), strict=True):
+        told[pair_of(*rooms)] = max(told.get(pair_of(*rooms), -np.inf), value)
+    return told
 
 
 def _edges_of(storey: SegmentedStorey, first: int) -> Array:

@@ -7,16 +7,249 @@ models of their own, as they show neither ceilings nor how high things are, and 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import edt
 import numpy as np
+import shapely
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from topomerge.errors import InputError
-from topomerge.extraction.room_features import GRID_FEATURES, POSE_FEATURES, ROOM_FEATURES, pose_features, room_features
+from topomerge.extraction.completeness import WALL_SIGHT
+from topomerge.extraction.storeys import floor_to_ceiling, lowest_of_column
 from topomerge.io.weight_files import read_weights_json
+from topomerge.kernels.sight import seen_from
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import ROOM_ODDS, Array, TopometricMap
+
+# What tells a room that somebody was in from one that was only looked into: a row of numbers a room, and one of its poses.
+#
+# From the next room one sees no wall that its own door is in, little of the ceiling, and what stands deep in it thinly. All
+# numbers are shares or logarithms, so that they do not change with the frame, and little with the size of a cell.
+
+ROOM_FEATURES = (
+    "completeness",  # share of the outline at which a wall was seen
+    "log_area",  # of m2
+    "log_width",  # of m: twice the area over the outline
+    "ceiling",  # share of its floor with something above it
+    "map_ceiling",  # the same of all rooms of the map
+    "floor_seen",  # share of its floor where a body fits: the rest was hidden, or is under furniture
+    "log_density",  # of occupied cells a column, beside the map's mean
+    "log_cells",  # of occupied cells a column
+    "walls_hidden",  # share of its walls that nobody sees who stands in another room
+    "log_hidden",  # of 1 + m of them
+    "contact",  # share of its outline beside which the floor of another room goes on
+    "between",  # share of its floor that lies between other rooms of the storey: within their convex hull
+    "floor_step",  # m that its floor is higher or lower than the storey
+)
+GRID_FEATURES = (  # of robots' grids and drawings, whose walls were all raised alike
+    "completeness",
+    "log_area",
+    "log_width",
+    "floor_seen",
+    "walls_hidden",
+    "log_hidden",
+    "contact",
+    "between",
+    "open_outline",  # share of its outline beside which there is neither a wall nor the floor of another room: rays end there
+    "thin",  # share of its floor that is narrower than a body and its way: single rays
+)
+POSE_FEATURES = (
+    "stood_in",  # 1: a place of the sensor is over its floor
+    "own_rays",  # share of what was seen of it that was seen from there
+)
+SIGHT_CELL = 0.1  # m: finer maps are looked at with about this
+VIEWPOINTS = 3.0  # m about a room: from there others look into it
+VIEW_STEP = 0.3  # m between them
+SIGHT_REACH = 8.0  # m
+WALL_BESIDE = 0.2  # m between the floor's edge and a wall
+THIN_HALF_WIDTH, THIN_REACH = 0.45, 0.55  # m: floor is thin that is farther than the second from all that is wider than the first
+BODY = 1.6  # m: lower things over the floor are no ceiling
+POSE_REACH = 0.4  # m beside the floor: places of a sensor in a narrow room, or adrift
+POSE_HEIGHTS = (-0.5, 3.0)  # m above the floor
+RAYS_OVER_FLOOR = 0.5  # share that begins over the floor of rooms; with fewer the poses are of another frame
+
+
+@dataclass(frozen=True, eq=False)
+class _StoreyFloor:
+    """The floor of a storey's rooms from above, (nx, ny) each: room (-1 none), something above?, does a body fit?, a wall?
+
+    Args:
+        height: (nx, ny) m of the floor over that of the storey.
+        edge: of a column, m.
+    """
+
+    room: Array
+    ceiling: Array
+    standing: Array
+    wall: Array
+    height: Array
+    edge: float
+
+
+def room_features(map: TopometricMap, names: Sequence[str] = ROOM_FEATURES) -> Array:
+    """(R, F) features of a map that need no poses.
+
+    Args:
+        names: of `ROOM_FEATURES` and `GRID_FEATURES`.
+    """
+    rooms = map.rooms
+    table = {name: np.zeros(len(rooms)) for name in (*ROOM_FEATURES, *GRID_FEATURES)}
+    covered = np.zeros((2, len(rooms)))  # columns with a ceiling, and all
+    for storey in _storey_floors(map):
+        hulls = _Hulls(storey)
+        for room, window in _windows(storey):
+            own = storey.room[window] == room
+            covered[:, room] = storey.ceiling[window][own].sum(), own.sum()
+            table["floor_seen"][room] = storey.standing[window][own].mean()
+            table["floor_step"][room] = abs(np.median(storey.height[window][own]))
+            table["between"][room] = hulls.share_between(room)
+            for name, value in _outline(storey, own, window).items():
+                table[name][room] = value
+    columns = np.maximum(covered[1], 1)
+    cells = np.maximum(rooms["cells"], 1) / columns
+    mean = np.average(cells, weights=columns) if len(rooms) else 1.0
+    table["ceiling"] = covered[0] / columns
+    table["map_ceiling"][:] = covered[0].sum() / max(covered[1].sum(), 1)
+    table["completeness"] = rooms["completeness"]
+    table["log_area"] = np.log(np.maximum(rooms["area"], 0.1))
+    table["log_density"], table["log_cells"] = np.log(cells / mean), np.log(cells)
+    return np.stack([table[name] for name in names], axis=1)
+
+
+def pose_features(map: TopometricMap, rays: tuple[Array, Array] | None) -> Array | None:
+    """(R, 2) `POSE_FEATURES`; None where no place of the sensor is known, or most are over no room's floor.
+
+    Args:
+        rays: (k, 3) places of the sensor and (k, 3) of what it saw, m, in the map's frame.
+    """
+    if rays is None or not len(map.rooms):
+        return None
+    starts, ends = (np.asarray(part, np.float64).reshape(-1, 3) for part in rays)
+    finite = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
+    starts = starts[finite]
+    moved = np.append(True, (starts[1:] != starts[:-1]).any(axis=1))[: len(starts)]  # the rays of one place follow each other
+    stood = _rooms_below(map, starts[moved])[np.cumsum(moved) - 1]
+    if not len(stood) or (stood >= 0).mean() < RAYS_OVER_FLOOR:
+        return None
+    cell = map.grid.rows(map.grid.locate(ends[finite]))
+    met = np.where(cell >= 0, map.room[cell], -1)
+    count = len(map.rooms)
+    of_room = np.bincount(met[met >= 0], minlength=count)
+    from_within = np.bincount(met[(met >= 0) & (met == stood)], minlength=count)
+    entered = np.bincount(stood[stood >= 0], minlength=count) > 0
+    return np.stack([entered, from_within / np.maximum(of_room, 1)], axis=1).astype(float)
+
+
+def _rooms_below(map: TopometricMap, places: Array) -> Array:
+    """(n,) room over whose floor each place is, -1 none."""
+    rows = lowest_of_column(map.navigable)
+    rows = rows[map.navigable_room[rows] >= 0]
+    floor = map.navigable.centroids(map.navigable.cells[rows])
+    room = np.full(len(places), -1)
+    for storey, level in enumerate(map.storeys["floor"]):
+        mine = map.rooms["storey"][map.navigable_room[rows]] == storey
+        above = (places[:, 2] > level + POSE_HEIGHTS[0]) & (places[:, 2] < level + POSE_HEIGHTS[1])
+        if mine.any() and above.any():
+            far, nearest = cKDTree(floor[mine, :2]).query(places[above, :2])
+            room[above] = np.where(far <= POSE_REACH, map.navigable_room[rows[mine]][nearest], room[above])
+    return room
+
+
+def _storey_floors(map: TopometricMap) -> Iterator[_StoreyFloor]:
+    """The storeys that have rooms, lowest first."""
+    factor = max(round(SIGHT_CELL / map.grid.edge), 1)
+    rows = lowest_of_column(map.navigable)
+    rows = rows[map.navigable_room[rows] >= 0]
+    room = map.navigable_room[rows]
+    lowest = map.navigable.subset(rows)
+    above = floor_to_ceiling(map.grid, lowest, BODY) > 0
+    standing = np.asarray(map.navigable.properties.get("standing", np.ones(len(map.navigable), bool)), bool)[rows]
+    z, floor_z = map.grid.centroids()[:, 2], lowest.centroids()[:, 2]
+    for storey, level in enumerate(map.storeys["floor"]):
+        mine = map.rooms["storey"][room] == storey
+        if not mine.any():
+            continue
+        at = lowest.cells[mine][:, :2].astype(np.int64) // factor
+        low = at.min(axis=0) - 1
+        shape, at = at.max(axis=0) - low + 2, tuple((at - low).T)
+        tall = (z > level + WALL_SIGHT[0]) & (z < level + WALL_SIGHT[1])
+        filled = map.grid.cells[tall][:, :2].astype(np.int64) // factor - low
+        filled = filled[((filled >= 0) & (filled < shape)).all(axis=1)]
+        label, flags, height = np.full(shape, -1), np.zeros((3, *shape), bool), np.zeros(shape)
+        label[at], height[at] = room[mine], floor_z[mine] - level
+        flags[0][at], flags[1][at] = above[mine], standing[mine]
+        flags[2][tuple(filled.T)] = True
+        yield _StoreyFloor(label, flags[0], flags[1], flags[2], height, map.grid.edge * factor)
+
+
+def _windows(storey: _StoreyFloor) -> Iterator[tuple[int, tuple[slice, slice]]]:
+    """Each room of a storey with the part of the raster from where others look into it."""
+    pad = round(VIEWPOINTS / storey.edge)
+    for room, box in enumerate(ndimage.find_objects(storey.room + 1)):
+        if box is not None:
+            x, y = (slice(max(side.start - pad, 0), side.stop + pad) for side in box)
+            yield room, (x, y)
+
+
+def _outline(storey: _StoreyFloor, own: Array, window: tuple[slice, slice]) -> dict[str, float]:
+    """What the outline of a room tells.
+
+    Args:
+        own: columns of the room, in the window.
+    """
+    free = storey.room[window] >= 0
+    beyond = free & ~own
+    reach = max(round(WALL_BESIDE / storey.edge), 1)
+    near = ndimage.binary_dilation(storey.wall[window], np.ones((2 * reach + 1, 2 * reach + 1)))
+    end = own & ndimage.binary_dilation(~own, border_value=1)
+    contact = end & ndimage.binary_dilation(beyond)
+    step = max(round(VIEW_STEP / storey.edge), 1)
+    views = np.argwhere(beyond[::step, ::step]) * step
+    walls = np.argwhere(end & ~contact & near)
+    hidden = ~seen_from(free, np.ascontiguousarray(walls), np.ascontiguousarray(views), SIGHT_REACH / storey.edge)
+    around = max(int(end.sum()), 1)
+    return {
+        "log_width": float(np.log(2 * own.sum() / around * storey.edge)),
+        "walls_hidden": float(hidden.mean()) if len(walls) else 0.0,
+        "log_hidden": float(np.log1p(hidden.sum() * storey.edge)),
+        "contact": float(contact.sum() / around),
+        "open_outline": float((end & ~contact & ~near).sum() / around),
+        "thin": thin_share(own, storey.edge),
+    }
+
+
+def thin_share(own: Array, edge: float) -> float:
+    """Share of a room's columns (nx, ny) that are farther than `THIN_REACH` from what is `THIN_HALF_WIDTH` from its outline."""
+    wide = edt.edt(np.pad(own, 1).view(np.uint8), parallel=1)[1:-1, 1:-1] * edge >= THIN_HALF_WIDTH
+    if not wide.any():
+        return 1.0
+    away = edt.edt((~np.pad(wide, 1)).view(np.uint8), parallel=1)[1:-1, 1:-1] * edge
+    return float((away[own] > THIN_REACH).mean())
+
+
+class _Hulls:
+    """What lies between the rooms of a storey."""
+
+    def __init__(self, storey: _StoreyFloor) -> None:
+        at = np.argwhere(storey.room >= 0)
+        room = storey.room[tuple(at.T)]
+        order = np.argsort(room, kind="stable")
+        numbers, first = np.unique(room[order], return_index=True)
+        self.columns = dict(zip(numbers.tolist(), np.split(at[order].astype(float), first[1:]), strict=True))
+        self.hulls = {n: shapely.convex_hull(shapely.MultiPoint(columns)) for n, columns in self.columns.items()}
+
+    def share_between(self, room: int) -> float:
+        """Of a room's columns, those within the convex hull of all other rooms."""
+        others = [hull for n, hull in self.hulls.items() if n != room]
+        if not others:
+            return 0.0
+        hull = shapely.convex_hull(shapely.geometrycollections(others))
+        return float(shapely.contains_xy(hull, self.columns[room]).mean())
+
 
 ROOM_ODDS_FILE = "room_odds.json"
 ENTERED_BY_POSES = "entered_by_poses"  # the model of `entered` that knows the sensor's places

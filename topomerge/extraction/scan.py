@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.extraction.lattice_cells import LatticeCells
+from topomerge.extraction.cleaning import COARSEST_CELL, without_gaps
 from topomerge.extraction.levelling import LevelledChunks
-from topomerge.extraction.sparsity import COARSEST_CELL, without_gaps
-from topomerge.extraction.voxels import voxelise
+from topomerge.extraction.voxels import LatticeCells, voxelise
 from topomerge.types import Array, PointCloud, VoxelGrid
 
 FINEST_CELL = 0.02  # m
@@ -23,8 +22,6 @@ LEAST_FINE = 2.05  # times as long: a grid of such cells will do, if it has the 
 MOST_FINE_CELLS = 12_000_000  # 0.7 GB; some 4,000 m2 of floor
 MOST_RAYS = 400_000  # of a portion of two million points
 MOST_RAYS_HELD = 4_000_000  # of all portions: 0.2 GB
-MOST_SHADES_HELD = 4_000_000  # points whose colours are held: 0.1 GB
-SHADE_RANGE, SHADE_TONES = (1.0, 99.0), (30.0, 225.0)  # percentiles of the intensities, and the greys that they become
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +32,6 @@ class Scan:
         grid: occupied cells.
         fine: cells of about `FINE_CELL` with the means of their points, as walls are looked at; None where they are not known.
         rays: (k, 3) places of the sensor and (k, 3) of what it saw from there, m; None where they are unknown.
-        shades: some of its points (k, 3), m, and their colours (k, 3) uint8, grey where it has intensities only; None: neither.
         free: cells that the file says are empty, or None.
         source: where it comes from.
         warnings: what the user should know.
@@ -48,7 +44,6 @@ class Scan:
     grid: VoxelGrid
     fine: VoxelGrid | None = None
     rays: tuple[Array, Array] | None = None
-    shades: tuple[Array, Array] | None = None
     free: VoxelGrid | None = None
     source: str = ""
     warnings: tuple[str, ...] = ()
@@ -111,7 +106,7 @@ def read_scan(
         chunks.warnings.append("the scan is large: doors are read off its plan alone, not off its walls")
     if least_neighbours:
         grid = without_gaps(grid, least_neighbours, chunks.warnings)
-    scan = Scan(grid, close, chunks.rays, chunks.shades.all(), chunks.free, chunks.source, tuple(chunks.warnings))
+    scan = Scan(grid, close, chunks.rays, chunks.free, chunks.source, tuple(chunks.warnings))
     return scan if levelled is None else replace(scan, levelling=levelled.matrix, warnings=(*levelled.warnings, *scan.warnings))
 
 
@@ -143,7 +138,6 @@ class _Chunks:
         self.source = ""
         self.free: VoxelGrid | None = None
         self.warnings: list[str] = []
-        self.shades = _Shades()
         self._rays: list[tuple[Array, Array]] = []
         self._step = 1  # of the rays, every one or every second, fourth ... is held
 
@@ -159,7 +153,6 @@ class _Chunks:
                 self._hold(*_rays(chunk, chunk.poses, chunk.pose_of))
             if self.fine is not None:
                 self.fine.add(chunk)
-            self.shades.add(chunk)
             yield chunk
 
     def _hold(self, starts: Array, ends: Array) -> None:
@@ -175,45 +168,6 @@ class _Chunks:
             return None
         starts, ends = (np.concatenate(part) for part in zip(*self._rays, strict=True))
         return starts, ends
-
-
-class _Shades:
-    """A sample of the points that have a colour or an intensity: each is as likely in it as any other, however many there are."""
-
-    def __init__(self) -> None:
-        self._parts: list[tuple[Array, ...]] = []  # drawn numbers; points; colours or intensities
-        self._share = 1.0
-        self._rng = np.random.default_rng(0)
-
-    def add(self, chunk: PointCloud) -> None:
-        """Take in a sample of a chunk; colours are preferred, and what has neither is left out."""
-        values = chunk.colors if chunk.colors is not None else chunk.intensities
-        if values is None or not len(chunk):
-            return
-        drawn = self._rng.random(len(chunk))
-        numbers = np.isfinite(values)
-        has = values.any(axis=1) & numbers.all(axis=1) if values.ndim == 2 else numbers  # no colour: black, or no number
-        rows = np.flatnonzero(has & (drawn < self._share) & np.isfinite(chunk.points).all(axis=1))
-        points = (chunk.points[rows] + chunk.shift).astype(np.float64)
-        self._parts.append((drawn[rows], points, values[rows]))
-        while sum(len(part[0]) for part in self._parts) > MOST_SHADES_HELD:
-            self._share /= 2
-            self._parts = [tuple(v[part[0] < self._share] for v in part) for part in self._parts]
-
-    def all(self) -> tuple[Array, Array] | None:
-        """(k, 3) m and (k, 3) uint8; None where nothing has a shade, or all have the same one."""
-        colours = [(p, v) for _, p, v in self._parts if v.ndim == 2]
-        if not colours:
-            grey = [(p, v) for _, p, v in self._parts]
-            bright = np.concatenate([v for _, v in grey]) if grey else np.zeros(0)
-            low, high = np.percentile(bright, SHADE_RANGE) if len(bright) else (0.0, 0.0)
-            if not high > low:
-                return None
-            dark, light = SHADE_TONES
-            scaled = np.clip(dark + (bright - low) / (high - low) * (light - dark), 0, 255).astype(np.uint8)
-            return np.concatenate([p for p, _ in grey]), np.repeat(scaled[:, None], 3, axis=1)
-        points, values = (np.concatenate(part) for part in zip(*colours, strict=True))
-        return (points, values) if len(values) and (values != values[0]).any() else None
 
 
 def _rays(cloud: PointCloud, poses: Array, pose_of: Array) -> tuple[Array, Array]:

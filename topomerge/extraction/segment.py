@@ -12,28 +12,25 @@ from heapq import heappop, heappush
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.ceilings import NOWHERE
-from topomerge.extraction.classified_storey import ClassifiedStorey
 from topomerge.extraction.completeness import outline_seen
-from topomerge.extraction.plans.door_classifier import door_probability
 from topomerge.extraction.plans.part_rooms import PartRooms, door_log_odds, laid_rooms, parted_columns
 from topomerge.extraction.plans.passages import (
     Pair,
     Passage,
     clearance_of,
     door_features,
+    door_probability,
     find_passages,
     joined,
     pair_of,
     regions_of,
 )
-from topomerge.extraction.plans.plan import columns_of, storey_plan
+from topomerge.extraction.plans.plan import columns_of, storey_plan, without_upper_sides
 from topomerge.extraction.plans.plan_network import column_probabilities, weights, without_furniture
-from topomerge.extraction.plans.storey_plan import StoreyPlan
-from topomerge.extraction.plans.upper_sides import without_upper_sides
+from topomerge.extraction.plans.storey_plan import ClassifiedStorey, StoreyPlan
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.slices import is_raised
-from topomerge.extraction.storeys import find_storeys, floor_to_ceiling
+from topomerge.extraction.storeys import NOWHERE, find_storeys, floor_to_ceiling
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import Array, VoxelGrid
 
@@ -203,14 +200,8 @@ def split_segments(storey: SegmentedStorey, doorways: Array) -> SegmentedStorey:
     return replace(storey, segment=segment, passages=passages, split=frozenset(pairs))
 
 
-def find_segments(
-    storeys: Sequence[SegmentedStorey], places: Array, up: tuple[float, float] = (-SAME_LEVEL, SAME_LEVEL)
-) -> Array:
-    """(n,) int64 segment under each place (n, 3) m, numbered on from storey to storey, -1 none.
-
-    Args:
-        up: m, between which a place lies above the floor.
-    """
+def find_segments(storeys: Sequence[SegmentedStorey], places: Array) -> Array:
+    """Find the (n,) int64 segment on whose floor each place (n, 3) m lies, numbered on from storey to storey, -1 none."""
     out, nearest = np.full(len(places), -1, np.int64), np.full(len(places), np.inf)
     first = 0
     for storey in storeys:
@@ -219,7 +210,7 @@ def find_segments(
         inside = np.flatnonzero(((at >= 0) & (at < plan.wall.shape)).all(axis=1))
         column = tuple(at[inside].T)
         above = places[inside, 2] - plan.floor[column]
-        own = (above > up[0]) & (above < up[1]) & (np.abs(above) < nearest[inside])
+        own = (np.abs(above) < SAME_LEVEL) & (np.abs(above) < nearest[inside])
         here = storey.segment[column]
         nearest[inside[own]] = np.abs(above[own])
         out[inside[own]] = np.where(here[own] >= 0, here[own] + first, -1)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.cell_means import MIDDLE
+from topomerge.extraction.cleaning import MIDDLE
 from topomerge.extraction.levelling import SLICE_HEIGHT
 from topomerge.extraction.scan import Scan
 from topomerge.kernels.carve import count_rays

@@ -1,16 +1,270 @@
-"""Rooms and edges with their measures: the topometric map (seeds 2.7)."""
+"""The topometric map of floors cut into rooms (seeds 2.7), and its doors, openings and stairs."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import edt
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.classified_storey import leads_through_wall
 from topomerge.extraction.completeness import completeness
-from topomerge.extraction.doors import find_edges
-from topomerge.extraction.floor import Floor
+from topomerge.extraction.convolution import sphere
+from topomerge.extraction.morphology import connected_components
+from topomerge.extraction.plans.storey_plan import Floor, leads_through_wall
 from topomerge.extraction.storeys import ceiling_height, floor_to_ceiling, lowest_of_column
-from topomerge.types import AREA_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid
+from topomerge.kernels.grow import steps_from
+from topomerge.types import AREA_DTYPE, EDGE_DTYPE, ROOM_DTYPE, Array, TopometricMap, VoxelGrid
+
+# Where two rooms meet: doors, openings and stairs (seeds 2.7).
+
+PASSAGE_LEAST_WIDTH = 0.4  # m: narrower gaps in which no body fits are holes in a wall
+DOOR_MOST_WIDTH = 1.6  # m: what is wider is an opening
+SAME_DOOR_DISTANCE = 0.8  # m: passages between the same rooms that are this close are one
+LEVEL_HEIGHT = 0.6  # m: what is higher or lower is another level
+LANDING_HEIGHT = 0.35  # m: what is nearer to the level of a storey is no stair
+RAMP_CLIMB = 0.25  # climb below which it is a ramp
+DOOR_SEARCH = 1.5  # m: how far from the border of two rooms their door may lie
+HALF_NEIGHBOURS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
+
+
+def find_edges(floor: Floor, room: Array, storey_of_room: Array, floor_to_ceiling: Array, within: Array | None = None) -> Array:
+    """Edges between rooms that have adjacent navigable cells (seeds 2.7), one for each place where they meet.
+
+    Args:
+        floor: of all storeys.
+        room: (m,) room (or area) of each of its cells, -1 none.
+        storey_of_room: (R,) storey of each room.
+        floor_to_ceiling: (m,) m of empty space above each cell, 0 where nothing was seen.
+        within: (R,) what each room is part of: only edges between parts of one are asked for; None: all.
+
+    Returns:
+        (E,) EDGE_DTYPE, sorted by rooms and place.
+    """
+    navigable, body = floor.cells, floor.body_width
+    cells = navigable.cells.astype(np.int64)
+    first, second = [], []
+    for step in HALF_NEIGHBOURS:
+        other = navigable.rows(cells + step)
+        row = np.flatnonzero((other >= 0) & (room >= 0))
+        neighbour = other[row]
+        meet = (room[neighbour] >= 0) & (room[neighbour] != room[row])
+        if within is not None:
+            meet &= within[room[neighbour]] == within[room[row]]
+        first.append(row[meet])
+        second.append(neighbour[meet])
+    a, b = np.concatenate(first), np.concatenate(second)
+    swap = room[a] > room[b]
+    a[swap], b[swap] = b[swap], a[swap]
+    edges: list[tuple[Any, ...]] = []
+    pair = room[a].astype(np.int64) * (int(room.max(initial=0)) + 1) + room[b]
+    order = np.argsort(pair, kind="stable")
+    for contacts in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []:
+        rows = np.unique(np.concatenate([a[contacts], b[contacts]]))
+        meeting = navigable.subset(rows)
+        contact = connected_components(meeting, sphere(2.5 * navigable.edge, navigable.edge))
+        parts = [rows[contact == c] for c in range(int(contact.max()) + 1)]
+        passages = [_edge(navigable, room, part, storey_of_room, floor_to_ceiling, body) for part in parts]
+        edges += _distinct_doors(
+            [edge for edge in passages if edge[2] >= PASSAGE_LEAST_WIDTH or (edge[6] and edge[5] != "stairs")]
+        )
+    table = np.array(edges, EDGE_DTYPE) if edges else np.zeros(0, EDGE_DTYPE)
+    _add_stairs(table, floor)
+    return table
+
+
+def _add_stairs(edges: Array, floor: Floor) -> None:
+    """Where the stairs of the given edges begin and end, and which of them are ramps.
+
+    A stair is the connected part of the floor that lies on no storey's level and at which the two rooms meet.
+    """
+    stairs = np.flatnonzero(edges["kind"] == "stairs")
+    if not len(stairs):
+        return
+    z = floor.cells.centroids()[:, 2]
+    nearest = np.abs(z[:, None] - floor.storeys["floor"]).min(axis=1)
+    rows = lowest_of_column(floor.cells)
+    rows = rows[nearest[rows] > LANDING_HEIGHT]
+    if not len(rows):
+        return
+    steps = floor.cells.subset(np.sort(rows))
+    part = connected_components(steps, sphere(2.5 * steps.edge, steps.edge))
+    places = steps.centroids()
+    for i in stairs:
+        distance = np.linalg.norm(places - edges["centre"][i], axis=1)
+        if distance.min() > DOOR_SEARCH:
+            continue
+        stair = places[part == part[distance.argmin()]]
+        low, high = stair[:, 2].min(), stair[:, 2].max()
+        edges["lower"][i] = stair[stair[:, 2] <= low + LANDING_HEIGHT].mean(axis=0)
+        edges["upper"][i] = stair[stair[:, 2] >= high - LANDING_HEIGHT].mean(axis=0)
+        if _steepness(stair) < RAMP_CLIMB:
+            edges["kind"][i] = "ramp"
+
+
+def _steepness(places: Array) -> float:
+    """Climb of a floor, m per m: the median over tiles of 0.6 m."""
+    tile = np.floor(places[:, :2] / 0.6).astype(np.int64)
+    _, of = np.unique(tile, axis=0, return_inverse=True)
+    of = of.ravel()
+    low, high = np.full(of.max() + 1, np.inf), np.full(of.max() + 1, -np.inf)
+    np.minimum.at(low, of, places[:, 2])
+    np.maximum.at(high, of, places[:, 2])
+    return float(np.median(high - low)) / 0.6
+
+
+def _distinct_doors(edges: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    """The edges of one pair of rooms, without those that lead through the same door as a wider one."""
+    distinct: list[tuple[Any, ...]] = []
+    for edge in sorted(edges, key=lambda e: (-e[2], e[1])):
+        if all(np.linalg.norm(np.subtract(edge[1], other[1])) > max(SAME_DOOR_DISTANCE, other[2] / 2) for other in distinct):
+            distinct.append(edge)
+    return sorted(distinct)
+
+
+def _edge(
+    navigable: VoxelGrid, room: Array, rows: Array, storey_of_room: Array, floor_to_ceiling: Array, body: float
+) -> tuple[Any, ...]:
+    """One row of EDGE_DTYPE from the cells (`rows`) of two rooms that touch."""
+    pair = np.unique(room[rows])
+    cells = navigable.cells[rows]
+    middle, along, span = _extent(np.unique(cells[:, :2], axis=0))
+    narrow = _narrowest(navigable, room, pair, cells)
+    if narrow is not None and narrow[2] <= span:
+        middle, along, span = narrow
+    under = _under(navigable, middle, cells)
+    rows = under if len(under) else rows
+    above = floor_to_ceiling[rows]
+    height = float(np.quantile(above[above > 0], 0.1, method="nearest")) if (above > 0).any() else 0.0
+    levels = np.sort(navigable.cells[rows, 2])
+    floor = float(levels[: max(len(levels) // 4, 1)].mean())
+    centre = navigable.origin + (np.array([*middle, floor]) + 0.5) * navigable.edge
+    width = span * navigable.edge + 2 * (int(np.ceil(body / navigable.edge - 1e-6)) // 2) * navigable.edge
+    if storey_of_room[pair[0]] != storey_of_room[pair[1]]:
+        kind = "stairs"
+    else:
+        kind = "door" if width <= DOOR_MOST_WIDTH else "opening"
+    across = float(np.arctan2(along[0], -along[1]) % np.pi)  # the wall's normal
+    place = tuple(centre.tolist())
+    standing = navigable.properties.get("standing")
+    passable = standing is None or bool(standing[rows].any())
+    return (tuple(int(p) for p in pair), place, width, height, across, kind, passable, False, 1.0, place, place)
+
+
+def _under(navigable: VoxelGrid, middle: Array, contact: Array) -> Array:
+    """Rows of the navigable cells in the middle of a passage, at the height of the contact."""
+    reach, rise = int(0.25 / navigable.edge), int(LEVEL_HEIGHT / navigable.edge)
+    low = np.rint([*middle, contact[:, 2].mean()]).astype(np.int64) - (reach, reach, rise)
+    window = np.argwhere(np.ones((2 * reach + 1, 2 * reach + 1, 2 * rise + 1), bool)) + low
+    rows = navigable.rows(window)
+    rows = rows[rows >= 0]
+    return rows[~navigable.contains(navigable.cells[rows].astype(np.int64) - (0, 0, 1))]  # the floor, not what was dilated
+
+
+def _extent(plan: Array) -> tuple[Array, Array, float]:
+    """Middle, direction and length (cells) of a strip of columns."""
+    middle = plan.mean(axis=0)
+    along = np.array([1.0, 0.0])
+    if len(plan) > 2:
+        along = np.linalg.svd(plan - middle, full_matrices=False)[2][0]
+    return middle, along, float(np.ptp(plan @ along)) + 1
+
+
+def _narrowest(navigable: VoxelGrid, room: Array, pair: Array, contact: Array) -> tuple[Array, Array, float] | None:
+    """Middle, direction and width (cells) of the narrowest place on the widest way between two rooms, near their contact.
+
+    Borders between clusters of views lie somewhere near a door, not in it; the floor itself is narrowest in the door.
+    """
+    reach = int(np.ceil(DOOR_SEARCH / navigable.edge))
+    low = contact[:, :2].min(axis=0) - reach
+    size = contact[:, :2].max(axis=0) + reach + 1 - low
+    owner = _owners(navigable, room, low, size, contact)
+    free = np.pad(owner >= 0, 1)
+    clearance = np.sqrt(edt.edtsq(free.view(np.uint8), parallel=1))[1:-1, 1:-1]
+    # Each room is represented by its widest place away from the border, which may lie on the wrong side of the door.
+    far = np.ones(size, bool)
+    far[tuple((contact[:, :2] - low).T)] = False
+    away = np.sqrt(edt.edtsq(far.view(np.uint8), parallel=1))
+    sides = []
+    for p in pair:
+        side = owner == p
+        if not side.any():
+            return None
+        away_enough = side & (away >= min(0.6 * reach, away[side].max()))
+        sides.append(np.argmax(np.where(away_enough, clearance, -1.0)))
+    if clearance.flat[sides[0]] <= 1 or clearance.flat[sides[1]] <= 1:
+        return None
+    pass_parts = _at_the_pass(clearance, int(sides[0]), int(sides[1]))
+    if pass_parts is None:
+        return None
+    saddle = _between(*pass_parts)
+    return None if saddle is None else _across(owner >= 0, clearance, saddle, low)
+
+
+def _at_the_pass(clearance: Array, first: int, second: int) -> tuple[Array, Array, Array] | None:
+    """The parts of the first and of the second of two columns where the widest body passes that does not get from the one to the
+    other, and the part of both where the next smaller one does; None where none or all do."""
+    levels = np.unique(clearance[clearance > 0])[::-1]
+
+    def parts_at(k: int) -> tuple[Array, int, int]:
+        parts, _ = ndimage.label(clearance >= levels[k], np.ones((3, 3)))
+        return parts, int(parts.flat[first]), int(parts.flat[second])
+
+    low, high = 0, len(levels)  # the first level at which they are joined is one of low..high
+    while low < high:
+        middle = (low + high) // 2
+        _, a, b = parts_at(middle)
+        low, high = (low, middle) if a and a == b else (middle + 1, high)
+    if low in (0, len(levels)):
+        return None
+    parts, a, b = parts_at(low - 1)
+    if not a or not b:
+        return None
+    joined, both, _ = parts_at(low)
+    return parts == a, parts == b, joined == both
+
+
+def _owners(navigable: VoxelGrid, room: Array, low: Array, size: Array, contact: Array) -> Array:
+    """(size) room of each column of a window at `low`, at the height of the contact; -1 where nobody can stand."""
+    reach = int(LEVEL_HEIGHT / navigable.edge)
+    middle = round(float(contact[:, 2].mean()))
+    levels = np.arange(middle - reach, middle + reach + 1)
+    columns = np.argwhere(np.ones(size, bool)) + low
+    cells = np.column_stack([np.tile(columns, (len(levels), 1)), np.repeat(levels, len(columns))])
+    row = navigable.rows(cells)
+    label = np.where(row >= 0, room[np.maximum(row, 0)], -1)
+    return label.reshape(len(levels), *size).max(axis=0)
+
+
+def _between(first: Array, second: Array, way: Array) -> Array | None:
+    """The cell of `way` halfway between two parts on the shortest connection."""
+    steps = [steps_from(part, way) for part in (first, second)]
+    total = np.where((steps[0] > 0) & (steps[1] > 0), steps[0] + steps[1], np.iinfo(np.int64).max)
+    if not (total < np.iinfo(np.int64).max).any():
+        return None
+    cells = np.argwhere(total == total.min())
+    return cells[np.abs(steps[0] - steps[1])[tuple(cells.T)].argmin()]
+
+
+def _across(free: Array, clearance: Array, saddle: Array, low: Array) -> tuple[Array, Array, float]:
+    """Middle, direction and width of the passage at `saddle`: from its nearest wall straight to the one opposite."""
+    _, nearest = ndimage.distance_transform_edt(np.pad(free, 1), return_indices=True)
+    wall = nearest[:, saddle[0] + 1, saddle[1] + 1] - 1
+    along = (wall - saddle) / max(float(np.linalg.norm(wall - saddle)), 1e-9)
+    ends = []
+    for sign in (1.0, -1.0):
+        length = 0.0
+        while True:
+            cell = np.rint(saddle + sign * (length + 0.5) * along).astype(int)
+            if (cell < 0).any() or (cell >= free.shape).any() or not free[tuple(cell)]:
+                break
+            length += 0.5
+        ends.append(length)
+    middle = saddle + along * (ends[0] - ends[1]) / 2 + low
+    return middle, along, sum(ends) + (0.0 if sum(ends) else 1.0)
+
+
+# Rooms and edges with their measures: the topometric map (seeds 2.7).
 
 
 def topometric_map(grid: VoxelGrid, floor: Floor, body_height: float) -> TopometricMap:

@@ -9,10 +9,108 @@ from numbers import Real
 import numpy as np
 
 from topomerge.errors import InputError
-from topomerge.extraction.lattice_cells import LatticeCells
-from topomerge.extraction.strays import box_volume, largest_place, without_strays
+from topomerge.extraction.cleaning import box_volume, largest_place, without_strays
 from topomerge.kernels import lookup, morton
+from topomerge.kernels import voxelise as kernel
 from topomerge.types import Array, PointCloud, VoxelGrid
+
+# Lattice cells of a cloud that comes in chunks: 40 bytes a cell, and at most two and a half times that while runs are united.
+
+RUN_RATIO = 4  # a run is united with the one before it unless that is more than so many times as long
+FAR_RATIO = 2  # likewise for cells that no code numbers
+BLOCK = 1_000_000  # cells that are looked at together
+_Cells = tuple[Array, Array, Array]  # cells (n, 3) or their codes (n,), counts (n,), sums (n, 3): `kernels.voxelise.occupied`
+
+
+class LatticeCells:
+    """Lattice cells of chunks that come one after the other, each with the number of its points and where they lie.
+
+    Cells are numbered by Morton codes about the middle of the first chunk, which reach a million cells to all sides; the few
+    beyond (strays) stand apart.
+
+    Args:
+        edge: of a cell, m.
+        most: cells that are held; of a larger cloud there are none. 0: any number.
+    """
+
+    def __init__(self, edge: float, most: int = 0) -> None:
+        self.edge, self.most = edge, most
+        self.too_many = False
+        self._origin: Array | None = None
+        self._runs: list[_Cells] = []  # by ascending codes, each run far longer than the next one
+        self._far: list[_Cells] = []
+
+    def add(self, chunk: PointCloud) -> None:
+        """Take in the cells of a chunk."""
+        if self.too_many:
+            return
+        base, cells, counts, sums = kernel.occupied(chunk.points, np.asarray(chunk.shift, np.float64), self.edge)
+        if not len(cells):
+            return
+        cells += base
+        if self._origin is None:
+            self._origin = np.median(cells, axis=0).astype(np.int64) - morton.AXIS_LIMIT // 2
+        numbers = cells - self._origin
+        near = bool(numbers.min() >= 0 and numbers.max() < morton.AXIS_LIMIT)
+        if not near:
+            inside = ((numbers >= 0) & (numbers < morton.AXIS_LIMIT)).all(axis=1)
+            self._far.append((cells[~inside], counts[~inside], sums[~inside]))
+            if sum(len(part[0]) for part in self._far[1:]) * FAR_RATIO > len(self._far[0][0]):
+                self._far = [_united_cells(self._far)]
+            numbers, counts, sums = numbers[inside], counts[inside], sums[inside]
+        codes = morton.encode(numbers)
+        order = morton.unique_rows(codes)
+        self._runs.append((codes[order], counts[order], sums[order]))
+        while len(self._runs) > 1 and len(self._runs[-2][0]) <= RUN_RATIO * len(self._runs[-1][0]):
+            self._runs[-2:] = [kernel.united(self._runs[-2], self._runs[-1])]
+        if self.most and len(self._runs[0][0]) > self.most:
+            self.too_many, self._runs, self._far = True, [], []
+
+    def all(self) -> _Cells:
+        """Cells (n, 3), counts (n,) and sums (n, 3) of the places of points within them, in `OFFSET_STEPS` parts."""
+        if self._origin is None:
+            return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.int64)
+        codes, counts, sums = self._one_run()
+        near = morton.decode(codes) + self._origin, counts, sums
+        if not self._far:
+            return near
+        cells, counts, sums = (np.concatenate(part) for part in zip(near, _united_cells(self._far), strict=True))
+        return cells, counts, sums
+
+    def within(self, grid: VoxelGrid) -> VoxelGrid | None:
+        """The cells in the box of a grid of whole multiples of them; None where they were too many."""
+        if self.too_many or self._origin is None:
+            return None
+        codes, counts, sums = self._one_run()
+        if self.most and len(codes) > self.most:
+            return None
+        base = np.rint(grid.origin / self.edge).astype(np.int64) - self._origin
+        size = np.array(grid.shape) * round(grid.edge / self.edge)
+        cells, offsets = [np.zeros((0, 3), np.int32)], [np.zeros((0, 3), np.uint8)]
+        for first in range(0, len(codes), BLOCK):
+            block = slice(first, first + BLOCK)
+            numbers = morton.decode(codes[block]) - base
+            inside = ((numbers >= 0) & (numbers < size)).all(axis=1)
+            count = counts[block][inside, None]
+            cells.append(numbers[inside].astype(np.int32))
+            offsets.append(((sums[block][inside] + count // 2) // np.maximum(count, 1)).astype(np.uint8))
+        shape = (int(size[0]), int(size[1]), int(size[2]))
+        return VoxelGrid.from_cells(np.concatenate(cells), grid.origin, self.edge, shape, {"offset": np.concatenate(offsets)})
+
+    def _one_run(self) -> _Cells:
+        while len(self._runs) > 1:
+            self._runs[-2:] = [kernel.united(self._runs[-2], self._runs[-1])]
+        return self._runs[0]
+
+
+def _united_cells(parts: list[_Cells]) -> _Cells:
+    """Cells that may be in several parts, each once."""
+    cells, counts, sums = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    cells, row = np.unique(cells, axis=0, return_inverse=True)
+    total = (np.bincount(row.ravel(), weights, len(cells)).astype(np.int64) for weights in (counts, *sums.T))
+    number, *axes = total
+    return cells, number, np.column_stack(axes)
+
 
 log = logging.getLogger(__name__)
 

@@ -13,13 +13,12 @@ from itertools import pairwise
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.doors import DOOR_MOST_WIDTH
 from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE, StoreyWalls, door_places, doorways, place_classes
-from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, Elevations, face_rows, unroll
-from topomerge.extraction.elevations.wall_network import PLACES
+from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, PLACES, Elevations, face_rows, unroll
 from topomerge.extraction.plans.storey_floor import WALL_REACH, cells_of_storey
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, find_segments, split_segments
+from topomerge.extraction.topology import DOOR_MOST_WIDTH
 from topomerge.kernels.voxelise import OFFSET_STEPS
 from topomerge.structure.face_points import FACE_HEIGHTS, FULL_COLUMN, LEAST_CELLS
 from topomerge.structure.lines import main_direction, straight_lines

@@ -17,21 +17,19 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.errors import InputError
-from topomerge.extraction.cell_means import with_means
+from topomerge.extraction.attributes import rooms_at
+from topomerge.extraction.cleaning import with_means
 from topomerge.extraction.convolution import convolve, moore
-from topomerge.extraction.distinct_doors import rooms_at
 from topomerge.extraction.extract import extract
 from topomerge.extraction.parameters import PRESETS
 from topomerge.extraction.plans.part_rooms import PartRooms
 from topomerge.extraction.scan import COARSEST_CELL, FINEST_CELL
 from topomerge.fusion.resampling import copies, decoded, encoded, laid_means, resampled
 from topomerge.fusion.transfer import (
-    laid_fixtures,
     laid_floor,
     laid_part,
     laid_windows,
     with_doors,
-    with_joined_fixtures,
     with_joined_windows,
     with_part_odds,
 )
@@ -76,12 +74,11 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     cells = _JoinedCells(maps[poses[0][0]].grid.origin, _edge(parts))
     order = sorted(range(len(poses)), key=lambda n: parts[n].assumed)  # what was assumed comes last
     placements = [Placement.of(pose, (bends or {}).get(k), maps[k].grid.edge) for k, pose in poses]
-    windows, fixtures, laid = [], [], []
+    windows, laid = [], []
     for n in order:
         map = maps[poses[n][0]]
         cells.add_map(map, placements[n], int(first_bits[n]), parts[n].assumed and n != order[0])
         windows.append(laid_windows(map, placements[n]))
-        fixtures.append(laid_fixtures(map, placements[n]))
         laid.append(laid_part(map, placements[n]))
     name = JOINED.join(maps[k].source or "map" for k, _ in poses)
     rooms = [part.rooms for part in laid]
@@ -90,7 +87,7 @@ def fuse(maps: MapSequence, poses: Sequence[tuple[int, Sim3]], bends: Mapping[in
     first = maps[poses[0][0]].levelling
     if not is_level(first):  # the frame of the joined map is that of the first one
         joined = replace(joined, parameters={**joined.parameters, LEVELLED: first.tolist()})
-    return with_joined_fixtures(joined, fixtures)
+    return joined
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from itertools import product
 
 import numpy as np
 
-from topomerge.extraction.cell_means import cell_middles
+from topomerge.extraction.cleaning import cell_middles
 from topomerge.kernels import copies as kernel
 from topomerge.kernels import morton
 from topomerge.kernels.lookup import build

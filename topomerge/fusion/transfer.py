@@ -1,4 +1,4 @@
-"""What the maps know that were joined -> the joined map: doors, windows, fixtures, and who was in the rooms (method 4)."""
+"""What the maps know that were joined -> the joined map: doors, windows, and who was in the rooms (method 4)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topomerge.extraction.distinct_doors import LEVEL_KINDS, distinct_doors, rooms_at
-from topomerge.extraction.elevations.fixtures import fixtures_in_map
+from topomerge.extraction.attributes import LEVEL_KINDS, distinct_doors, rooms_at
 from topomerge.extraction.elevations.windows import in_map, same_windows
 from topomerge.extraction.plans.part_rooms import PartRooms
-from topomerge.types import EDGE_DTYPE, FIXTURE_DTYPE, WINDOW_DTYPE, Array, Placement, TopometricMap
+from topomerge.types import EDGE_DTYPE, WINDOW_DTYPE, Array, Placement, TopometricMap
 from topomerge.types.arrays import within_turn
 
 DOOR_SIDE = 1.0  # m around a door in which floor says which rooms it joins
@@ -156,27 +155,14 @@ def with_part_odds(joined: TopometricMap, parts: Sequence[PartRooms]) -> Topomet
 
 def laid_windows(part: TopometricMap, placement: Placement) -> Array:
     """(W,) WINDOW_DTYPE of a part in the joined map, without rooms."""
-    windows = _laid(part.windows, placement, ("width", "sill", "head"), np.pi)
+    windows = part.windows.copy()
+    if len(windows):
+        windows["centre"] = placement.transform_points(windows["centre"])
+        windows["direction"] = within_turn(windows["direction"] + placement.pose.yaw, np.pi)
+        for name in ("width", "sill", "head"):
+            windows[name] *= placement.pose.scale
     windows["rooms"] = -1
     return windows
-
-
-def laid_fixtures(part: TopometricMap, placement: Placement) -> Array:
-    """(F,) FIXTURE_DTYPE of a part in the joined map, without a room."""
-    fixtures = _laid(part.fixtures, placement, ("width", "depth", "bottom", "top"), 2 * np.pi)
-    fixtures["room"] = -1
-    return fixtures
-
-
-def _laid(rows: Array, placement: Placement, lengths: Sequence[str], full_turn: float) -> Array:
-    """Rows with `centre` and `direction` in the joined map, the columns of lengths at its scale."""
-    rows = rows.copy()
-    if len(rows):
-        rows["centre"] = placement.transform_points(rows["centre"])
-        rows["direction"] = within_turn(rows["direction"] + placement.pose.yaw, full_turn)
-        for name in lengths:
-            rows[name] *= placement.pose.scale
-    return rows
 
 
 def with_joined_windows(joined: TopometricMap, parts: Sequence[Array]) -> TopometricMap:
@@ -188,13 +174,3 @@ def with_joined_windows(joined: TopometricMap, parts: Sequence[Array]) -> Topome
     windows = np.concatenate([np.zeros(0, WINDOW_DTYPE), *parts])
     first = [int(group[0]) for group in same_windows(windows)]
     return replace(joined, windows=in_map(joined, windows[first]))
-
-
-def with_joined_fixtures(joined: TopometricMap, parts: Sequence[Array]) -> TopometricMap:
-    """The joined map, which has its windows, with the niches and cupboards of its parts, each once.
-
-    Args:
-        parts: FIXTURE_DTYPE of `laid_fixtures`.
-    """
-    rows = np.concatenate([np.zeros(0, FIXTURE_DTYPE), *parts])
-    return replace(joined, fixtures=fixtures_in_map(joined, rows))

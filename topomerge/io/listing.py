@@ -10,7 +10,6 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
      "edges": [{"rooms": [id, id], "door": {"centre": [x, y, z], "width", "height", "direction"}, "kind",
                 "open", "half", "confidence", "lower": [x, y, z], "upper": [x, y, z]}, …],
      "windows": [{"rooms": [id, id], "centre": [x, y, z], "width", "sill", "head", "direction", "confidence"}, …],
-     "fixtures": [{"kind", "room", "centre": [x, y, z], "width", "depth", "bottom", "top", "direction", "confidence"}, …],
      "areas": [{"id", "room", "centroid": [x, y, z], "area"}, …], "narrows": [like edges, "areas" for "rooms"],
      "storeys": [{"id", "floor", "ceiling", "area"}, …],
      "seconds": {step: s}, "parameters": {…}, "warnings": […]}
@@ -19,8 +18,7 @@ what is not known is null. A height of 0 means that no ceiling (or lintel) was s
 that most of it was seen, `entered` that the sensor was in it, `outside` that it is out of doors; `glimpsed` rooms were probably
 only looked into. `kind` is door, opening or stairs; `half`: its leaf stands half open; `direction` is that of the wall's normal
 seen from above, from x towards y. The second room of a window is null where it leads out of doors; `sill` and `head` are m above
-the floor. Fixtures are niches and cupboards: `centre` lies in the face of their wall, `depth` counts from it, `bottom` and `top`
-from the floor, and `direction` points from the room into the wall.
+the floor.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from topomerge.io.atomic import replacing
-from topomerge.types import FIXTURE_KINDS, ROOM_ODDS, TopometricMap
+from topomerge.types import ROOM_ODDS, TopometricMap
 
 LISTING_FORMAT = 1
 EDGE_FACTS = ("kind", "open", "half", "confidence", "lower", "upper")
@@ -91,7 +89,6 @@ def map_to_json(map: TopometricMap) -> dict[str, Any]:
         "rooms": rooms,
         "edges": [_edge(e, "rooms") for e in map.edges],
         "windows": [_window(w) for w in map.windows],
-        "fixtures": [{name: f[name] for name in f.dtype.names} for f in map.fixtures],
         "areas": areas,
         "narrows": [_edge(e, "areas") for e in map.narrows],
         "storeys": storeys,
@@ -191,8 +188,6 @@ def map_to_text(map: TopometricMap) -> str:
     counts += [_plural(kinds[kind], kind) for kind in ("door", "opening", "stairs")]
     counts += [_plural(kinds["ramp"], "ramp")] if kinds["ramp"] else []
     counts += [_plural(len(map.windows), "window")] if len(map.windows) else []
-    of_walls = Counter(map.fixtures["kind"].tolist())
-    counts += [_plural(of_walls[kind], kind) for kind in FIXTURE_KINDS if of_walls[kind]]
     steps = [(f"{s:.2f}", step) for step, s in map.seconds.items()]
     steps.append((f"{sum(map.seconds.values()):.2f}", "all"))
     source = " ".join((map.source or "map").splitlines())  # names of files may hold line breaks

@@ -12,8 +12,8 @@ from topomerge.types import Array, VoxelGrid
 # The largest buildings have about 1,000 rooms, the tallest 163 storeys.
 ROOM_LIMIT, STOREY_LIMIT = 5_000, 200
 ROOM_COLUMNS, TOTAL_COLUMNS = 50_000_000, 100_000_000  # of the grid, in the rectangle around a room's floor, and around each
-CONNECTION_LIMIT = 30_000  # of edges, areas, narrows, windows and fixtures each, however many rooms there are
-EDGES_PER_ROOM, AREAS_PER_ROOM, WINDOWS_PER_ROOM, FIXTURES_PER_ROOM = 20, 20, 100, 100  # on average
+CONNECTION_LIMIT = 30_000  # of edges, areas, narrows and windows each, however many rooms there are
+EDGES_PER_ROOM, AREAS_PER_ROOM, WINDOWS_PER_ROOM = 20, 20, 100  # on average
 ABOUT_LIMIT = 1 << 24  # bytes of what a map says about itself
 PROPERTY_WIDTH = 64  # numbers of one property in a cell
 CELL_ARRAYS = {"grid": ("room", "provenance"), "navigable": ("navigable_room", "navigable_area"), "free": ()}  # a row for each
@@ -25,8 +25,8 @@ def require_sane_counts(heads: Mapping[str, Head]) -> None:
 
     Raises:
         KeyError: an array is missing.
-        ValueError: more rooms, edges, storeys, areas, narrows, windows or fixtures than a building has; more or fewer rows of a
-            property than cells; words that no map says.
+        ValueError: more rooms, edges, storeys, areas, narrows or windows than a building has; more or fewer rows of a property
+            than cells; words that no map says.
     """
     rooms, areas = heads["rooms"].size, heads["areas"].size
     cells = heads["room"].size + heads["navigable_room"].size
@@ -37,7 +37,6 @@ def require_sane_counts(heads: Mapping[str, Head]) -> None:
         "areas": (min(AREAS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({AREAS_PER_ROOM} a room)"),
         "narrows": (min(EDGES_PER_ROOM * areas, CONNECTION_LIMIT), f" ({EDGES_PER_ROOM} an area)"),
         "windows": (min(WINDOWS_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({WINDOWS_PER_ROOM} a room)"),
-        "fixtures": (min(FIXTURES_PER_ROOM * rooms, CONNECTION_LIMIT), f" ({FIXTURES_PER_ROOM} a room)"),
     }
     for name, (limit, share) in limits.items():
         words = share if limit < CONNECTION_LIMIT else ""

@@ -12,10 +12,10 @@ A `.tmap` is one compressed NumPy archive without pickled objects. Format 2 hold
 | grid_property.NAME, … | one row a cell |
 | room, navigable_room | int32 room of each cell, -1 none |
 | navigable_area | int32 area of each navigable cell, -1 none |
-| rooms, edges, storeys, areas, narrows, windows, fixtures | tables, see `topomerge.types` |
+| rooms, edges, storeys, areas, narrows, windows | tables, see `topomerge.types` |
 | provenance | uint32 bit set of the maps that saw each cell |
 
-`free_…`, `windows`, `fixtures` and `provenance` are absent where the map has none.
+`free_…`, `windows` and `provenance` are absent where the map has none. `fixtures` of earlier versions is not read.
 """
 
 from __future__ import annotations
@@ -37,8 +37,6 @@ from topomerge.kernels import morton
 from topomerge.types import (
     AREA_DTYPE,
     EDGE_DTYPE,
-    FIXTURE_DTYPE,
-    FIXTURE_KINDS,
     OLDER_EDGE_DTYPE,
     ROOM_DTYPE,
     ROOM_ODDS,
@@ -60,7 +58,8 @@ AREA_LIMIT = 1e12  # m2, and m3 for volumes
 SHORTEST_CELL_EDGE, LONGEST_CELL_EDGE = 0.001, 10.0  # m
 OLDER_ROOMS = np.dtype([(n, ROOM_DTYPE[n]) for n in ROOM_DTYPE.names or () if n not in ROOM_ODDS])  # before there were odds
 # Columns of tables that are nan where nothing was seen.
-UNSEEN = {"storeys": ("ceiling",), "windows": ("sill", "head"), "fixtures": ("depth", "bottom", "top")}
+UNSEEN = {"storeys": ("ceiling",), "windows": ("sill", "head")}
+UNREAD = {"fixtures"}  # niches and cupboards, in files of earlier versions
 WARNING_LIMIT, LONGEST_WARNING = 20, 500  # warnings of a map, characters of one
 
 
@@ -84,7 +83,8 @@ def save_map(map: TopometricMap, path: str | Path) -> None:
     arrays["navigable_area"] = np.asarray(map.navigable_area, "<i4")
     if map.free is not None:
         arrays |= _pack("free", map.free)
-    arrays |= {name: table for name, table in (("windows", map.windows), ("fixtures", map.fixtures)) if len(table)}
+    if len(map.windows):
+        arrays["windows"] = map.windows
     if map.provenance is not None:
         arrays["provenance"] = map.provenance.astype("<u4")
     about = {
@@ -118,7 +118,7 @@ def load_map(path: str | Path) -> TopometricMap:
         raise InputError(f"{path}: is of format {number}, and this topomerge reads format {TMAP_FORMAT}; {advice}")
     with _told_of(path):
         require_sane_counts(heads)  # before anything is unpacked
-    arrays = archive.read(path, KIND)
+    arrays = archive.read(path, KIND, [name for name in heads if name not in UNREAD])
     with _told_of(path):
         return _map(arrays)
 
@@ -235,16 +235,6 @@ def _windows(arrays: dict[str, Array]) -> Array:
     return windows
 
 
-def _fixtures(arrays: dict[str, Array]) -> Array:
-    """The table of niches and cupboards. Files of earlier versions have none."""
-    fixtures = _table(arrays, "fixtures", FIXTURE_DTYPE) if "fixtures" in arrays else np.zeros(0, FIXTURE_DTYPE)
-    if not set(fixtures["kind"].tolist()) <= set(FIXTURE_KINDS):
-        raise ValueError(f"fixtures has a kind that is none of {', '.join(FIXTURE_KINDS)}")
-    if (fixtures["width"] <= 0).any() or (fixtures["depth"] <= 0).any() or (fixtures["top"] <= fixtures["bottom"]).any():
-        raise ValueError("fixtures has one that is not wide, deep or high")
-    return fixtures
-
-
 def _limited_warnings(messages: list[Any]) -> tuple[str, ...]:
     """The first warnings, each one line of bounded length, and how many more there are."""
     surplus = len(messages) - WARNING_LIMIT
@@ -260,7 +250,7 @@ def _limited_warnings(messages: list[Any]) -> tuple[str, ...]:
 
 def _map(arrays: dict[str, Array]) -> TopometricMap:
     about = json.loads(arrays["about"].item())
-    if missing := set(about["arrays"]) - set(arrays):
+    if missing := set(about["arrays"]) - set(arrays) - UNREAD:
         raise KeyError(min(missing))
     provenance = _typed(arrays, "provenance", "u", 1).astype(np.uint32) if "provenance" in arrays else None
     edges, narrows = _edges(arrays, "edges"), _edges(arrays, "narrows")
@@ -282,7 +272,6 @@ def _map(arrays: dict[str, Array]) -> TopometricMap:
         navigable_area=_typed(arrays, "navigable_area", "i", 1).astype(np.int32),
         narrows=narrows,
         windows=_windows(arrays),
-        fixtures=_fixtures(arrays),
         free=_unpack(arrays, "free") if "free_cells" in arrays else None,
         provenance=provenance,
         source=str(about["source"]),

@@ -1,4 +1,4 @@
-"""Sparse voxel octree over Morton codes: building and querying (compiled loops behind `extraction.octree`).
+"""Sparse voxel octree over Morton codes: building and querying (compiled loops behind `extraction.views.visibility`).
 
 Leaves and nodes share one numbering: leaves 0 .. n - 1 are the rows of the grid, then the nodes level by level, the root
 last. The children of node n + j are ``child[j] .. child[j + 1] - 1``, its leaves the rows ``span[j]``, and ``box[j]`` the

@@ -12,7 +12,7 @@ Ints = NDArray[np.int64]
 
 @njit(cache=True)
 def _fill(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    points, values, frames, sizes, starts, low, tile, columns, first, lines, step, out
+    points, frames, sizes, starts, low, tile, columns, first, lines, step, out
 ):
     for p in range(len(points)):
         i, j = int((points[p, 0] - low[0]) // tile), int((points[p, 1] - low[1]) // tile)
@@ -32,18 +32,16 @@ def _fill(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
             near = int(np.floor(v))
             far = v - near
             row = starts[line] + u
-            for c in range(out.shape[3]):
-                if 0 <= near < out.shape[1]:
-                    out[row, near, w, c] += (1.0 - far) * values[p, c]
-                if 0 <= near + 1 < out.shape[1]:
-                    out[row, near + 1, w, c] += far * values[p, c]
+            if 0 <= near < out.shape[1]:
+                out[row, near, w] += 1.0 - far
+            if 0 <= near + 1 < out.shape[1]:
+                out[row, near + 1, w] += far
 
 
 def fill_strips(
-    points: Floats, frames: Floats, sizes: Ints, shape: tuple[int, int], step: Floats, tile: float, values: Floats | None = None
+    points: Floats, frames: Floats, sizes: Ints, shape: tuple[int, int], step: Floats, tile: float
 ) -> NDArray[np.float32]:
-    """How many points each element of strips along lines holds, or the sums of what belongs to them; between two elements across
-    they count for both, in proportion.
+    """Count the points in each element of strips along lines; between two elements across they count for both, in proportion.
 
     Args:
         points: (n, 3) m.
@@ -52,16 +50,14 @@ def fill_strips(
         shape: elements across, and above each other.
         step: (3,) m along, across and up of an element.
         tile: m, of the squares in which lines are looked up.
-        values: (n, c) of the points, to be summed; None: they are counted.
 
     Returns:
-        (sizes.sum(), *shape) float32, one strip after the other; (sizes.sum(), *shape, c) of values.
+        (sizes.sum(), *shape) float32, one strip after the other.
     """
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    summed = np.ones((len(points), 1)) if values is None else values
-    out = np.zeros((int(starts[-1]), *shape, summed.shape[1]), np.float32)
+    out = np.zeros((int(starts[-1]), *shape), np.float32)
     if not len(frames) or not len(points):
-        return out[..., 0] if values is None else out
+        return out
     along, across = sizes * step[0], shape[0] * step[1]
     corners = frames[:, None, :2] + np.array([0.0, 1.0])[:, None] * (along[:, None] * frames[:, 2:4])[:, None]
     corners = np.concatenate([corners, corners + across * frames[:, None, 4:6]], axis=1)
@@ -70,8 +66,8 @@ def fill_strips(
     table = _touched(frames, along, across, low, tile, columns)
     first = np.searchsorted(table[:, 0], np.arange(int(columns.prod()) + 1))
     lines = np.ascontiguousarray(table[:, 1])
-    _fill(points, summed, frames, sizes, starts, low, tile, columns, first, lines, step, out)
-    return out[..., 0] if values is None else out
+    _fill(points, frames, sizes, starts, low, tile, columns, first, lines, step, out)
+    return out
 
 
 def _touched(frames: Floats, along: Floats, across: float, low: Floats, tile: float, columns: Ints) -> Ints:

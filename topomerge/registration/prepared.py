@@ -9,7 +9,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from topomerge.extraction.cell_means import cell_middles
+from topomerge.extraction.cleaning import cell_middles
 from topomerge.matching.plan_fields import PlanFields
 from topomerge.registration.bend.measure import Target, WallLines, samples, wall_lines
 from topomerge.registration.bend.pieces import Pieces, map_sensor, pieces_of

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topomerge.extraction.cell_means import cell_middles
+from topomerge.extraction.cleaning import cell_middles
 from topomerge.kernels import icp
 from topomerge.types import Array, Sim3, VoxelGrid
 

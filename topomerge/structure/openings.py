@@ -1,4 +1,4 @@
-"""Doors, openings, windows and fixtures of a map, set into the walls that carry them."""
+"""Doors, openings and windows of a map, set into the walls that carry them."""
 
 from __future__ import annotations
 
@@ -31,16 +31,6 @@ SET_WINDOW_DTYPE = np.dtype(
         ("direction", "f8"),  # rad, of the wall's normal, in [0, pi)
     ]
 )
-SET_FIXTURE_DTYPE = np.dtype(
-    [
-        ("fixture", "i4"),  # row of the map's fixtures
-        ("wall", "i4"),  # row of the walls; -1: none was seen around it
-        ("depth", "f8"),  # m; a usual one where it was not seen, as those that follow
-        ("bottom", "f8"),  # m above the floor
-        ("top", "f8"),
-    ]
-)
-USUAL_DEPTH = {"niche": 0.1, "cupboard": 0.45}  # m
 USUAL_SILL, USUAL_HEAD, LEAST_PANE = 0.9, 2.1, 0.3  # m above the floor, where they were not seen, and between them at least
 CARRIER_REACH = 0.8  # m between the middle of a door and the middle line of its wall
 STRANGE = 0.4  # m: a wall of other rooms has to be so much nearer
@@ -84,22 +74,6 @@ def windows_in_walls(map: TopometricMap, walls: Array) -> Array:
     return out
 
 
-def fixtures_in_walls(map: TopometricMap, walls: Array) -> Array:
-    """(F,) SET_FIXTURE_DTYPE, in the order of the map's fixtures; they stay where they are, in the face of their wall.
-
-    Args:
-        walls: WALL_DTYPE of the whole map.
-    """
-    out = np.zeros(len(map.fixtures), SET_FIXTURE_DTYPE)
-    for k, (placed, fixture) in enumerate(zip(out, map.fixtures, strict=True)):
-        kind, bottom = str(fixture["kind"]), float(fixture["bottom"])
-        placed["fixture"], placed["wall"] = k, _carrier(fixture, fixture["room"][None], walls, map.rooms)
-        placed["depth"] = fixture["depth"] if np.isfinite(fixture["depth"]) else USUAL_DEPTH[kind]
-        stands = kind == "cupboard" and not np.isfinite(bottom)
-        placed["bottom"], placed["top"] = _pane(0.0 if stands else bottom, float(fixture["top"]))
-    return out
-
-
 def _pane(sill: float, head: float) -> tuple[float, float]:
     """Sill and head above the floor, usual ones where they were not seen; LEAST_PANE high what ends below the floor."""
     low = sill if np.isfinite(sill) else min(USUAL_SILL, head - LEAST_PANE) if np.isfinite(head) else USUAL_SILL
@@ -110,10 +84,10 @@ def _pane(sill: float, head: float) -> tuple[float, float]:
 
 
 def _carrier(edge: Array, rooms: Array, walls: Array, table: Array) -> int:
-    """Row of the wall nearest to a door, a window or a fixture among those that part its rooms, -1 none.
+    """Row of the wall nearest to a door or a window among those that part its rooms, -1 none.
 
     Args:
-        rooms: (2,) on its two sides, -1 none; or (1,) that sees it, whatever lies behind.
+        rooms: (2,) on its two sides, -1 none.
         table: ROOM_DTYPE of the whole map.
     """
     inner = rooms[rooms >= 0]
@@ -125,7 +99,7 @@ def _carrier(edge: Array, rooms: Array, walls: Array, table: Array) -> int:
     off = np.abs(apart[:, 0] * along[:, 1] - apart[:, 1] * along[:, 0])
     past = np.maximum(np.maximum(-place, place - length), 0.0)
     beside = np.isin(walls["rooms"], inner).sum(axis=1)
-    two = (np.sort(walls["rooms"], axis=1) == np.sort(rooms)).all(axis=1) if len(rooms) == 2 else beside > 0
+    two = (np.sort(walls["rooms"], axis=1) == np.sort(rooms)).all(axis=1)
     cost = np.hypot(off, past) + np.where(two, 0.0, STRANGE)
     fits = np.isin(walls["storey"], table["storey"][inner]) & (beside > 0) & (off <= CARRIER_REACH)
     fits &= past <= (0.5 - LEAST_SHARE) * edge["width"] + 0.1

@@ -11,7 +11,7 @@ import shapely
 from topomerge.structure.face_points import FacePoints, face_points, wall_columns
 from topomerge.structure.floors import floor_polygons
 from topomerge.structure.lines import main_direction, straight_lines
-from topomerge.structure.openings import OPENING_DTYPE, fixtures_in_walls, openings_in_walls, windows_in_walls
+from topomerge.structure.openings import OPENING_DTYPE, openings_in_walls, windows_in_walls
 from topomerge.structure.outlines import apart, room_outline
 from topomerge.structure.sides import one_side_each
 from topomerge.structure.walls import WALL_DTYPE, walls_between
@@ -26,7 +26,6 @@ class PlanStructure:
         walls: (W,) WALL_DTYPE, by storey.
         openings: (O,) OPENING_DTYPE, a row for each door and opening of the map that is no flight of stairs.
         windows: (N,) SET_WINDOW_DTYPE, a row for each window of the map.
-        fixtures: (F,) SET_FIXTURE_DTYPE, a row for each niche and cupboard of the map.
         rooms: of each room its floor between the faces of its walls, m, counter-clockwise; rooms of a storey do not overlap.
         storey_of_rooms: (R,) int32.
     """
@@ -34,7 +33,6 @@ class PlanStructure:
     walls: Array
     openings: Array
     windows: Array
-    fixtures: Array
     rooms: list[shapely.MultiPolygon]
     storey_of_rooms: Array
 
@@ -66,8 +64,7 @@ def _structure(map: TopometricMap) -> PlanStructure:
         walls.append(walls_between(map, storey, rooms, points))
     every = np.concatenate(walls)
     openings = openings_in_walls(map, every) if len(map.edges) else np.zeros(0, OPENING_DTYPE)
-    windows, fixtures = windows_in_walls(map, every), fixtures_in_walls(map, every)
-    return PlanStructure(every, openings, windows, fixtures, rooms, map.rooms["storey"])
+    return PlanStructure(every, openings, windows_in_walls(map, every), rooms, map.rooms["storey"])
 
 
 def _outlines(points: FacePoints, rooms: Array, floors: list[shapely.MultiPolygon]) -> list[shapely.MultiPolygon]:

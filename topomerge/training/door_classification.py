@@ -1,4 +1,4 @@
-"""Task `door_classification`: is a narrowing of the floor a door (`extraction.plans.door_classifier`)?
+"""Task `door_classification`: is a narrowing of the floor a door (`extraction.plans.passages`)?
 
 A plan is cut into regions as the extraction does. Two neighbouring regions are an example: 1 where most of them lie in different
 true rooms. Regions of one true room are then merged, as a perfect classifier would, and what remains gives more examples: the
@@ -21,8 +21,14 @@ from torch import Tensor, nn
 from topomerge.datasets.core.derived import derive, read_derived
 from topomerge.datasets.pairs.plan_examples import PlanRecipe, build_plans, load_examples
 from topomerge.errors import InputError
-from topomerge.extraction.plans.door_classifier import read_classifier
-from topomerge.extraction.plans.passages import DOOR_FEATURES, clearance_of, door_features, find_passages, regions_of
+from topomerge.extraction.plans.passages import (
+    DOOR_FEATURES,
+    clearance_of,
+    door_features,
+    find_passages,
+    read_classifier,
+    regions_of,
+)
 from topomerge.extraction.plans.plan_network import (
     GRID_NETWORK_FILE,
     PLAN_NETWORK_FILE,

@@ -20,7 +20,6 @@ from topomerge.datasets.pairs.plan_examples import PlanExample, PlanRecipe, buil
 from topomerge.datasets.pairs.plan_truth import TRUE_CLASSES
 from topomerge.datasets.pairs.scan_items import FLAT_SENSOR_SHARES
 from topomerge.errors import InputError
-from topomerge.extraction.classified_storey import COLUMN_CLASSES
 from topomerge.extraction.plans.plan_network import (
     EVIDENCE_CHANNELS,
     PLAN_SIGNATURE,
@@ -28,6 +27,7 @@ from topomerge.extraction.plans.plan_network import (
     evidence,
     read_weights,
 )
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES
 from topomerge.models.plan_unet import PlanProbabilities, PlanUNet
 from topomerge.networks.network import Run
 from topomerge.training.grid_noise import with_grid_noise

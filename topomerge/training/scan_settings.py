@@ -92,15 +92,17 @@ class WallAugment:
 
 
 @dataclass
-class WallTask(RasterTask):
-    """What networks of walls share.
-
-    Args:
-        steps: of an epoch; warmup: steps in which the rate rises.
-        length: places of a stretch, even; at_holes: share of the stretches about the side of a door or window.
-        classes: weights of the classes in the cross-entropy.
+class WallSegmentation(RasterTask):
+    """Args:
+    steps: of an epoch; warmup: steps in which the rate rises.
+    length: places of a stretch, even; at_holes: share of the stretches about the side of a door or window.
+    classes: weights of the classes in the cross-entropy.
+    widths: of `models.wall_network.WallNetwork`.
+    unseen: weight of places where nothing was seen.
     """
 
+    task: str = "wall_segmentation"
+    name: str = "wall_segmentation"
     data: PlanRecipe = field(default_factory=PlanRecipe)
     heldout: PlanRecipe = field(default_factory=PlanRecipe)
     epochs: int = 12
@@ -109,62 +111,18 @@ class WallTask(RasterTask):
     warmup: int = 100
     length: int = 96
     at_holes: float = 0.5
-    classes: list[float] = field(default_factory=lambda: [1.0, 1.5, 3.0, 1.5])
-
-
-@dataclass
-class WallSegmentation(WallTask):
-    """Args:
-    widths: of `models.wall_network.WallNetwork`.
-    unseen: weight of places where nothing was seen.
-    """
-
-    task: str = "wall_segmentation"
-    name: str = "wall_segmentation"
-    widths: list[int] = field(default_factory=lambda: [24, 32, 96, 64])
     classes: list[float] = field(default_factory=lambda: [1.0, 1.5, 3.0, 1.5, 2.0, 2.5, 1.0])
+    widths: list[int] = field(default_factory=lambda: [24, 32, 96, 64])
     unseen: float = 0.05
     augment: WallAugment = field(default_factory=WallAugment)
     watch: str = "f1_doors"
 
 
 @dataclass
-class ColourAugment:
-    """What is done to stretches of coloured walls while training, beside mirroring.
-
-    Args:
-        grey: share of stretches that lose their hues.
-        noise: standard deviation of what each element is off by, drawn between 0 and this.
-        lost: share of elements whose colour is not seen, drawn between 0 and this.
-        faint: least factor of all contrasts.
-    """
-
-    grey: float = 0.2
-    noise: float = 0.1
-    lost: float = 0.4
-    faint: float = 0.6
-
-
-@dataclass
-class WallColours(WallTask):
-    """Args:
-    width, dropout: of `models.colour_network.ColourNetwork`.
-    """
-
-    task: str = "wall_colours"
-    name: str = "wall_colours"
-    length: int = 128
-    width: int = 64
-    dropout: float = 0.1
-    augment: ColourAugment = field(default_factory=ColourAugment)
-    watch: str = "log_chance"
-
-
-@dataclass
 class WallDoors(TaskSettings):
     """Args:
-    data, painted, flat: scans that show walls, those with colours, and slices and grid maps; heldout, heldout_painted,
-        heldout_flat: likewise, of other buildings.
+    data, frameless, flat: scans that show walls, those of doors without frames, and slices and grid maps.
+    heldout, heldout_frameless, heldout_flat: likewise, of other buildings.
     pull: to 0, of all weights but the constants.
     folds: of scans, for the scores.
     """
@@ -172,10 +130,10 @@ class WallDoors(TaskSettings):
     task: str = "wall_doors"
     name: str = "wall_doors"
     data: PlanRecipe = field(default_factory=PlanRecipe)
-    painted: PlanRecipe = field(default_factory=PlanRecipe)
+    frameless: PlanRecipe = field(default_factory=PlanRecipe)
     flat: PlanRecipe = field(default_factory=PlanRecipe)
     heldout: PlanRecipe = field(default_factory=PlanRecipe)
-    heldout_painted: PlanRecipe = field(default_factory=PlanRecipe)
+    heldout_frameless: PlanRecipe = field(default_factory=PlanRecipe)
     heldout_flat: PlanRecipe = field(default_factory=PlanRecipe)
     pull: float = 1.0
     folds: int = 5

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.colour_network import COLOUR_CLASSES
 from topomerge.extraction.elevations.elevation import WALL_CLASSES
-from topomerge.training.scan_settings import PlanSegmentation, WallColours, WallSegmentation, WallTask
+from topomerge.training.scan_settings import PlanSegmentation, WallSegmentation
 from topomerge.training.shared_settings import TaskSettings
 from topomerge.training.task_settings import LOOKALIKES_TAKEN, MergeBelief
 
@@ -49,13 +48,10 @@ def check_task(settings: TaskSettings) -> None:
             raise InputError(f"widths must be 8 numbers of channels, not {settings.widths}")
         if len(settings.loss.classes) != 5 or min(settings.loss.classes) <= 0:
             raise InputError(f"loss.classes must be 5 weights above 0, not {settings.loss.classes}")
-    if isinstance(settings, WallColours) and settings.width < 1:
-        raise InputError(f"width must be 1 or more, not {settings.width}")
-    if isinstance(settings, WallSegmentation) and (len(settings.widths) != 4 or min(settings.widths) < 1):
-        raise InputError(f"widths must be 4 numbers of channels, not {settings.widths}")
-    if isinstance(settings, WallTask):
+    if isinstance(settings, WallSegmentation):
+        if len(settings.widths) != 4 or min(settings.widths) < 1:
+            raise InputError(f"widths must be 4 numbers of channels, not {settings.widths}")
         if settings.length < 8 or settings.length % 2:
             raise InputError(f"length must be an even number of places, 8 or more, not {settings.length}")
-        count = len(WALL_CLASSES if isinstance(settings, WallSegmentation) else COLOUR_CLASSES)
-        if len(settings.classes) != count or min(settings.classes) <= 0:
-            raise InputError(f"classes must be {count} weights above 0, not {settings.classes}")
+        if len(settings.classes) != len(WALL_CLASSES) or min(settings.classes) <= 0:
+            raise InputError(f"classes must be {len(WALL_CLASSES)} weights above 0, not {settings.classes}")

@@ -47,9 +47,6 @@ TASKS = {
     "wall_segmentation": Task(
         "wall_segmentation", "WallSegmentation", "topomerge.networks", "wall_network.onnx", 1.2, "scan_settings"
     ),
-    "wall_colours": Task(
-        "wall_colours", "WallColours", "topomerge.extraction.elevations", "colour_network.npz", 1.0, "scan_settings"
-    ),
     "passages": Task("passages", "Passages", "topomerge.extraction", "passages.json", 0.2, "scan_settings"),
     "wall_doors": Task("wall_doors", "WallDoors", "topomerge.extraction.elevations", "wall_doors.json", 0.2, "scan_settings"),
     "room_odds": Task("room_odds", "RoomOdds", "topomerge.extraction", "room_odds.json", 0.5, "scan_settings"),

@@ -1,7 +1,7 @@
 """Task `wall_doors`: how much what plans and what walls show says of a door (`extraction.elevations.wall_doors`).
 
-The extraction's candidates in scans that did not train the networks of walls, which ship, with colours and without, and in slices
-and grid maps; a candidate is a door where a true one lies near. There is a logistic model for each of what shows it.
+The extraction's candidates in scans that did not train the networks of walls, which ship, those of doors without frames among
+them, and in slices and grid maps; a candidate is a door where a true one lies near. There is a logistic model for each source.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from sklearn.linear_model import LogisticRegression
 from topomerge.datasets.pairs.plan_examples import PlanRecipe
 from topomerge.datasets.pairs.wall_examples import build_walls, load_walls
 from topomerge.errors import InputError
-from topomerge.extraction.classified_storey import ClassifiedStorey
-from topomerge.extraction.distinct_doors import LEVEL_KINDS, rooms_at
+from topomerge.extraction.attributes import LEVEL_KINDS, rooms_at
 from topomerge.extraction.elevations.doorways import StoreyWalls, door_places, place_classes
 from topomerge.extraction.elevations.elevation import Elevations
 from topomerge.extraction.elevations.wall_doors import (
@@ -30,6 +29,7 @@ from topomerge.extraction.elevations.wall_doors import (
     door_candidates,
     door_chance,
 )
+from topomerge.extraction.plans.storey_plan import ClassifiedStorey
 from topomerge.extraction.walls import find_doorways
 from topomerge.io.weight_files import read_weights_json
 from topomerge.metrics import match_places
@@ -50,7 +50,8 @@ def fit(settings: WallDoors, say: Say) -> dict[str, float]:
 
 def fit_doors(settings: WallDoors, say: Say) -> Fitted:
     """Weights of the models from all scans, and scores of those that were fitted without each scan."""
-    scans = [scan for recipe in (settings.data, settings.painted, settings.flat) for scan in candidates_of(recipe, settings, say)]
+    recipes = (settings.data, settings.frameless, settings.flat)
+    scans = [scan for recipe in recipes for scan in candidates_of(recipe, settings, say)]
     parts = [scans[k :: settings.folds] for k in range(settings.folds)]
     left_out = []
     for k, part in enumerate(parts):
@@ -132,6 +133,6 @@ def door_figures(scans: Sequence[tuple[Array, Array]]) -> dict[str, float]:
 def judge(settings: WallDoors, file: Path, say: Say) -> dict[str, Any]:
     """Scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
-    recipes = (settings.heldout, settings.heldout_painted, settings.heldout_flat)
+    recipes = (settings.heldout, settings.heldout_frameless, settings.heldout_flat)
     scans = [scan for recipe in recipes for scan in candidates_of(recipe, settings, say)]
     return door_figures([(door_chance(c, weights), y) for c, y in scans])

@@ -1,4 +1,4 @@
-"""Task `wall_segmentation`: the network that says what is in each place along a wall (`extraction.elevations.wall_network`).
+"""Task `wall_segmentation`: the network that says what is in each place along a wall (`extraction.elevations.elevation`).
 
 Stretches of the walls of simulated scans, mirrored, seen from a little nearer or farther, with points taken away now and then.
 Every n-th scan is watched.
@@ -16,18 +16,26 @@ from torch.nn import functional
 
 from topomerge.datasets.pairs.wall_examples import WallExample, build_walls, load_walls
 from topomerge.errors import InputError
-from topomerge.extraction.elevations.colour_network import COLOUR_CLASSES, coarse_classes
-from topomerge.extraction.elevations.elevation import BANDS, DEPTHS, STRIP_CHANNELS, WALL_CLASSES
-from topomerge.extraction.elevations.wall_network import PLACES, WALL_SIGNATURE, place_probabilities, read_network
+from topomerge.extraction.elevations.elevation import (
+    BANDS,
+    DEPTHS,
+    PLACES,
+    STRIP_CHANNELS,
+    WALL_CLASSES,
+    WALL_SIGNATURE,
+    place_probabilities,
+    read_network,
+)
 from topomerge.models.wall_network import WallNetwork, WallProbabilities
 from topomerge.networks.network import Run
 from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import Exported, ExportedJob, run_network
-from topomerge.training.scan_settings import WallAugment, WallSegmentation, WallTask
+from topomerge.training.scan_settings import WallAugment, WallSegmentation
 from topomerge.types import Array
 
-# Index of each of `WALL_CLASSES` among those that colours tell apart: half-open doors are open, niches and cupboards are wall.
-COARSE_CLASS = coarse_classes(np.eye(len(WALL_CLASSES))).argmax(axis=1)
+COARSE_CLASSES = ("wall", "open", "shut", "window")
+# Index of each of `WALL_CLASSES` among them: half-open doors are open, niches and cupboards are wall.
+COARSE_CLASS = np.array([0, 1, 2, 3, 1, 0, 0])
 ScanT = TypeVar("ScanT")
 Stretch = tuple[Array, Array, Array]  # strip, truth and weight of each place
 
@@ -47,7 +55,7 @@ def fit(settings: WallSegmentation, say: Say) -> dict[str, float]:
     return run_network(job, settings, settings.steps, say)
 
 
-def learned_and_watched(scans: Sequence[ScanT], settings: WallTask) -> tuple[list[ScanT], list[ScanT]]:
+def learned_and_watched(scans: Sequence[ScanT], settings: WallSegmentation) -> tuple[list[ScanT], list[ScanT]]:
     """The scans to train on, and every n-th one, which is watched.
 
     Raises:
@@ -156,18 +164,18 @@ def wall_scores(examples: Sequence[WallExample], network: Run) -> dict[str, floa
             strip = scan.strips[low:high] / np.float32(255)
             right, there = answers(scan.truth[low:high], strip)
             np.add.at(table, (right[there], place_probabilities(strip, network).argmax(axis=1)[there]), 1)
-    coarse = np.zeros((len(COLOUR_CLASSES), len(COLOUR_CLASSES)), np.int64)
+    coarse = np.zeros((len(COARSE_CLASSES), len(COARSE_CLASSES)), np.int64)
     np.add.at(coarse, np.ix_(COARSE_CLASS, COARSE_CLASS), table)
     return {**f1_scores(table, WALL_CLASSES), **class_scores(coarse)}
 
 
 def class_scores(table: Array) -> dict[str, float]:
-    """F1 of each of `COLOUR_CLASSES`, and the mean of those of doors.
+    """F1 of each of `COARSE_CLASSES`, and the mean of those of doors.
 
     Args:
         table: (4, 4) how often each was taken for each.
     """
-    scores = f1_scores(table, COLOUR_CLASSES)
+    scores = f1_scores(table, COARSE_CLASSES)
     return {**scores, "f1_doors": float((scores["f1_open"] + scores["f1_shut"]) / 2)}
 
 

@@ -23,8 +23,6 @@ from topomerge.types.some_rooms import confident, of_rooms
 from topomerge.types.topometric_map import (
     AREA_DTYPE,
     EDGE_DTYPE,
-    FIXTURE_DTYPE,
-    FIXTURE_KINDS,
     JOINED,
     OLDER_EDGE_DTYPE,
     ROOM_DTYPE,
@@ -40,8 +38,6 @@ from topomerge.types.topometric_map import (
 __all__ = [
     "AREA_DTYPE",
     "EDGE_DTYPE",
-    "FIXTURE_DTYPE",
-    "FIXTURE_KINDS",
     "JOINED",
     "LEVELLED",
     "OLDER_EDGE_DTYPE",

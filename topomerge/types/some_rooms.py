@@ -1,4 +1,4 @@
-"""A map without some of its rooms, doors, windows and fixtures: those that are no rooms, and those that a user does not trust."""
+"""A map without some of its rooms, doors and windows: those that are no rooms, and those that a user does not trust."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from topomerge.types.topometric_map import TopometricMap
 def of_rooms(map: TopometricMap, stays: Array) -> TopometricMap:
     """The map of some of its rooms, numbered anew in their order.
 
-    Cells of the others are of no room, and their areas, doors, stairs and fixtures are left out. A window of theirs stays
+    Cells of the others are of no room, and their areas, doors and stairs are left out. A window of theirs stays
     where the room on its other side does; it then leads to where nothing was seen. Storeys stay.
 
     Args:
@@ -33,8 +33,6 @@ def of_rooms(map: TopometricMap, stays: Array) -> TopometricMap:
     ends = number[windows["rooms"]]
     both = (ends >= 0).all(axis=1, keepdims=True)
     windows["rooms"] = np.where(both, np.sort(ends, axis=1), -np.sort(-ends, axis=1))
-    fixtures = map.fixtures[stays[map.fixtures["room"]]].copy()
-    fixtures["room"] = number[fixtures["room"]]
     assert map.navigable_area is not None
     return replace(
         map,
@@ -46,12 +44,11 @@ def of_rooms(map: TopometricMap, stays: Array) -> TopometricMap:
         navigable_area=area_number[map.navigable_area],
         narrows=narrows,
         windows=windows[windows["rooms"][:, 0] >= 0],
-        fixtures=fixtures,
     )
 
 
 def confident(map: TopometricMap, least: float) -> TopometricMap:
-    """The map without the rooms, doors, stairs, windows and fixtures that are less likely than `least`; as `of_rooms` has it.
+    """The map without the rooms, doors, stairs and windows that are less likely than `least`; as `of_rooms` has it.
 
     Args:
         map: any map.
@@ -64,6 +61,5 @@ def confident(map: TopometricMap, least: float) -> TopometricMap:
         raise InputError(f"min_confidence {least}: is no probability; give a number from 0 to 1 (0 keeps everything)")
     if least == 0:
         return map
-    tables = (map.edges, map.windows, map.fixtures)
-    edges, windows, fixtures = (table[table["confidence"] >= least] for table in tables)
-    return of_rooms(replace(map, edges=edges, windows=windows, fixtures=fixtures), map.rooms["confidence"] >= least)
+    edges, windows = (table[table["confidence"] >= least] for table in (map.edges, map.windows))
+    return of_rooms(replace(map, edges=edges, windows=windows), map.rooms["confidence"] >= least)

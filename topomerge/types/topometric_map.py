@@ -68,20 +68,6 @@ WINDOW_DTYPE = np.dtype(
         ("confidence", "f8"),  # that it is one: 0..1
     ]
 )
-FIXTURE_DTYPE = np.dtype(
-    [
-        ("kind", "U8"),  # of FIXTURE_KINDS: a recess in a wall, or what stands before one
-        ("room", "i4"),  # that it is seen from
-        ("centre", "f8", 3),  # on the floor, in the face of the wall, in the input's frame
-        ("width", "f8"),  # m
-        ("depth", "f8"),  # m from the wall's face to the back of a niche, or to the front of a cupboard; nan: not seen
-        ("bottom", "f8"),  # m above the floor, where it begins and where it ends; nan: not seen
-        ("top", "f8"),
-        ("direction", "f8"),  # rad, in the horizontal plane, from the room into the wall, in [0, 2 pi)
-        ("confidence", "f8"),  # that it is one: 0..1
-    ]
-)
-FIXTURE_KINDS = ("niche", "cupboard")
 STOREY_DTYPE = np.dtype([("floor", "f8"), ("ceiling", "f8"), ("area", "f8")])  # m, m (nan: not seen), m2
 
 
@@ -130,7 +116,6 @@ class TopometricMap:
         navigable_area: (m,) int32, area of each navigable cell, -1 none.
         narrows: (N,) EDGE_DTYPE whose `rooms` are two areas of one room.
         windows: (W,) WINDOW_DTYPE, those that the walls show.
-        fixtures: (F,) FIXTURE_DTYPE, the niches and cupboards that the walls show.
         free: cells known to be empty (rays crossed them), of the same origin but perhaps another edge length; or None.
         provenance: (n,) uint32 bit set of the maps that saw each cell, or None for a map of one source.
         source: the file it was made from; of a joined map those of all, with `JOINED` between them.
@@ -150,7 +135,6 @@ class TopometricMap:
     navigable_area: Array | None = None
     narrows: Array = field(default_factory=lambda: np.zeros(0, EDGE_DTYPE))
     windows: Array = field(default_factory=lambda: np.zeros(0, WINDOW_DTYPE))
-    fixtures: Array = field(default_factory=lambda: np.zeros(0, FIXTURE_DTYPE))
     free: VoxelGrid | None = None
     provenance: Array | None = None
     source: str = ""
@@ -167,7 +151,6 @@ class TopometricMap:
         require(self.areas.dtype == AREA_DTYPE, "areas must have AREA_DTYPE")
         require(self.narrows.dtype == EDGE_DTYPE, "narrows must have EDGE_DTYPE")
         require(self.windows.dtype == WINDOW_DTYPE, "windows must have WINDOW_DTYPE")
-        require(self.fixtures.dtype == FIXTURE_DTYPE, "fixtures must have FIXTURE_DTYPE")
         if self.navigable_area is None:
             object.__setattr__(self, "navigable_area", np.full(len(self.navigable), -1, np.int32))
         assert self.navigable_area is not None
@@ -186,8 +169,6 @@ class TopometricMap:
         require(int(first.min(initial=0)) >= 0 and int(second.min(initial=0)) >= -1, "a window's room does not exist")
         require(int(self.windows["rooms"].max(initial=-1)) < len(self.rooms), "a window's room does not exist")
         require(bool((first != second).all()), "a window must not lead from a room into itself")
-        beside = self.fixtures["room"]
-        require(not len(beside) or (beside.min() >= 0 and beside.max() < len(self.rooms)), "a fixture's room does not exist")
         storey = self.rooms["storey"]
         require(not len(storey) or (storey.min() >= 0 and storey.max() < len(self.storeys)), "a room's storey is missing")
         require(self.provenance is None or len(self.provenance) == len(self.grid), "provenance: one value a cell")

@@ -201,8 +201,6 @@ def legend(map: TopometricMap) -> Markup:
         ("shut", "shut door", bool((way & ~map.edges["open"]).any())),
         ("opening", "opening", bool((map.edges["kind"] == "opening").any())),
         ("window", "window", len(map.windows) > 0),
-        ("niche", "niche", bool((map.fixtures["kind"] == "niche").any())),
-        ("cupboard", "cupboard", bool((map.fixtures["kind"] == "cupboard").any())),
         ("stairs", "stairs or ramp", bool((~way).any())),
         ("glimpsed", "glimpsed: only looked into", bool(map.rooms["glimpsed"].any())),
         ("narrow", "narrowing within a room", len(map.narrows) > 0),

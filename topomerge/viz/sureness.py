@@ -1,6 +1,6 @@
 """How sure a report is of what it shows, as `data-sure` of its elements: its slider hides what is less sure.
 
-It hides what `topomerge.types.confident` leaves out: with a room its doors and fixtures, and its windows where no room is left
+It hides what `topomerge.types.confident` leaves out: with a room its doors, and its windows where no room is left
 beside them.
 """
 
@@ -25,11 +25,6 @@ def window_sureness(map: TopometricMap, window: Any) -> str:
     """Of a window: no more than of the surer one of its rooms."""
     rooms = window["rooms"][window["rooms"] >= 0]
     return _text(min(window["confidence"], map.rooms["confidence"][rooms].max()))
-
-
-def fixture_sureness(map: TopometricMap, fixture: Any) -> str:
-    """Of a niche or a cupboard: no more than of its room."""
-    return _text(min(fixture["confidence"], map.rooms["confidence"][fixture["room"]]))
 
 
 def _text(odds: float) -> str:

@@ -19,7 +19,7 @@ from topomerge.viz.outline import room_outlines, seen_outline, wall_outline
 from topomerge.viz.plan import Place, StoreyPlan, places
 from topomerge.viz.scene import hex_colour
 from topomerge.viz.sheet import Sheet
-from topomerge.viz.sureness import edge_sureness, fixture_sureness, room_sureness, window_sureness
+from topomerge.viz.sureness import edge_sureness, room_sureness, window_sureness
 
 SCREEN = (840, 560)  # pixels that the drawing is expected to have: the page's script knows better
 PLAN_MARGIN = 0.04  # of the longer side, around the building
@@ -48,7 +48,6 @@ def plan_svgs(map: TopometricMap, sheet: Sheet, plans: Sequence[StoreyPlan], col
             element("path", class_="seen", d=seen_outline(plan, sheet)),
             _layer("rooms", [_room(map, sheet, i, d, hex_colour(colours[i])) for i, d in outlines.items()]),
             element("path", class_="wall", d=wall_outline(plan, sheet), fill_rule="evenodd"),
-            _layer("fixtures", _fixtures(map, sheet, storey)),
             _layer("windows", _windows(map, sheet, storey)),
             _layer("areas", _narrows(map, sheet, storey)),
             _layer("graph", _graph(map, sheet, storey, everywhere)),
@@ -235,18 +234,4 @@ def _windows(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
     for window in map.windows[on_storey]:
         lines = [_line(sheet, *_ends(window), class_=name) for name in ("gap", "frame", "pane")]
         parts.append(element("g", *lines, class_="window", data_sure=window_sureness(map, window)))
-    return parts
-
-
-def _fixtures(map: TopometricMap, sheet: Sheet, storey: int) -> list[Markup]:
-    """Faint outlines of niches in their walls and of cupboards before theirs; a line where no depth was seen."""
-    parts = []
-    for fixture in map.fixtures[map.rooms["storey"][map.fixtures["room"]] == storey]:
-        deep = float(np.nan_to_num(fixture["depth"])) * (1 if fixture["kind"] == "niche" else -1)
-        shift = deep * np.array([math.cos(fixture["direction"]), math.sin(fixture["direction"])])
-        a, b = np.array(_ends(fixture))
-        corners = [sheet.at(corner) for corner in (a, b, b + shift, a + shift)]
-        outline = "M" + "L".join(f"{x} {y}" for x, y in corners) + "z"
-        sure = fixture_sureness(map, fixture)
-        parts.append(element("path", class_=f"fixture {fixture['kind']}", d=outline, data_sure=sure))
     return parts

@@ -172,7 +172,6 @@ def test_a_model_each_for_what_shows_a_door():
         "plan": [-1.0, *zeros],
         "wall": [1.0, *zeros],
         "flat": [2.0, *zeros],
-        "colour": [0.5, *zeros],
     }
     assert door_chance(candidates, models) == pytest.approx(1 / (1 + np.exp([-2.0, 1.0, -1.0, -2.0])))
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tests.training.tiny import two_doors
-from topomerge.extraction.classified_storey import DOORWAY_CLASS, PLAN_SIGNS, SHUT_CLASS, WALL_CLASS, ClassifiedStorey, plan_signs
 from topomerge.extraction.elevations.wall_doors import (
     SOURCES,
     WALL_DOOR_FEATURES,
     door_chance,
     with_wall_doors,
 )
+from topomerge.extraction.plans.storey_plan import DOORWAY_CLASS, PLAN_SIGNS, SHUT_CLASS, WALL_CLASS, ClassifiedStorey, plan_signs
 from topomerge.training.wall_doors import candidates_of_map
 from topomerge.types import EDGE_DTYPE
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.extraction.classified_storey import COLUMN_CLASSES, ClassifiedStorey, leads_through_wall
 from topomerge.extraction.plans import plan_network
 from topomerge.extraction.plans.plan import profile_bands
 from topomerge.extraction.plans.plan_network import (
@@ -14,7 +13,7 @@ from topomerge.extraction.plans.plan_network import (
     evidence,
     without_furniture,
 )
-from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, ClassifiedStorey, StoreyPlan, leads_through_wall
 from topomerge.kernels.profile import PROFILE_BELOW
 from topomerge.types import Array
 

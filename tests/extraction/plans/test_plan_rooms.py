@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests import scenes
 from tests.extraction.segments import rooms_of_segments
-from topomerge.extraction.assumed_floor import has_floor
 from topomerge.extraction.extract import extract
+from topomerge.extraction.floors import has_floor
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import PRESETS, DefaultParameters
-from topomerge.extraction.partition import FLAT_LEAST_AREA, ROOM_LEAST_AREA
-from topomerge.extraction.plans.door_classifier import door_probability
-from topomerge.extraction.plans.passages import DOOR_FEATURES, Passage, clearance_of, door_features, find_passages, regions_of
+from topomerge.extraction.partition import FLAT_LEAST, ROOM_LEAST, LeastSize
+from topomerge.extraction.plans.passages import (
+    DOOR_FEATURES,
+    Passage,
+    clearance_of,
+    door_features,
+    door_probability,
+    find_passages,
+    regions_of,
+)
 from topomerge.extraction.plans.plan import _box_around, storey_plan
 from topomerge.extraction.plans.plan_network import COARSEST_STRIDE, column_probabilities
 from topomerge.extraction.plans.storey_floor import FLOOR_PROPERTIES, joined_floor
@@ -240,32 +249,38 @@ def test_passages_measure_the_door() -> None:
     assert door_probability(door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
     parted = rooms_of_segments(region, clearance, passages, score_by_plan)
     never = rooms_of_segments(region, clearance, passages, lambda x, _: np.zeros(len(x)))
-    always = rooms_of_segments(region, clearance, passages, lambda x, _: np.ones(len(x)), (0.0, 0.0))
+    always = rooms_of_segments(region, clearance, passages, lambda x, _: np.ones(len(x)), LeastSize(0.0, 0.0, 0.0, 0.0))
     sizes = np.bincount(region[region >= 0])
     assert len(np.unique(parted[sizes * 0.01 > 1])) == 2
     assert len(np.unique(never)) == 1 and len(np.unique(always)) == len(sizes)
 
 
 @pytest.mark.parametrize(
-    ("side", "chance", "least", "rooms"),
+    ("side", "chance", "evidence", "least", "rooms"),
     [
-        (9, 0.9, ROOM_LEAST_AREA, 3),
-        (7, 0.9, ROOM_LEAST_AREA, 3),
-        (7, 0.7, ROOM_LEAST_AREA, 2),
-        (5, 0.9, ROOM_LEAST_AREA, 2),
-        (7, 0.9, FLAT_LEAST_AREA, 2),
+        (9, 0.9, (), ROOM_LEAST, 3),
+        (7, 0.9, (), ROOM_LEAST, 3),
+        (7, 0.7, (), ROOM_LEAST, 2),
+        (7, 0.7, (3.0, 0.0, 0.0), ROOM_LEAST, 3),
+        (5, 0.9, (3.0, 0.0, 0.0), ROOM_LEAST, 2),
+        (7, 0.9, (), FLAT_LEAST, 2),
+        (12, 0.9, (0.0, 0.0, 1.0), FLAT_LEAST, 3),
+        (12, 0.9, (0.0, 0.0, -2.0), FLAT_LEAST, 2),
+        (12, 0.9, (0.0, 0.0, -2.0), ROOM_LEAST, 3),
     ],
-    ids=["a room", "small, surely parted", "small, less surely", "tiny", "small, of a slice"],
+    ids=["a room", "small, surely parted", "small, less surely", "small, walls show a door", "tiny", "small, of a slice"]
+    + ["a room of a slice", "a room of a slice without a door", "a room without a door that walls show"],
 )
 def test_what_is_small_is_a_room_where_a_door_surely_parts_it(
-    side: int, chance: float, least: tuple[float, float], rooms: int
+    side: int, chance: float, evidence: tuple[float, ...], least: LeastSize, rooms: int
 ) -> None:
     region = np.zeros((20, 60), np.int64)
     region[:, 30:] = 1
-    region[:side, 60 - side :] = 2  # squares of 0.81, 0.49 and 0.25 m2
+    region[:side, 60 - side :] = 2  # squares of 1.44, 0.81, 0.49 and 0.25 m2
     passage = Passage((0, 0), 0.8, (1.0, 0.0), (0.0,) * 12)
-    passages = {(0, 1): passage, (1, 2): passage}
-    of_segment = rooms_of_segments(region, np.ones(region.shape), passages, lambda x, _: np.full(len(x), chance), least)
+    passages = {(0, 1): passage, (1, 2): replace(passage, evidence=evidence)}
+    whole = replace(least, half_width=0.0)
+    of_segment = rooms_of_segments(region, np.ones(region.shape), passages, lambda x, _: np.full(len(x), chance), whole)
     assert len(np.unique(of_segment)) == rooms
 
 

@@ -8,10 +8,14 @@ from scipy import sparse
 
 from topomerge.extraction.convolution import sphere
 from topomerge.extraction.parameters import ThesisParameters
-from topomerge.extraction.views.clustering import cluster_views, markov_clusters, modularity
-from topomerge.extraction.views.navigable_floor import navigable_floor
-from topomerge.extraction.views.propagation import propagate_labels
-from topomerge.extraction.views.room_pieces import split_rooms
+from topomerge.extraction.views.view_rooms import (
+    cluster_views,
+    markov_clusters,
+    modularity,
+    navigable_floor,
+    propagate_labels,
+    split_rooms,
+)
 from topomerge.types import VoxelGrid
 
 

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from topomerge.extraction.views.similarity import jaccard_similarity
+from topomerge.extraction.views.view_rooms import jaccard_similarity, vote
 from topomerge.extraction.views.visibility import Visibility, visible_cells
-from topomerge.extraction.views.votes import vote
 from topomerge.kernels import raycast
 from topomerge.kernels import sets as kernel
 from topomerge.types import VoxelGrid

@@ -12,9 +12,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse.csgraph import connected_components
 
-from topomerge.extraction.elevations.colour_network import coarse_classes, with_colours
-from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, WALL_CLASSES, Elevations
-from topomerge.extraction.elevations.wall_network import PLACES, place_probabilities
+from topomerge.extraction.elevations.elevation import ACROSS, ALONG, BANDS, PLACES, WALL_CLASSES, Elevations, place_probabilities
 from topomerge.types import Array
 
 DOOR_CHANCE, LIKELY_DOOR = 0.35, 0.5  # probability of a door of every place of a doorway, and of one of them
@@ -77,31 +75,6 @@ def read_both_ways(strip: Array) -> Array:
     return mean
 
 
-def coloured_classes(walls: Elevations, classes: Array) -> Array:
-    """(n / 2, 7) float32 likewise, by shape and colours; walls without colours as they are.
-
-    Args:
-        classes: (n / 2, 7) of `place_classes`.
-    """
-    if walls.colours is None:
-        return classes
-    parts = [coloured_both_ways(walls.colours[a:b], classes[a // PLACES : b // PLACES]) for a, b in strip_bounds(walls)]
-    return np.concatenate([np.zeros((0, len(WALL_CLASSES)), np.float32), *parts])
-
-
-def coloured_both_ways(colours: Array, classes: Array) -> Array:
-    """(n / 2, 7) float32 likewise, by shape and colours, which tell `colour_network.COLOUR_CLASSES` apart: the others are 0.
-
-    Args:
-        colours: (n, 13, 4), n even.
-        classes: (n / 2, 7) by shape.
-    """
-    shape = coarse_classes(classes)
-    one, mirrored = with_colours(colours, shape), with_colours(colours[::-1], shape[::-1])
-    mean: Array = (one + mirrored[::-1]) / np.float32(2)
-    return np.pad(mean, [(0, 0), (0, len(WALL_CLASSES) - mean.shape[1])])
-
-
 def door_places(walls: Elevations, classes: Array) -> Array:
     """(n / 2, 3) float32 probability of an open, a shut and a half-open door in each place, of those of all classes."""
     parts = [classes[low // PLACES : high // PLACES, [OPEN, SHUT, HALF_OPEN]] for low, high in strip_bounds(walls)]
@@ -113,20 +86,19 @@ def strip_bounds(walls: Elevations) -> Iterator[tuple[int, int]]:
     return zip(walls.first[:-1].tolist(), walls.first[1:].tolist(), strict=True)
 
 
-def doorways(walls: Elevations, doors: Array, before: Array | None = None, by_shape: bool = True) -> Array:
+def doorways(walls: Elevations, doors: Array, before: Array | None = None) -> Array:
     """(D,) DOORWAY_DTYPE, each once however many faces show it.
 
     Args:
         doors: (n / 2, 3) of `door_places`.
         before: (n / 2, k) room on whose floor each of k spots before a place lies, -1 none: a strip goes on past its face, where
             the next room may lie before it. None: the room of the face everywhere.
-        by_shape: what is thicker than a leaf is no shut door; colours show those that are as thick as their wall.
     """
     rows = []
     for face, (low, high) in zip(walls.faces, strip_bounds(walls), strict=True):
         each = doors[low // PLACES : high // PLACES]
         for start, stop in _runs(each.sum(axis=1)):
-            shut = by_shape and 2 * each[start:stop, 1].sum() > each[start:stop].sum()
+            shut = 2 * each[start:stop, 1].sum() > each[start:stop].sum()
             if not _is_seen(walls.strips[low:high], start, stop) or (shut and _is_thick(walls.strips[low:high], start, stop)):
                 continue
             room = int(face["room"])

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from topomerge.extraction.cell_means import cell_middles
+from topomerge.extraction.cleaning import cell_middles
 from topomerge.kernels.strips import fill_strips
+from topomerge.networks.network import Network, Run, load_network, load_shipped_network
+from topomerge.networks.signature import Signature, Tensor
 from topomerge.structure.lines import Line
 from topomerge.types import Array, VoxelGrid
 
@@ -27,9 +30,6 @@ FREE_ALONG, FREE_ACROSS = 2, 4  # elements that share an answer: cells that rays
 STRIP_CHANNELS = BANDS + 1 + len(FREE_HEIGHTS)  # and where one can walk, and where rays went
 FULL = 0.75  # of the cells of a flat surface that make an element full
 SIDE_REACH = (0.15, 0.6)  # m from a face: where its room's floor lies
-SURFACE = (-0.1, 0.3)  # m from a face: what has a colour there is of the wall, or of a leaf in it
-LEAST_SHADE = 0.25  # points
-DARKEST, HUE_STEP, MOST_CONTRAST = 15.0, 64.0, 2.0  # of 255; of a difference of 1
 # Of a place along a wall: a door that stands open, is shut, a window, a door that stands half open, a recess, and what stands
 # before the wall; "wall" where there is none, too.
 WALL_CLASSES = ("wall", "open", "shut", "window", "half", "niche", "cupboard")
@@ -56,14 +56,11 @@ class Elevations:
         strips: (n, 32, 17) float32 0..1 of each place along all strips: how full its elements are across the wall, from before it
             to behind it, in each band of heights; then where one can walk, and where rays went at three heights (0 everywhere
             where the sensor's places are unknown).
-        colours: (n, 13, 4) float32 in each band of heights: was its colour seen (0 or 1), and by how much it is lighter, redder
-            and yellower than most of its wall; None of a scan without colours.
     """
 
     faces: Array
     first: Array
     strips: Array
-    colours: Array | None = None
 
 
 def unroll(faces: Array, navigable: VoxelGrid, cells: VoxelGrid, crossed: VoxelGrid | None = None) -> Elevations:
@@ -113,27 +110,6 @@ def crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array) -> Arr
     return out
 
 
-def strip_colours(walls: Elevations, points: Array, colours: Array) -> Array:
-    """(n, 13, 4) float32 `Elevations.colours`, of points (k, 3) m and their colours (k, 3) uint8.
-
-    Lightness is compared as a ratio, so that neither light nor the unit of an intensity matters; hues as differences.
-    """
-    faces, sizes = walls.faces, np.diff(walls.first)
-    frames = np.column_stack([faces["start"] + SURFACE[0] * faces["out"], faces["along"], faces["out"], faces["floor"] + LOWEST])
-    step, values = np.array([ALONG, SURFACE[1] - SURFACE[0], UPWARDS]), np.column_stack([np.ones(len(points)), colours])
-    sums = fill_strips(np.asarray(points, float), frames, sizes, (1, BANDS), step, TILE, values.astype(float))[:, 0].astype(float)
-    seen = sums[..., 0] > LEAST_SHADE
-    red, green, blue = (sums[..., k] / np.maximum(sums[..., 0], LEAST_SHADE) for k in (1, 2, 3))
-    light = np.log((red + green + blue) / 3 + DARKEST)
-    out = np.stack([seen, light, (red - green) / HUE_STEP, ((red + green) / 2 - blue) / HUE_STEP], axis=-1)
-    for low, high in zip(walls.first[:-1], walls.first[1:], strict=True):
-        strip, there = out[low:high], seen[low:high]
-        if there.any():
-            strip[..., 1:] -= np.median(strip[there][:, 1:], axis=0)
-    out[~seen] = 0
-    return np.asarray(np.clip(out, -MOST_CONTRAST, MOST_CONTRAST), np.float32)
-
-
 def face_rows(room: int, lines: Sequence[Line], floor: Array, level: float) -> list[tuple[object, ...]]:
     """Rows of FACE_DTYPE along lines; those with no floor (n, 2) m of the room beside them are left out."""
     rows: list[tuple[object, ...]] = []
@@ -148,3 +124,44 @@ def face_rows(room: int, lines: Sequence[Line], floor: Array, level: float) -> l
         start = line.middle + (line.start - PAST_ENDS) * line.along
         rows.append((room, start, line.along, out, line.length + 2 * PAST_ENDS, level))
     return rows
+
+
+# What is in each place along a wall: a small convolutional network over its elevation, trained on simulated scans of training
+# buildings (`train.py task=wall_segmentation`; beyond the thesis: docs/adr/0018).
+#
+# Two convolutions look at a strip along the wall and across it, the heights as channels; a layer then weighs all depths at once,
+# and three convolutions along the wall see 1.4 m to both sides, so that a leaf is told from a niche by its width and its frame.
+
+WALL_NETWORK_FILE = "wall_network.onnx"
+PLACES = 2  # elements along a strip that have one answer
+TAPS, DILATIONS = 5, (1, 2, 4)  # of the convolutions along the wall
+WALL_SIGNATURE = Signature(
+    "Says what is in each place along a wall.",
+    {"strips": Tensor(("strips", "length", DEPTHS, STRIP_CHANNELS), "0 to 1, along walls (even)")},
+    {"probability": Tensor(("strips", "places", len(WALL_CLASSES)), f"of {', '.join(WALL_CLASSES)}, of each two elements")},
+)
+
+
+def place_probabilities(strip: Array, network: Run | None = None) -> Array:
+    """Compute (n / 2, 7) float32 probability of each of `WALL_CLASSES` along a strip (n, 32, 17), or of several of one length at
+    once (k, n, 32, 17); by the network that ships or another."""
+    run = weights() if network is None else network
+    several = strip if strip.ndim == 4 else strip[None]
+    if not several.shape[0] or not several.shape[1]:
+        return np.zeros((*strip.shape[:-3], strip.shape[-3] // PLACES, len(WALL_CLASSES)), np.float32)
+    (probability,) = run(strips=several)
+    return np.asarray(probability if strip.ndim == 4 else probability[0])
+
+
+def weights() -> Network:
+    """Load the network that ships, or the one in its place (`io.weight_files`)."""
+    return load_shipped_network(WALL_NETWORK_FILE, WALL_SIGNATURE)
+
+
+def read_network(path: Path) -> Network:
+    """Load the network of a file.
+
+    Raises:
+        InputError: not the network that this version knows, or damaged.
+    """
+    return load_network(path, WALL_SIGNATURE)

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from topomerge.extraction.classified_storey import PLAN_SIGNS, ClassifiedStorey, plan_signs
-from topomerge.extraction.doors import DOOR_MOST_WIDTH
 from topomerge.extraction.elevations.doorways import STRAIGHT, StoreyWalls, joined_openings
-from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, Elevations
-from topomerge.extraction.elevations.wall_network import PLACES
+from topomerge.extraction.elevations.elevation import ALONG, BANDS, BEFORE, BEHIND, PLACES, Elevations
+from topomerge.extraction.plans.storey_plan import PLAN_SIGNS, ClassifiedStorey, plan_signs
+from topomerge.extraction.topology import DOOR_MOST_WIDTH
 from topomerge.io.weight_files import read_weights_json
 from topomerge.numpy_nn import sigmoid
 from topomerge.types import EDGE_DTYPE, Array, TopometricMap
@@ -37,8 +36,8 @@ WALL_DOOR_FEATURES = (
     "fill",  # logarithm of the share of the walls' elements that hold points: what sparse scans show is less sure
     *PLAN_SIGNS,
 )
-# What shows a door (flat: the plan of a map without walls; colour: the colours of a wall alone); there is a model for each.
-SOURCES = ("both", "plan", "wall", "flat", "colour")
+# What shows a door (flat: the plan of a map without walls); there is a model for each.
+SOURCES = ("both", "plan", "wall", "flat")
 WALL_DOOR_REACH = 1.0  # m between a door of the plan and the same one on the wall
 NEAR = 0.3  # m around a door of the plan
 PART_OFF = 0.5  # m between the middle of an opening of the plan and the wall that shows a part of it
@@ -163,11 +162,10 @@ def _flat_candidates(complete: Array, storeys: Sequence[ClassifiedStorey], edges
 def _candidates(
     edges: Array, features: Sequence[Sequence[float]], fill: float, storeys: Sequence[ClassifiedStorey], source: Array
 ) -> DoorCandidates:
-    """With the signs of the plan beside what was measured; where walls or their colours alone show a door the plan is not
-    asked."""
+    """Put the signs of the plan beside what was measured; where walls alone show a door the plan is not asked."""
     measured = np.array(features, float).reshape(len(edges), len(WALL_DOOR_FEATURES) - len(PLAN_SIGNS) - 1)
     measured = np.column_stack([measured, np.full(len(edges), fill)])
-    unasked = np.isin(source, [SOURCES.index("wall"), SOURCES.index("colour")])
+    unasked = source == SOURCES.index("wall")
     signs = np.where(unasked[:, None], 0.0, plan_signs(storeys, edges["centre"]))
     return DoorCandidates(edges, np.hstack([measured, signs]), source)
 

@@ -6,28 +6,148 @@ corner of its room. Where there is a door there is no window.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from topomerge.extraction.elevations.doorways import HALF_WALL, strip_bounds
-from topomerge.extraction.elevations.elevation import ACROSS, BEFORE, WALL_CLASSES, Elevations
-from topomerge.extraction.elevations.stretches import (
-    PLACE,
-    at_any,
-    doors_of,
-    ends_upwards,
-    face_cover,
-    in_place,
-    likely_stretches,
-    one_each,
-    rooms_beside,
-    wall_depth,
+from topomerge.extraction.elevations.doorways import HALF_WALL, STOOD, strip_bounds
+from topomerge.extraction.elevations.elevation import (
+    ACROSS,
+    ALONG,
+    BANDS,
+    BEFORE,
+    LOWEST,
+    PLACES,
+    UPWARDS,
+    WALL_CLASSES,
+    Elevations,
 )
-from topomerge.extraction.elevations.wall_network import PLACES
 from topomerge.types import WINDOW_DTYPE, Array, TopometricMap
 from topomerge.types.arrays import within_turn
+
+# Stretches of walls that show one thing, a window for example: where they begin and end, and whether two show the same one.
+
+STRETCH_CHANCE = 0.5  # probability of every place of a stretch
+PLACE = PLACES * ALONG  # m, of a place along a wall
+SHARED_WIDTH = 0.5  # share of the narrower of two that lies in the other one, from which they are one
+SAME_WALL, STRETCH_LEVEL = 0.6, 0.75  # m across and in height, to be in one wall
+SIDES = (0.3, 1.0)  # m from a stretch: where its rooms have their floors, which reach a little into walls
+BESIDE = 5  # places beside a stretch that show how full its wall is, and where it stands
+BESIDE_BANDS, ABOVE_BANDS = slice(5, 12), slice(11, 13)  # in which walls show beside windows, and above most
+LEAST_FILL = 0.15  # of the elements of a surface: in emptier ones nothing shows where it begins or ends
+
+
+def likely_stretches(chance: Array, likely: float, least: float) -> Iterator[tuple[int, int]]:
+    """First place and that after the last one of every stretch that probably shows one thing.
+
+    Args:
+        chance: (n,) probability of it in each place along a strip.
+        likely: of it on average; least: m, width.
+    """
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], chance > STRETCH_CHANCE, [0]]).astype(np.int8)))
+    for start, stop in ends.reshape(-1, 2).tolist():
+        if (stop - start) * PLACE >= least - 1e-9 and chance[start:stop].mean() >= likely:
+            yield start, stop
+
+
+def wall_depth(strip: Array, start: int, stop: int) -> int:
+    """Element across the strip in which most of the wall of a stretch lies (`wall_profile`)."""
+    return int(wall_profile(strip, start, stop).argmax())
+
+
+def wall_profile(strip: Array, start: int, stop: int) -> Array:
+    """(32,) how much lies in each element across the strip beside a stretch and above it: its wall. A cupboard has a face, too,
+    and its strip shows the wall, or a window, behind it."""
+    left, right = strip[max(start - BESIDE, 0) * PLACES : start * PLACES], strip[stop * PLACES : (stop + BESIDE) * PLACES]
+    beside = np.concatenate([left, right])[:, :, BESIDE_BANDS].sum(axis=(0, 2))
+    profile: Array = beside + strip[start * PLACES : stop * PLACES, :, ABOVE_BANDS].sum(axis=(0, 2))
+    return profile
+
+
+def face_cover(strip: Array, start: int, stop: int, depth: int) -> Array | None:
+    """(13,) 0..1 share of the surface at a depth that is there in each band of a stretch, of what is there in most bands around
+    it; None where hardly anything is."""
+    inner = slice((start + 1) * PLACES, (stop - 1) * PLACES)
+    reach = slice(max(start - BESIDE, 0) * PLACES, (stop + BESIDE) * PLACES)
+    face = strip[:, max(depth - 1, 0) : depth + 1, :BANDS].max(axis=1)
+    full = float(np.quantile(face[reach].mean(axis=0), 0.75))
+    return None if full < LEAST_FILL else np.minimum(face[inner].mean(axis=0) / full, 1.0)
+
+
+def ends_upwards(profile: Array) -> tuple[float, float]:
+    """m above the floor between which most bands of (13,) 0..1 are above a half, and as much of those below and above them as is;
+    nan where the end of the strip is one of them, or none is above."""
+    runs = np.flatnonzero(np.diff(np.concatenate([[0], profile > 0.5, [0]]))).reshape(-1, 2)
+    if not len(runs):
+        return np.nan, np.nan
+    low, high = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist()
+    bottom = low + (1 - profile[low]) - profile[low - 1] if low > 0 else np.nan
+    top = high - (1 - profile[high - 1]) + profile[high] if high < BANDS else np.nan
+    return float(LOWEST + UPWARDS * bottom), float(LOWEST + UPWARDS * top)
+
+
+def one_each(rows: Array, same: Callable[[Array, Array], Array]) -> Iterator[Array]:
+    """Rows that show one thing, as indices, the likeliest first; the likeliest things first.
+
+    Args:
+        rows: with `confidence`.
+        same: a row and all rows -> (n,) bool, do these show what it shows?
+    """
+    open_rows = np.ones(len(rows), bool)
+    for i in np.argsort(-rows["confidence"], kind="stable").tolist():
+        if open_rows[i]:
+            near = np.flatnonzero(open_rows & same(rows[i], rows))
+            open_rows[near] = False
+            yield near[np.argsort(-rows["confidence"][near], kind="stable")]
+
+
+def in_place(row: Array, centres: Array, widths: Array, across_reach: float = SAME_WALL) -> Array:
+    """(n,) bool: does something so wide share most of its width, or of the row's, with a row that has `centre`, `width` and
+    `direction`?"""
+    apart, along = centres - row["centre"], _along(row)
+    place, across = apart[:, :2] @ along, np.abs(apart[:, 0] * along[1] - apart[:, 1] * along[0])
+    shared = (widths + row["width"]) / 2 - np.abs(place)
+    level = np.abs(apart[:, 2]) < STRETCH_LEVEL
+    fits: Array = level & (across < across_reach) & (shared > SHARED_WIDTH * np.minimum(widths, row["width"]))
+    return fits
+
+
+def at_any(rows: Array, others: Array) -> Array:
+    """(n,) bool: is one of the others, doors or windows, there?"""
+    return np.array([bool(in_place(row, others["centre"], others["width"]).any()) for row in rows], bool)
+
+
+def doors_of(map: TopometricMap) -> Array:
+    """(D,) EDGE_DTYPE, the doors and openings of a map."""
+    doors: Array = map.edges[np.isin(map.edges["kind"], ("door", "opening"))]
+    return doors
+
+
+def rooms_beside(map: TopometricMap, rows: Array) -> Array:
+    """(n, 2) the rooms whose floors are the nearest before rows and behind them, along their `direction`; -1 none."""
+    inside = map.navigable_room >= 0
+    flat = np.array([1, 1, STOOD / STRETCH_LEVEL])
+    floor, room = map.navigable.centroids(map.navigable.cells[inside]) * flat, map.navigable_room[inside]
+    steps = np.arange(SIDES[0], SIDES[1] + 0.05, 0.1)[:, None] * np.array([-1.0, 1.0])
+    shift = rows["width"][:, None] / 4 * np.array([0.0, -1.0, 1.0])
+    out = np.stack([np.cos(rows["direction"]), np.sin(rows["direction"])], axis=-1)
+    places = np.zeros((len(rows), len(steps), 3, 2, 3))
+    places[..., :2] = shift[:, None, :, None, None] * _along(rows)[:, None, None, None]
+    places[..., :2] += steps[None, :, None, :, None] * out[:, None, None, None]
+    places += rows["centre"][:, None, None, None]
+    far, row = cKDTree(floor).query(places * flat, distance_upper_bound=STOOD)
+    label = np.where(np.isfinite(far), np.append(room, -1)[row], -1).reshape(len(rows), -1, 2)
+    first = (label >= 0).argmax(axis=1)
+    sides: Array = np.take_along_axis(label, first[:, None], axis=1)[:, 0].astype(np.int64)
+    return sides
+
+
+def _along(rows: Array) -> Array:
+    """(n, 2) unit, the ways along the walls that rows are in."""
+    return np.stack([-np.sin(rows["direction"]), np.cos(rows["direction"])], axis=-1)
+
 
 LIKELY_WINDOW = 0.85  # probability of a window, on average of its places
 LEAST_WINDOW = 0.4  # m, width

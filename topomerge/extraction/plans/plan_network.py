@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from topomerge.extraction.classified_storey import COLUMN_CLASSES, INSIDE_CLASS
-from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.storey_plan import COLUMN_CLASSES, INSIDE_CLASS, StoreyPlan
 from topomerge.networks.network import Network, Run, load_network, load_shipped_network
 from topomerge.networks.signature import Signature, Tensor
 from topomerge.types import Array

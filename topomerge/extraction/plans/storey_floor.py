@@ -8,12 +8,11 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.completeness import outline_seen
-from topomerge.extraction.components import spread_labels
-from topomerge.extraction.floor import Floor
+from topomerge.extraction.morphology import spread_labels
 from topomerge.extraction.partition import PartitionedStorey
 from topomerge.extraction.plans.passages import Pair
 from topomerge.extraction.plans.plan import columns_of
-from topomerge.extraction.plans.storey_plan import StoreyPlan
+from topomerge.extraction.plans.storey_plan import Floor, StoreyPlan
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import Array, VoxelGrid
 

@@ -1,20 +1,22 @@
-"""A storey seen from above: the one type for it, and the one rule for which of its columns are walls (beyond the thesis).
-
-A wall fills most of the heights between furniture and lintels; what fills fewer is clutter. The extraction makes such plans from
-the navigable volume (`extraction.plans.plan`), the merging from bare cells (`fusion.storey_plan`), the matching from finished
-maps (`matching.room_plans`).
-"""
+"""A storey seen from above: its plan, what probably stands in its columns, and the floors of a map cut into rooms."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
 from topomerge.kernels.profile import lowest_bit
-from topomerge.types import Array
+from topomerge.types import Array, VoxelGrid
+
+# A storey seen from above: the one type for it, and the one rule for which of its columns are walls (beyond the thesis).
+#
+# A wall fills most of the heights between furniture and lintels; what fills fewer is clutter. The extraction makes such plans
+# from the navigable volume (`extraction.plans.plan`), the merging from bare cells (`fusion.storey_plan`), the matching from
+# finished maps (`matching.room_plans`).
 
 WALL_HEIGHTS = np.linspace(0.5, 2.0, 7)  # m above the floor, limits of the bands in most of which a wall is seen
 BODY_HEIGHTS = (0.25, 2.0)  # m above the floor: empty where one can walk
@@ -186,3 +188,109 @@ def _spread(filled: Array, neighbours: int) -> Array:
     out[:, :, 1:] |= rows[:, :, :-1]
     out[:, :, :-1] |= rows[:, :, 1:]
     return out
+
+
+# What probably stands in the columns of a storey, and which passages that rules out (beyond the thesis: docs/adr/0005).
+
+COLUMN_CLASSES = ("inside", "wall", "doorway", "shut", "outside")  # furniture is inside
+INSIDE_CLASS, WALL_CLASS, DOORWAY_CLASS, SHUT_CLASS = range(4)  # of them
+DOOR_CHANCE, WALL_CHANCE = 0.3, 0.02  # less of a door and more of a wall around it, and a passage leads through a wall
+PASSAGE_REACH = 0.3  # m around a passage
+SIGNS_REACH = 0.5  # m around it, in which walls and leaves are looked for
+PLAN_SIGNS = (
+    "doorway",
+    "doorway_most",
+    "walled",
+    "leaf",
+)  # around a passage: mean, highest, mean of a wall, highest of a shut door
+
+
+@dataclass(frozen=True, eq=False)
+class ClassifiedStorey:
+    """Class probabilities of the columns of a storey, in the frame of the map.
+
+    Args:
+        probability: (nx, ny, 5) of each of `COLUMN_CLASSES`.
+        origin: (2,) m, lower corner of the first column.
+        edge: m, of a column.
+        height: m, of the floor.
+    """
+
+    probability: Array
+    origin: Array
+    edge: float
+    height: float
+
+
+def leads_through_wall(storeys: Sequence[ClassifiedStorey], centre: Array) -> bool:
+    """Does a passage at `centre` (3,) m lead through a wall: none of its columns is of a door, and some are of a wall?"""
+    if not storeys:
+        return False
+    near = _around(_nearest(storeys, centre), centre, PASSAGE_REACH)
+    if not near.size:
+        return False
+    return bool(
+        near[..., DOORWAY_CLASS : SHUT_CLASS + 1].sum(axis=-1).max() < DOOR_CHANCE and near[..., WALL_CLASS].mean() > WALL_CHANCE
+    )
+
+
+def plan_signs(storeys: Sequence[ClassifiedStorey], centres: Array) -> Array:
+    """(n, 4) `PLAN_SIGNS` at passages (n, 3) m; zeros where no plan is."""
+    signs = np.zeros((len(centres), len(PLAN_SIGNS)))
+    for row, centre in zip(signs, centres if storeys else (), strict=False):
+        storey = _nearest(storeys, centre)
+        near, wider = (_around(storey, centre, reach) for reach in (PASSAGE_REACH, SIGNS_REACH))
+        if near.size:
+            doorway = near[..., DOORWAY_CLASS]
+            row[:] = doorway.mean(), doorway.max(), wider[..., WALL_CLASS].mean(), wider[..., SHUT_CLASS].max()
+    return signs
+
+
+def _nearest(storeys: Sequence[ClassifiedStorey], centre: Array) -> ClassifiedStorey:
+    return min(storeys, key=lambda s: abs(s.height - float(centre[2])))
+
+
+def _around(storey: ClassifiedStorey, centre: Array, reach: float) -> Array:
+    """(a, b, 5) of the columns at most `reach` m from a place, along each axis."""
+    columns = max(int(reach / storey.edge), 1)
+    low = np.floor((np.asarray(centre)[:2] - storey.origin) / storey.edge).astype(np.int64) - columns
+    box = tuple(slice(max(k, 0), max(k + 2 * columns + 1, 0)) for k in low.tolist())
+    near: Array = storey.probability[box]
+    return near
+
+
+# The floors of a map cut into rooms: what rooms of plans and rooms of views become before the graph is made (seeds 2.7).
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """The floors of all storeys, cut into rooms.
+
+    Args:
+        cells: the navigable volume, and the floor under furniture where rooms have such. Its property `standing` (bool) tells
+            where a body fits; absent, it fits everywhere.
+        storeys: (S,) STOREY_DTYPE.
+        storey, room, area: (m,) int32 of each cell, -1 none.
+        room_of_area: (A,) int32.
+        label: (n,) int32 room of each occupied cell of the grid, -1 none.
+        body_width: m, how much wider than its cells a passage is: where they tell where a body's middle may be, the body's width.
+        door_probability: that a door parts two rooms, where it was judged.
+        completeness: (R,) share of each room's outline at which a wall was seen, where the plans tell it.
+        classified_storeys: what probably stands in the columns of the storeys' plans.
+        plans: these plans, without furniture.
+        chosen_parameters: of the extraction, that a step chose by itself.
+    """
+
+    cells: VoxelGrid
+    storeys: Array
+    storey: Array
+    room: Array
+    area: Array
+    room_of_area: Array
+    label: Array
+    body_width: float = 0.0
+    door_probability: dict[tuple[int, int], float] = field(default_factory=dict)
+    completeness: Array | None = None
+    classified_storeys: tuple[ClassifiedStorey, ...] = ()
+    plans: tuple[StoreyPlan, ...] = ()
+    chosen_parameters: dict[str, float] = field(default_factory=dict)

@@ -172,7 +172,6 @@ def tile_map(map: TopometricMap, rooms: Sequence[int] | Array) -> TopometricMap:
         edges=map.edges[mine[map.edges["rooms"]].any(axis=1)] if len(map.edges) else map.edges,
         narrows=map.narrows[mine[map.areas["room"][map.narrows["rooms"]]].any(axis=1)] if len(map.narrows) else map.narrows,
         windows=map.windows[mine[map.windows["rooms"][:, 0]]] if len(map.windows) else map.windows,
-        fixtures=map.fixtures[mine[map.fixtures["room"]]] if len(map.fixtures) else map.fixtures,
         free=None,
     )
 

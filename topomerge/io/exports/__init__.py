@@ -94,7 +94,7 @@ def save_export(map: TopometricMap, name: str, path: str | Path, min_confidence:
         map: any map.
         name: graphml, geojson, indoorgml, dsg, ros, rviz, tf2, ply, las or ifc.
         path: the file; for ros the folder, which is made.
-        min_confidence: rooms, doors, stairs, windows and fixtures that are less likely are left out, 0 to 1; 0: none.
+        min_confidence: rooms, doors, stairs and windows that are less likely are left out, 0 to 1; 0: none.
         options: `storey` (geojson, ros) a number; `origin` (geojson) "latitude,longitude" or "latitude,longitude,heading";
             `transforms` (tf2) as `topomerge.io.exports.tf2.frame_poses` gives them.
 

@@ -1,5 +1,4 @@
-"""Rooms and walls as polygons, doors and windows as lines and as openings in walls, niches and cupboards as lines: GeoJSON (RFC
-7946), for QGIS and web maps.
+"""Rooms and walls as polygons, doors and windows as lines and as openings in walls: GeoJSON (RFC 7946), for QGIS and web maps.
 
 With an origin, coordinates are longitude and latitude of WGS84. Without, they are metres in the frame of the map; then `crs` is
 null, which tells readers of the older GeoJSON that there are no degrees, and the member `topomerge` says so in words.
@@ -59,7 +58,7 @@ def parse_origin(text: str) -> Origin:
 
 def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: int | None = None) -> None:
     """Write one FeatureCollection: a feature for each room, then for each door, opening and flight of stairs, each window,
-    niche and cupboard, each wall, and each door, opening or window as a hole in its wall.
+    each wall, and each door, opening or window as a hole in its wall.
 
     Args:
         map: any map.
@@ -77,7 +76,6 @@ def save(map: TopometricMap, path: Path, origin: Origin | None = None, storey: i
         _check_near(map)
     place = _metres if origin is None else _on_earth(origin)
     features = [*_rooms(map, place, storey), *_doors(map, place, storey), *_windows(map, place, storey)]
-    features += _fixtures(map, place, storey)
     features += [*_walls(map, place, storey), *_openings(map, place, storey)]
     listing: dict[str, Any] = {"type": "FeatureCollection"}
     if origin is None:
@@ -132,15 +130,6 @@ def _windows(map: TopometricMap, place: Place, storey: int | None) -> Iterator[d
             properties = {"kind": "window", "window": k, "rooms": _sides(window), "storey": level}
             properties |= {name: _height(window[name]) for name in ("width", "sill", "head", "confidence")}
             yield _feature(f"window {k}", {"type": "LineString", "coordinates": place(jambs(pane))}, properties)
-
-
-def _fixtures(map: TopometricMap, place: Place, storey: int | None) -> Iterator[dict[str, Any]]:
-    for k, fixture in enumerate(map.fixtures):
-        if storey in (None, level := int(map.rooms["storey"][fixture["room"]])):
-            properties = {"kind": str(fixture["kind"]), "fixture": k, "room": int(fixture["room"]), "storey": level}
-            sizes = ("width", "depth", "bottom", "top", "direction", "confidence")
-            properties |= {name: _height(fixture[name]) for name in sizes}
-            yield _feature(f"fixture {k}", {"type": "LineString", "coordinates": place(jambs(fixture))}, properties)
 
 
 def _height(value: Any) -> float | None:

@@ -1,10 +1,9 @@
 """A building model, IFC4: site, building, storeys, spaces, doors, windows, stairs; walls, floors and ceilings as far as seen.
 
 Spaces, floors, ceilings and walls are extruded polygons. An IfcOpeningElement voids the wall that carries a door or a window,
-and the door or the window, a box, fills it; that of a niche is a recess. A cupboard is a box in its space. An opening without a
-door is an IfcVirtualElement, stairs and ramps are a plate from their lower to their upper end. IfcRelSpaceBoundary says which
-spaces a door joins. The site is placed where the map lies, so that all else has small coordinates. Source: ISO 16739-1, IFC4
-ADD2 TC1.
+and the door or the window, a box, fills it. An opening without a door is an IfcVirtualElement, stairs and ramps are a plate
+from their lower to their upper end. IfcRelSpaceBoundary says which spaces a door joins. The site is placed where the map lies,
+so that all else has small coordinates. Source: ISO 16739-1, IFC4 ADD2 TC1.
 """
 
 from __future__ import annotations
@@ -72,12 +71,6 @@ def save(map: TopometricMap, path: Path) -> None:
         for n, r in enumerate(rooms):
             side = spaces[rooms[1 - n]].PredefinedType if len(rooms) > 1 else "NOTDEFINED"
             model.bound(f"window {k}", spaces[r], element, side)
-    for placed in structure.fixtures:
-        k, w, r = int(placed["fixture"]), int(placed["wall"]), int(map.fixtures["room"][placed["fixture"]])
-        if map.fixtures["kind"][k] == "cupboard":
-            model.contain(spaces[r], [model.cupboard(placed, storeys[map.rooms["storey"][r]])])
-        elif w >= 0:
-            model.recess(placed, structure.walls[w], walls[w])
     with replacing(path) as beside:
         model.file.write(str(beside))
 
@@ -167,40 +160,6 @@ class _Building(Model):
         element = self._void(f"pane {k}", wall_part(wall, pane, CUT_THROUGH), wall, span, voided)
         self.root("IfcRelFillsElement", element.GlobalId, RelatingOpeningElement=element, RelatedBuildingElement=window)
 
-    def recess(self, placed: Any, wall: Any, voided: Any) -> None:
-        """A niche, as a hole in a wall that does not go through it."""
-        niche = self.map.fixtures[placed["fixture"]]
-        into = np.array([np.cos(niche["direction"]), np.sin(niche["direction"])])
-        side = np.array([-into[1], into[0]]) * float(niche["width"]) / 2
-        face, back = niche["centre"][:2] - CUT_THROUGH * into, niche["centre"][:2] + float(placed["depth"]) * into
-        shape = shapely.Polygon([face + side, face - side, back - side, back + side])
-        span = float(niche["centre"][2] + placed["bottom"]), float(placed["top"] - placed["bottom"])
-        element = self._void(f"niche {placed['fixture']}", shape, wall, span, voided)
-        element.PredefinedType = "RECESS"
-        self._say_of_fixture(placed["fixture"], element)
-
-    def cupboard(self, placed: Any, storey: Any) -> Any:
-        """A cupboard as a box before its wall."""
-        k, deep = int(placed["fixture"]), float(placed["depth"])
-        seen = self.map.fixtures[k]
-        into = np.array([np.cos(seen["direction"]), np.sin(seen["direction"]), 0.0])
-        along, width = np.array([-into[1], into[0]]), float(seen["width"])
-        x, y, z = seen["centre"] - deep / 2 * into - (*along * width / 2, 0) - self.shift
-        at = self.place(storey.ObjectPlacement, x, y, z + float(placed["bottom"]) - storey.Elevation, along)
-        body = self._box(width, float(placed["top"] - placed["bottom"]), deep)
-        shown = {"ObjectPlacement": at, "Representation": body}
-        element = self.root("IfcFurniture", f"cupboard {k}", PredefinedType="NOTDEFINED", **shown)
-        self._say_of_fixture(k, element)
-        return element
-
-    def _say_of_fixture(self, k: int, element: Any) -> None:
-        """How likely a niche or a cupboard is one, and which of its ends were seen."""
-        seen = self.map.fixtures[k]
-        facts = [self._fact("Confidence", "IfcReal", float(seen["confidence"]))]
-        ends = ("depth", "bottom", "top")
-        facts += [self._fact(f"{end.title()}Seen", "IfcBoolean", bool(np.isfinite(seen[end]))) for end in ends]
-        self._define(element, self._set("IfcPropertySet", f"Topomerge_{str(seen['kind']).title()}", k, HasProperties=facts))
-
     def _void(self, name: str, outline: Any, wall: Any, span: tuple[float, float], voided: Any) -> Any:
         """A hole in a wall; `span`: where it begins, m in the input's frame, and its height, at most up to the wall's top."""
         low, height = span
@@ -237,10 +196,10 @@ class _Building(Model):
         facts += [self._fact(name, "IfcBoolean", bool(edge[name.lower()])) for name in ("Open", "Half")]
         self._define(element, self._set("IfcPropertySet", f"Topomerge_{str(edge['kind']).title()}", i, HasProperties=facts))
 
-    def _box(self, width: float, height: float, deep: float = LEAF_THICKNESS) -> Any:
+    def _box(self, width: float, height: float) -> Any:
         """What fills an opening or stands before a wall, along x from 0, y to both sides."""
         middle = self.new("IfcAxis2Placement2D", Location=self.point(width / 2, 0))
-        box = self.new("IfcRectangleProfileDef", ProfileType="AREA", Position=middle, XDim=width, YDim=deep)
+        box = self.new("IfcRectangleProfileDef", ProfileType="AREA", Position=middle, XDim=width, YDim=LEAF_THICKNESS)
         up = self.new("IfcDirection", DirectionRatios=[0.0, 0.0, 1.0])
         solid = self.new("IfcExtrudedAreaSolid", SweptArea=box, ExtrudedDirection=up, Depth=height)
         return self.shape("Body", "SweptSolid", [solid])

@@ -1,8 +1,4 @@
-"""What stands far from the rest of a cloud: stray points, and places that are no part of one building.
-
-Rasters cover the rectangle around all cells. What costs so much more than the cells themselves is told apart here, before any is
-made: few cells far off are left out, and several large places far apart are refused.
-"""
+"""Points and cells that are too many or too few: strays, points that hang at edges, gaps of sparse scans, means of cells."""
 
 from __future__ import annotations
 
@@ -11,7 +7,44 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from topomerge.errors import InputError
-from topomerge.types import Array
+from topomerge.extraction.convolution import convolve, moore
+from topomerge.kernels.voxelise import OFFSET_STEPS
+from topomerge.types import Array, VoxelGrid
+
+# Where the points of a cell lie on average: surfaces are known better by it than by the cell alone.
+#
+# A grid holds it as its property ``offset``, (n, 3) uint8: of the way through the cell along each axis, in 256 parts. So it stays
+# right when a map is moved to another origin or scaled.
+
+MIDDLE = OFFSET_STEPS // 2  # offset of a cell whose points are not known
+
+
+def cell_middles(grid: VoxelGrid) -> Array:
+    """(n, 3) float64 m: the mean of the points of each cell where the grid has it (property ``offset``), else the centroids."""
+    offset = grid.properties.get("offset")
+    if offset is None:
+        return grid.centroids()
+    out: Array = grid.origin + (grid.cells + (offset.astype(np.float64) + 0.5) / OFFSET_STEPS) * grid.edge
+    return out
+
+
+def with_means(grid: VoxelGrid, points: Array, counts: Array | None = None) -> VoxelGrid:
+    """The grid with the property ``offset`` of points (N, 3), m, that each stand for so many points; others are left out."""
+    rows = grid.rows(grid.locate(points))
+    inside = rows >= 0
+    points, rows = np.asarray(points, np.float64)[inside], rows[inside]
+    weights = np.ones(len(rows)) if counts is None else np.asarray(counts, np.float64)[inside]
+    many = np.bincount(rows, weights, len(grid))
+    within = (points - grid.origin) / grid.edge - grid.cells[rows]
+    total = np.column_stack([np.bincount(rows, weights * within[:, k], len(grid)) for k in range(3)])
+    mean = np.where(many[:, None] > 0, total / np.maximum(many, 1e-9)[:, None], 0.5)
+    return grid.with_properties(offset=np.clip(mean * OFFSET_STEPS, 0, OFFSET_STEPS - 1).astype(np.uint8))
+
+
+# What stands far from the rest of a cloud: stray points, and places that are no part of one building.
+#
+# Rasters cover the rectangle around all cells. What costs so much more than the cells themselves is told apart here, before any
+# is made: few cells far off are left out, and several large places far apart are refused.
 
 # A group of points is a stray when it lies this far (m) from every larger group and holds less than this share of the cells.
 STRAY_DISTANCE = 10.0
@@ -138,3 +171,42 @@ def _columns(cells: Array) -> float:
 def _where(cells: Array, share: float, edge: float) -> str:
     middle = ", ".join(f"{v:.0f}" for v in (np.median(cells, axis=0) + 0.5) * edge)
     return f"{100 * share:.2g} % around {middle} m"
+
+
+# Points that are too few: cells are made so large that surfaces hold together (beyond the thesis).
+
+COARSEST_CELL = 0.3  # m: in larger ones no door is seen
+
+
+def without_gaps(grid: VoxelGrid, neighbours: float, warnings: list[str]) -> VoxelGrid:
+    """The grid with cells so large that surfaces hold together: doubled until the median cell has as many neighbours (of 26).
+
+    Cells that would be too large to find doors are not made.
+
+    Args:
+        warnings: what the user should know is appended here.
+    """
+    while len(grid) and 2 * grid.edge <= COARSEST_CELL and float(np.median(convolve(grid, moore()))) < neighbours:
+        fine, grid = grid, grid.coarser(2)
+        if "offset" in fine.properties:
+            grid = with_means(grid, cell_middles(fine), fine.properties.get("count"))
+        warnings.append(f"the points are sparse: cells of {grid.edge:g} m were taken")
+    return grid
+
+
+# Points that are too many (beyond the thesis).
+#
+# At the edge of a door a laser or a depth camera averages what is in front and what is behind: points hang in the opening, and a
+# single one of them obstructs the body of the stick kernel.
+
+THICK_SURFACE = 17  # neighbours of a cell in a surface that is two cells thick
+
+
+def without_flying_cells(grid: VoxelGrid, share: float) -> VoxelGrid:
+    """The cells that have at least `share` of the usual (median) number of neighbours.
+
+    The limit follows the map: where points are sparse, surfaces have few neighbours, too, and only lonely cells go. In plans
+    whose walls are solid most cells have all 26, and the floor 8: there the limit is that of a surface.
+    """
+    neighbours = convolve(grid, moore())
+    return grid.subset(neighbours >= share * min(float(np.median(neighbours)), THICK_SURFACE))

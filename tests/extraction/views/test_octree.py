@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.grids import COMPILED, grids, interleave, random_grid
-from topomerge.extraction.octree import SparseVoxelOctree
+from topomerge.extraction.views.visibility import SparseVoxelOctree
 from topomerge.types import VoxelGrid
 
 AXIS = st.integers(-5, 25)

@@ -6,8 +6,7 @@ import edt
 import numpy as np
 import pytest
 
-from topomerge.extraction.distance_field import horizontal_distance_field, on_all_sides
-from topomerge.extraction.gaps import _closing, _near
+from topomerge.extraction.morphology import _closing, _near, horizontal_distance_field, on_all_sides
 from topomerge.types import VoxelGrid
 
 

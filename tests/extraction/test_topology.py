@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from topomerge.extraction.doors import find_edges
-from topomerge.extraction.floor import Floor
+from topomerge.extraction.plans.storey_plan import Floor
+from topomerge.extraction.topology import find_edges
 from topomerge.types import STOREY_DTYPE, Array, VoxelGrid
 
 EDGE = 0.05

@@ -1,0 +1,175 @@
+"""Cells by their neighbourhoods: components, distances, where a body can stand, bridged gaps (seeds 2.3, 2.4.1)."""
+
+from __future__ import annotations
+
+import edt
+import numpy as np
+
+from topomerge.extraction.convolution import LENGTH_SLACK, Kernel, any_at, circle, count_at, von_neumann
+from topomerge.kernels import components as kernel
+from topomerge.types import Array, VoxelGrid
+
+# Connected components (seeds 2.3.3).
+
+
+def connected_components(grid: VoxelGrid, neighbourhood: Kernel | None = None, group: Array | None = None) -> Array:
+    """Component of each cell: two cells share one if a path of neighbours joins them (seeds 2.3.3).
+
+    Args:
+        grid: the cells.
+        neighbourhood: which cells are neighbours; von Neumann (6) by default. It is taken as symmetric.
+        group: (n,) integer; only neighbours of the same group are joined, a cell of a negative one has no component.
+
+    Returns:
+        (n,) int64, numbered from 0 in the order of their first cells, -1 for cells left out.
+    """
+    offsets = (neighbourhood or von_neumann()).stencil[0]
+    both = np.unique(np.concatenate([offsets, -offsets]), axis=0)  # a neighbour's neighbour, whichever way it is said
+    half = both[[tuple(o) > (0, 0, 0) for o in both.tolist()]]
+    group = np.zeros(len(grid), np.int64) if group is None else np.asarray(group, np.int64)
+    return kernel.components(grid.cells, *grid._bricks, half, group)
+
+
+def spread_labels(grid: VoxelGrid, labels: Array, steps: int | None = None, neighbourhood: Kernel | None = None) -> Array:
+    """Labels of cells that have none (-1) taken from the nearest labelled cell, counted in steps between neighbours.
+
+    Args:
+        steps: how far labels may travel; no limit by default.
+    """
+    out = np.array(labels, np.int64)
+    offsets = (neighbourhood or von_neumann()).stencil[0]
+    kernel.spread(grid.cells, *grid._bricks, offsets, out, len(grid) if steps is None else steps)
+    return out
+
+
+# Horizontal distance field (seeds 2.4.1).
+
+
+def horizontal_distance_field(grid: VoxelGrid) -> Array:
+    """How many times a horizontal circle around each cell can grow by one cell before it leaves the grid (seeds 2.4.1).
+
+    The seeds grow a circle-shaped kernel until it holds fewer neighbours than cells. That is the largest whole radius below the
+    distance to the nearest missing cell of the same level, so one exact Euclidean transform a level gives the same numbers.
+
+    Returns:
+        (n,) int32; 0 on the boundary: cells that miss one of their four horizontal neighbours.
+    """
+    distance = np.zeros(len(grid), np.int32)
+    order = np.argsort(grid.cells[:, 2], kind="stable")
+    levels = grid.cells[order, 2]
+    for rows in np.split(order, np.flatnonzero(np.diff(levels)) + 1):
+        if not len(rows):
+            continue
+        cells = grid.cells[rows, :2]
+        low = cells.min(axis=0) - 1
+        plan = np.zeros(cells.max(axis=0) - low + 2, bool)
+        at = tuple((cells - low).T)
+        plan[at] = True
+        # squared distances are whole numbers: rounding them keeps the root exact
+        squared = np.rint(edt.edtsq(plan.view(np.uint8), parallel=1)[at].astype(np.float64))
+        distance[rows] = np.ceil(np.sqrt(squared)).astype(np.int32) - 1
+    return distance
+
+
+def on_all_sides(grid: VoxelGrid, cells: Array, radius: int) -> Array:
+    """(m,) bool: does the grid hold all cells of the level that are at most so many cells away? As `horizontal_distance_field` at
+    or above the radius, of some cells and for a small radius."""
+    disc = circle(radius * grid.edge, grid.edge)
+    inside: Array = count_at(grid, cells, disc) == len(disc)
+    return inside
+
+
+# Upward dilation (seeds 2.3.2).
+
+
+def dilate_upwards(grid: VoxelGrid, height: float) -> VoxelGrid:
+    """The cells and those up to `height` m above them, so that the steps of a stair touch (seeds 2.3.2)."""
+    layers = np.arange(int(np.floor(height / grid.edge + 1e-6)) + 1)
+    up = (grid.cells[:, None, :] + layers[:, None] * np.array([0, 0, 1])).reshape(-1, 3)
+    return grid.with_cells(up[up[:, 2] < grid.shape[2]].astype(np.int32))
+
+
+# Cells that somebody could stand on (seeds 2.3.1; Gorte et al. 2019).
+
+
+def unobstructed(grid: VoxelGrid, stick: Kernel) -> VoxelGrid:
+    """Cells whose convolution with the stick kernel is 0: nothing stands in the room that a body needs above them.
+
+    The seeds sum occupancy under the kernel and keep sum = 0; as no weight is negative, the search may stop at the first cell.
+    """
+    return grid.subset(~any_at(grid, grid.cells, stick))
+
+
+# Bridging gaps in the floor, without making ceilings or table tops into floor (beyond the thesis: method 2).
+
+CLOSING_TILE = 256  # cells
+
+
+def bridge_gaps(grid: VoxelGrid, standing: VoxelGrid, stick: Kernel, reach: float) -> VoxelGrid:
+    """Close gaps of up to twice `reach` m between cells that one can stand on.
+
+    The standing cells of a level and its two neighbours are closed horizontally; of the cells that this adds, those remain in
+    which the stick fits. A kernel grown to bridge gaps lets beds become floor; this adds no height, so it does not.
+
+    Args:
+        grid: occupied cells.
+        standing: the unobstructed ones that count as floor.
+        stick: the room that a body needs.
+        reach: m.
+    """
+    radius = reach / grid.edge + LENGTH_SLACK
+    if radius < 1 or not len(standing):
+        return standing
+    levels = np.split(standing.cells[np.argsort(standing.cells[:, 2], kind="stable")], _steps(standing.cells[:, 2]))
+    by_level = {int(level[0, 2]): level[:, :2] for level in levels}
+    added: list[Array] = []
+    for z in by_level:
+        near = np.concatenate([by_level[k] for k in (z - 1, z, z + 1) if k in by_level])
+        columns = _closing(near, radius)
+        added.append(np.column_stack([columns, np.full(len(columns), z)]).astype(np.int32))
+    new = np.concatenate(added)
+    new = new[((new >= 0) & (new < grid.shape)).all(axis=1)]
+    new = new[~any_at(grid, new, stick)]
+    return grid.with_cells(np.concatenate([standing.cells, new]))
+
+
+def _steps(values: Array) -> Array:
+    """Where the sorted values change."""
+    return np.flatnonzero(np.diff(np.sort(values))) + 1
+
+
+def _closing(columns: Array, radius: float) -> Array:
+    """(k, 2) columns that closing by a disc of `radius` cells adds to the given ones, tile by tile: most of a building's box is
+    empty on most of its levels."""
+    margin = 2 * int(np.ceil(radius)) + 1
+    tile = columns.astype(np.int64) // CLOSING_TILE
+    added = []
+    _, firsts = np.unique(tile[:, 0] << 32 | tile[:, 1] & 0xFFFFFFFF, return_index=True)
+    for corner in tile[firsts]:
+        # closing looks twice as far as its radius
+        low, high = corner * CLOSING_TILE - margin, (corner + 1) * CLOSING_TILE + margin
+        window = columns[((columns >= low) & (columns < high)).all(axis=1)]
+        start = np.maximum(window.min(axis=0) - margin, low)
+        plan = np.zeros(np.minimum(window.max(axis=0) + margin + 1, high) - start, bool)
+        plan[tuple((window - start).T)] = True
+        closed = ~_near(~_near(plan, radius), radius) & ~plan
+        cells = np.argwhere(closed) + start
+        added.append(cells[(cells // CLOSING_TILE == corner).all(axis=1)])
+    return np.concatenate(added)
+
+
+def _near(mask: Array, radius: float) -> Array:
+    """Pixels at most `radius` pixels from one of the mask: the lines of a disc laid over each other, which for a few pixels is
+    many times faster than a distance transform."""
+    reach = int(radius)
+    wider, widest = mask.copy(), [mask]  # pixels with one of the mask at most so far in their row
+    for step in range(1, reach + 1):
+        wider[:, step:] |= mask[:, :-step]
+        wider[:, :-step] |= mask[:, step:]
+        widest.append(wider.copy())
+    out = wider.copy()
+    for step in range(1, reach + 1):
+        line = widest[int(np.sqrt(radius**2 - step**2))]
+        out[step:] |= line[:-step]
+        out[:-step] |= line[step:]
+    return out
