@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.scenes import two_rooms
+from topomerge import networks
 from topomerge.errors import InputError
 from topomerge.extraction.extract import extract
 from topomerge.extraction.scan import read_scan
@@ -58,12 +60,14 @@ def test_no_cells() -> None:
     assert not is_raised(voxelise(np.zeros((1, 3)), 0.1))
 
 
-@pytest.mark.parametrize("broken", ["plan_network.npz", "grid_network.npz"])
+@pytest.mark.parametrize("broken", ["plan_network.onnx", "grid_network.onnx"])
 def test_a_raised_plan_is_looked_at_by_its_own_network(drawn: Path, broken: str, tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "weights").mkdir()
-    (tmp_path / "weights" / broken).write_bytes(b"no archive")
+    (tmp_path / "weights" / broken).write_bytes(b"no network")
+    card = broken.replace(".onnx", ".card.json")
+    shutil.copy(Path(networks.__file__).parent / card, tmp_path / "weights" / card)
     plan, scan = read_points(drawn, resolution=0.05), two_rooms().points()
-    used, other = (scan, plan) if broken == "plan_network.npz" else (plan, scan)
+    used, other = (scan, plan) if broken == "plan_network.onnx" else (plan, scan)
     monkeypatch.setenv(VARIABLE, str(tmp_path / "weights"))
     assert len(extract(other).rooms) == 2
     with pytest.raises(InputError, match=broken):
