@@ -17,7 +17,7 @@ from topomerge.datasets.pairs.pairs import HARD
 from topomerge.datasets.plans import splits
 from topomerge.datasets.simulation.sensors import get_sensor
 
-from topomerge.embedding import graph
+from topomerge.embedding.schema import POINTS_PER_ROOM
 from topomerge.errors import InputError
 
 LEAST_PLAN = (5, 45.0)  # rooms, m2 of a real plan: fewer have no two parts, and those of a tiny flat are hardly told apart
@@ -72,7 +72,7 @@ class Recipe:
     scale: float = 0.0
     spread: float = 0.5
     voxel_size: float = 0.1
-    points_per_room: int = graph.POINTS_PER_ROOM
+    points_per_room: int = POINTS_PER_ROOM
     stacks: float = 0.0
     over_stairs: float = 0.0
     maps: bool = False

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from topomerge.embedding.schema import EDGE_KINDS, LENGTH_POWERS, columns_of_power
+from topomerge.embedding.schema import EDGE_KINDS, LENGTH_POWERS, POINTS_PER_ROOM, columns_of_power
 from topomerge.errors import InputError
 from topomerge.extraction.storeys import lowest_of_column
 from topomerge.types import Array, TopometricMap, mostly_unseen
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from torch_geometric.data import Data
 
 GRAPH_FORMAT = 1  # of `graph_arrays`; part of the name of whatever is cached
-POINTS_PER_ROOM = 512
 
 
 def to_graph(map: TopometricMap, points_per_room: int = POINTS_PER_ROOM) -> Data:

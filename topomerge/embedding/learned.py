@@ -16,10 +16,11 @@ import numpy as np
 
 from topomerge.embedding.door_layout import door_layout
 from topomerge.embedding.forward import Forward
-from topomerge.embedding.graph import POINTS_PER_ROOM, graph_arrays, resized
+from topomerge.embedding.graph import graph_arrays, resized
 from topomerge.embedding.network import TABLE_PARTS, Network, tensors
 from topomerge.embedding.point_features import point_features, point_spectra
 from topomerge.embedding.rooms_around import with_rooms_around
+from topomerge.embedding.schema import POINTS_PER_ROOM
 from topomerge.embedding.sheets import sheet_arrays
 from topomerge.embedding.surroundings import CROP_SHAPES, crops
 from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls, edge_ways, quarter_turned, room_facts

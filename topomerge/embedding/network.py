@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from topomerge.embedding.graph import POINTS_PER_ROOM
-from topomerge.embedding.schema import TABLES
+from topomerge.embedding.schema import POINTS_PER_ROOM, TABLES
 from topomerge.embedding.surroundings import CROP_PART, CROP_SHAPES, DOOR_PART, WIDE_PART
 from topomerge.errors import InputError
 from topomerge.networks.signature import Signature, Tensor

@@ -6,6 +6,7 @@ feature takes a line here and its value in `embedding.graph`; weights that were 
 
 from __future__ import annotations
 
+POINTS_PER_ROOM = 512  # that stand for a room
 EDGE_KINDS = ("door", "opening", "stairs")  # of edges
 ROOM_FEATURES = (
     "area",  # m2
