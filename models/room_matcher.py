@@ -141,7 +141,7 @@ class RoomMatcher(nn.Module):
 
     def forward(self, a: RoomsSeen, b: RoomsSeen) -> list[Partners]:
         maps = [Rooms(*(_tensor(part) for part in (m.rows, m.facts, m.places, m.heights))) for m in (a, b)]
-        likely = self.first_guess(maps)
+        likely = self.compute_first_guess(maps)
         states: list[Tensor] = []
         partners: list[Partners] = []
         for k in range(len(self.head)):
@@ -151,7 +151,7 @@ class RoomMatcher(nn.Module):
             likely = (0.5 * (of_stage.rows[:, :-1] + of_stage.columns[:, :-1].T)).exp()
         return partners
 
-    def first_guess(self, maps: Sequence[Rooms]) -> Tensor:
+    def compute_first_guess(self, maps: Sequence[Rooms]) -> Tensor:
         """How likely each pair of rooms is by their rows alone: what votes in the first stage."""
         cosine = FIRST_SHARPNESS * (maps[0].rows @ maps[1].rows.T)
         likely: Tensor = (cosine.softmax(dim=1) * cosine.softmax(dim=0)).sqrt()

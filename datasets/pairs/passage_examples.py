@@ -96,7 +96,7 @@ def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
         columns = np.stack(np.meshgrid(*(np.arange(n) for n in storey.segment.shape), indexing="ij"), axis=-1)
         flat = storey.plan.origin + (columns + 0.5) * storey.plan.edge
         places = np.concatenate([flat, storey.plan.floor[..., None]], axis=-1)
-        rows += storey_passages(storey, truth_of(made.building, storey.plan, places, made.frame, made.shift)[0], visited)
+        rows += collect_storey_passages(storey, truth_of(made.building, storey.plan, places, made.frame, made.shift)[0], visited)
     count, kind = len(rows), "walls" if found.walls is not None else ""
     features, odds, evidence, parted = zip(*rows, strict=True) if rows else ((), (), (), ())
     return PassageExamples(
@@ -108,7 +108,7 @@ def make_passages(item: PlanItem, plan: Plan | None) -> PassageExamples:
     )
 
 
-def storey_passages(
+def collect_storey_passages(
     storey: SegmentedStorey, truth: Array, visited: set[int]
 ) -> list[tuple[Array, float, tuple[float, ...], bool]]:
     """Features, log odds by the plan, evidence and answer of the passages of a storey, before and while segments of one true room

@@ -27,7 +27,7 @@ def storey_of(
     return SegmentedStorey(0, plan, classes, np.ones(shape) if clearance is None else clearance, segment, passages)
 
 
-def rooms_of_segments(
+def find_rooms_of_segments(
     segment: Array,
     clearance: Array,
     passages: dict[Pair, Passage],

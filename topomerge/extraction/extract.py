@@ -14,8 +14,8 @@ from topomerge.extraction.parameters import DefaultParameters, Parameters, Thesi
 from topomerge.extraction.partition import (
     FLAT_LEAST,
     ROOM_LEAST,
+    find_rooms_of_segments,
     partition_rooms,
-    rooms_of_segments,
 )
 from topomerge.extraction.passages import choose_scorer, find_passages
 from topomerge.extraction.plans.part_rooms import PartRooms
@@ -158,7 +158,7 @@ def cut_rooms(
     floor = floor_of_storeys(scan.grid, navigable, found.rasters.storey, found.rasters.storeys, cut, found.rasters.factor)
     if found.walls is None:
         return floor, None
-    return floor, relabel_walls(found.walls, rooms_of_segments(cut, rooms_with_floor(floor)))
+    return floor, relabel_walls(found.walls, find_rooms_of_segments(cut, rooms_with_floor(floor)))
 
 
 def _doubts(map: TopometricMap) -> list[str]:

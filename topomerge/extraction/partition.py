@@ -115,7 +115,7 @@ def find_too_small(rooms: GrowingRooms, least: LeastSize) -> Pair | None:
     return min(found)[2] if found else None
 
 
-def rooms_of_segments(storeys: Sequence[PartitionedStorey], numbers: Array) -> Array:
+def find_rooms_of_segments(storeys: Sequence[PartitionedStorey], numbers: Array) -> Array:
     """(n,) room of the map of each segment of all storeys, -1 none.
 
     Args:

@@ -123,7 +123,7 @@ def _edges_of(storey: SegmentedStorey, first: int) -> Array:
     out["confidence"] = door_probability(x)
     for row, pair in zip(out, pairs, strict=True):
         passage = storey.passages[pair]
-        row["rooms"], row["centre"], row["width"] = np.array(pair) + first, storey.centre_of(passage), passage.width
+        row["rooms"], row["centre"], row["width"] = np.array(pair) + first, storey.locate_centre(passage), passage.width
         row["direction"], row["open"] = np.arctan2(passage.across[0], -passage.across[1]) % np.pi, True
         row["kind"] = "door"
     return out

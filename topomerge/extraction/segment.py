@@ -105,7 +105,7 @@ class SegmentedStorey:
         """(n,) share of each segment's outline at which a wall was seen."""
         return outline_seen(self.segment, self.plan.inside, self.plan.wall, self.plan.edge)
 
-    def centre_of(self, passage: Passage) -> Array:
+    def locate_centre(self, passage: Passage) -> Array:
         """(3,) m, where a passage lies."""
         at = self.plan.origin + (np.array(passage.place) + 0.5) * self.plan.edge
         return np.append(at, self.plan.floor[passage.place])

@@ -14,8 +14,8 @@ import numpy as np
 from scipy import ndimage
 
 from topomerge.extraction.elevations.doorways import DOORWAY_DTYPE, StoreyWalls, door_places, doorways, place_classes
-from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, PLACES, Elevations, face_rows, unroll
-from topomerge.extraction.plans.storey_floor import WALL_REACH, cells_of_storey
+from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, PLACES, Elevations, build_face_rows, unroll
+from topomerge.extraction.plans.storey_floor import WALL_REACH, find_cells_of_storey
 from topomerge.extraction.scan import Scan
 from topomerge.extraction.segment import RasterisedStoreys, SegmentedStorey, find_segments, split_segments
 from topomerge.extraction.topology import DOOR_MOST_WIDTH
@@ -114,7 +114,7 @@ def _faces_of(grid: VoxelGrid, rasters: RasterisedStoreys, storey: SegmentedStor
     plan = storey.plan
     far, nearest = ndimage.distance_transform_edt(storey.segment < 0, return_indices=True)
     segment = np.where(far * plan.edge <= WALL_REACH, storey.segment[tuple(nearest)], -1)
-    rows, column = cells_of_storey(grid, plan, segment, rasters.factor)
+    rows, column = find_cells_of_storey(grid, plan, segment, rasters.factor)
     of = segment[tuple(column.T)]
     count = storey.count
     inside = storey.segment >= 0
@@ -140,7 +140,7 @@ def _faces_of(grid: VoxelGrid, rasters: RasterisedStoreys, storey: SegmentedStor
     main = main_direction([line for points in columns for line in straight_lines(*points)])
     faces: list[tuple[object, ...]] = []
     for s, points in enumerate(columns):
-        faces += face_rows(first + s, straight_lines(*points, main), floors[ends[s] : ends[s + 1]], float(level[s]))
+        faces += build_face_rows(first + s, straight_lines(*points, main), floors[ends[s] : ends[s + 1]], float(level[s]))
     return faces
 
 

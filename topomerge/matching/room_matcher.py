@@ -164,7 +164,7 @@ def odds_of(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
     for side, map in (("a", a), ("b", b)):
         feeds |= {f"rows_{side}": map.rows, f"facts_{side}": map.facts, f"places_{side}": map.places - map.places.mean(axis=0)}
         feeds |= {f"heights_{side}": map.heights - map.heights.mean(), f"state_{side}": np.zeros((len(map.rows), matcher.width))}
-    likely = first_guess(a.rows @ b.rows.T)
+    likely = compute_first_guess(a.rows @ b.rows.T)
     for stage in range(matcher.stages):
         feeds |= {"stage": np.arange(matcher.stages) == stage, "votes": agreement(likely, a, b)}
         feeds["state_a"], feeds["state_b"], rows, columns = matcher.run(**feeds)
@@ -172,7 +172,7 @@ def odds_of(a: RoomsSeen, b: RoomsSeen, matcher: Matcher) -> RoomOdds:
     return RoomOdds(rows.astype(float), columns.astype(float))
 
 
-def first_guess(cosine: Array) -> Array:
+def compute_first_guess(cosine: Array) -> Array:
     """(R_a, R_b) how likely each pair of rooms is by their rows alone: what votes in the first stage."""
     from scipy.special import softmax
 

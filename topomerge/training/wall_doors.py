@@ -71,7 +71,7 @@ def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Can
     scans = []
     for path in paths:
         example = load_walls(path)
-        candidates = candidates_of_map(example.map, example.storeys, example.elevations)
+        candidates = find_candidates_of_map(example.map, example.storeys, example.elevations)
         right = np.zeros(len(candidates.edges), bool)
         right[match_places(example.doors, candidates.edges["centre"], NEAR_DOOR)[:, 1]] = True
         scans.append((candidates, right))
@@ -80,7 +80,7 @@ def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Can
     return scans
 
 
-def candidates_of_map(
+def find_candidates_of_map(
     map: TopometricMap, storeys: Sequence[ClassifiedStorey], elevations: Elevations | None, classes: Array | None = None
 ) -> DoorCandidates:
     """The candidates of a map, by the network of elevations that ships.

@@ -19,7 +19,7 @@ from topomerge.extraction.elevations.doorways import (
 )
 from topomerge.extraction.elevations.elevation import ALONG, FACE_DTYPE, STRIP_CHANNELS, WALL_CLASSES, Elevations
 from topomerge.extraction.elevations.wall_doors import SOURCES, WALL_DOOR_FEATURES, DoorCandidates, door_chance
-from topomerge.training.wall_doors import candidates_of_map
+from topomerge.training.wall_doors import find_candidates_of_map
 from topomerge.types import Sim3, door_state
 
 STEP = 2 * ALONG
@@ -130,7 +130,7 @@ def seen(doors, map=None):
     elevations = Elevations(example[1], np.array([0, 160]), example[2] / np.float32(255))
     classes = np.zeros((len(doors), len(WALL_CLASSES)))
     classes[:, [OPEN, SHUT, HALF_OPEN]] = doors
-    return candidates_of_map(example[0] if map is None else map, (), elevations, classes)
+    return find_candidates_of_map(example[0] if map is None else map, (), elevations, classes)
 
 
 def test_a_door_of_the_plan_lies_where_the_wall_shows_it():

@@ -15,7 +15,7 @@ from topomerge.extraction.elevations.wall_doors import (
     with_wall_doors,
 )
 from topomerge.extraction.plans.storey_plan import DOORWAY_CLASS, PLAN_SIGNS, SHUT_CLASS, WALL_CLASS, ClassifiedStorey, plan_signs
-from topomerge.training.wall_doors import candidates_of_map
+from topomerge.training.wall_doors import find_candidates_of_map
 from topomerge.types import EDGE_DTYPE
 
 
@@ -53,7 +53,7 @@ def test_of_a_map_without_walls_the_plan_is_weighed():
     open_there, wall_there = storey((2.0, 2.9, DOORWAY_CLASS)), storey()
     chances = []
     for plan in (open_there, wall_there):
-        candidates = candidates_of_map(map, (plan,), None)
+        candidates = find_candidates_of_map(map, (plan,), None)
         at = dict(zip(WALL_DOOR_FEATURES, candidates.features[0], strict=True))
         assert [SOURCES[k] for k in candidates.source] == ["flat"] and at["plan"] == pytest.approx(0.9) and at["wall"] == 0
         chances += door_chance(candidates).tolist()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests import scenes
-from tests.extraction.segments import rooms_of_segments
+from tests.extraction.segments import find_rooms_of_segments
 from topomerge.extraction.extract import extract
 from topomerge.extraction.navigable import navigable_volume
 from topomerge.extraction.parameters import PRESETS
@@ -90,7 +90,7 @@ def test_a_side_that_was_not_seen_and_another_storey_say_nothing(cut):
 def rooms_of(cut, log_odds) -> int:
     plan, region, clearance, passages, _ = cut
     weighed = {pair: replace(passage, log_odds=log_odds.get(pair, 0.0)) for pair, passage in passages.items()}
-    room = rooms_of_segments(region, clearance, weighed, score_by_plan, edge=plan.edge)
+    room = find_rooms_of_segments(region, clearance, weighed, score_by_plan, edge=plan.edge)
     sizes = np.bincount(region[region >= 0])
     return len(np.unique(room[sizes * plan.edge**2 > 1]))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests import scenes
-from tests.extraction.segments import rooms_of_segments
+from tests.extraction.segments import find_rooms_of_segments
 from topomerge.extraction.extract import extract
 from topomerge.extraction.floors import has_floor
 from topomerge.extraction.navigable import navigable_volume
@@ -247,9 +247,9 @@ def test_passages_measure_the_door() -> None:
     assert values["lintel"] == pytest.approx(scenes.HEIGHT - scenes.DOOR[1], abs=0.15) and values["lintel_cover"] > 0.8
     assert values["jamb"] > 0.8 and values["opens"] > 1.0 and values["length"] < 0.5
     assert door_probability(door_features(at_the_door[0], (2.0, 1.5), (20.0, 15.0))[None])[0] > 0.9
-    parted = rooms_of_segments(region, clearance, passages, score_by_plan)
-    never = rooms_of_segments(region, clearance, passages, lambda x, _: np.zeros(len(x)))
-    always = rooms_of_segments(region, clearance, passages, lambda x, _: np.ones(len(x)), LeastSize(0.0, 0.0, 0.0, 0.0))
+    parted = find_rooms_of_segments(region, clearance, passages, score_by_plan)
+    never = find_rooms_of_segments(region, clearance, passages, lambda x, _: np.zeros(len(x)))
+    always = find_rooms_of_segments(region, clearance, passages, lambda x, _: np.ones(len(x)), LeastSize(0.0, 0.0, 0.0, 0.0))
     sizes = np.bincount(region[region >= 0])
     assert len(np.unique(parted[sizes * 0.01 > 1])) == 2
     assert len(np.unique(never)) == 1 and len(np.unique(always)) == len(sizes)
@@ -280,7 +280,7 @@ def test_what_is_small_is_a_room_where_a_door_surely_parts_it(
     passage = Passage((0, 0), 0.8, (1.0, 0.0), (0.0,) * 12)
     passages = {(0, 1): passage, (1, 2): replace(passage, evidence=evidence)}
     whole = replace(least, half_width=0.0)
-    of_segment = rooms_of_segments(region, np.ones(region.shape), passages, lambda x, _: np.full(len(x), chance), whole)
+    of_segment = find_rooms_of_segments(region, np.ones(region.shape), passages, lambda x, _: np.full(len(x), chance), whole)
     assert len(np.unique(of_segment)) == rooms
 
 

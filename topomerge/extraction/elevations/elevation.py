@@ -110,7 +110,7 @@ def crossed_places(crossed: VoxelGrid | None, faces: Array, sizes: Array) -> Arr
     return out
 
 
-def face_rows(room: int, lines: Sequence[Line], floor: Array, level: float) -> list[tuple[object, ...]]:
+def build_face_rows(room: int, lines: Sequence[Line], floor: Array, level: float) -> list[tuple[object, ...]]:
     """Rows of FACE_DTYPE along lines; those with no floor (n, 2) m of the room beside them are left out."""
     rows: list[tuple[object, ...]] = []
     for line in lines:

@@ -75,11 +75,11 @@ def _label_cells(label: Array, grid: VoxelGrid, plan: StoreyPlan, room: Array, f
     """Give the occupied cells of a storey the room of their column; walls go to the nearest room."""
     far, nearest = ndimage.distance_transform_edt(room < 0, return_indices=True)
     room = np.where(far * plan.edge <= WALL_REACH, room[tuple(nearest)], -1)
-    rows, column = cells_of_storey(grid, plan, room, factor)
+    rows, column = find_cells_of_storey(grid, plan, room, factor)
     label[rows] = room[tuple(column.T)]
 
 
-def cells_of_storey(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor: int) -> tuple[Array, Array]:
+def find_cells_of_storey(grid: VoxelGrid, plan: StoreyPlan, room: Array, factor: int) -> tuple[Array, Array]:
     """Rows of the occupied cells between floor and ceiling of a storey, in columns that have a room (nx, ny), and (k, 2) these.
 
     Args:
