@@ -19,9 +19,11 @@ from __future__ import annotations
 
 import shlex
 import sys
+from pathlib import Path
 
 from topomerge.datasets.core.script import exit_status
 
+from topomerge.code_digest import find_other_clone
 from topomerge.config import compose
 from topomerge.evaluation.evaluate import evaluate
 from topomerge.evaluation.settings import Evaluation
@@ -38,6 +40,8 @@ def main(words: list[str]) -> int:
     if {"-h", "--help"} & set(words):
         print(__doc__)
         return 0
+    if other := find_other_clone(Path(__file__)):
+        say(f"evaluate: {other}")
     command = shlex.join(
         ["python", "evaluate.py", *words]
     )  # brackets and spaces in quotes, so that a shell takes it as it stands

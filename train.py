@@ -9,17 +9,20 @@ python -m topomerge.training run.json                               without Hydr
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from topomerge.code_digest import find_other_clone
+from topomerge.config import name_by_sweep
 from topomerge.errors import InputError
 from topomerge.training.tasks import register_tasks, settings_from, settings_of, train
 
 register_tasks()
-FLAGS = {"--overfit": "overfit=true", "--resume": "resume=true"}
+FLAGS = {f"--{word}": f"{word}=true" for word in ("overfit", "resume", "overwrite")}
 
 
 def say(text: str) -> None:
@@ -34,7 +37,7 @@ def main(config: DictConfig) -> float:
         settings = settings_from(config)
         job = HydraConfig.get()
         if job.mode == RunMode.MULTIRUN:  # each run of a sweep gets a folder of its own
-            settings.runs, settings.name = str(job.sweep.dir), str(job.sweep.subdir)
+            settings.runs, settings.name = str(job.sweep.dir), str(job.sweep.subdir) or settings.name
             settings.resume = settings.resume and (settings.folder / "last").exists()  # the others have not begun
         return train(settings, say)[f"val/{settings.watch}"]
     except InputError as error:
@@ -45,11 +48,13 @@ def main(config: DictConfig) -> float:
 
 
 if __name__ == "__main__":
+    if other := find_other_clone(Path(__file__)):
+        say(f"train: {other}")
     words = [FLAGS.get(word, word) for word in sys.argv[1:]]
-    if not any(word.startswith("-") or word.startswith("hydra") for word in words):
-        try:
+    try:
+        if not any(word.startswith("-") or word.startswith("hydra") for word in words):
             settings_of(words)  # a wrong key is one line, where Hydra says ten
-        except InputError as error:
-            sys.exit(f"train: {error}")
-    sys.argv[1:] = words
+        sys.argv[1:] = name_by_sweep(words)
+    except InputError as error:
+        sys.exit(f"train: {error}")
     main()

@@ -2,12 +2,14 @@
 
 A batch holds several pairs of maps. For a room of a, the rooms of the other map that are the same true room are its partners
 (several, where one of the maps has it in pieces). The other rooms of both maps are hard negatives: they stand in the same
-building. The rooms of the other pairs are easy ones. Rooms of one true room are no negatives of each other.
+building. The rooms of the other pairs are easy ones. Rooms of one true room are no negatives of each other, nor are rooms of two
+pairs that show one building: they may be one room.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from topomerge.models.embedder import Embedder
@@ -48,6 +50,7 @@ class Truth:
         same: (N, N) bool, the two are one true room, in the two maps of a pair.
         piece: (N, N) bool, the two are of one true room in one map.
         clear: (N,) bool, both maps have most of the room; or it has no partner, and its map has most of it.
+    building: (N,) int64, a number of the physical building that a room is in.
     """
 
     pair: Tensor
@@ -55,6 +58,29 @@ class Truth:
     same: Tensor
     piece: Tensor
     clear: Tensor
+    building: Tensor
+
+
+@dataclass(eq=False)
+class Others:
+    """Rooms of the batches of other processes.
+
+    Args:
+        embedding: (M, D) of length 1; building: (M,), as of `Truth`.
+    """
+
+    embedding: Tensor
+    building: Tensor
+
+
+class Processes(Protocol):
+    """What a loss asks of the processes that train together."""
+
+    def gather_others(self, rows: Tensor) -> Tensor:
+        """Return the rows (M, ...) of all other processes; gradients flow back to where they come from."""
+
+    def average(self, value: Tensor) -> Tensor:
+        """Return the mean of a value over the processes, without a gradient."""
 
 
 def check(settings: LossSettings) -> None:
@@ -73,40 +99,60 @@ def check(settings: LossSettings) -> None:
 
 
 def matching_loss(
-    settings: LossSettings, embedding: Tensor, dustbin: Tensor, temperature: Tensor, truth: Truth
+    settings: LossSettings,
+    embedding: Tensor,
+    dustbin: Tensor,
+    temperature: Tensor,
+    truth: Truth,
+    processes: Processes | None = None,
 ) -> dict[str, Tensor]:
     """Losses by name; `loss` is their weighted sum. Each is the mean over rooms, the faint ones weighing less.
+
+    The mean of the losses of several processes, and of their gradients, is that of one process with all their pairs.
 
     Args:
         embedding: (N, D) of length 1.
         dustbin: (N,) logits.
         temperature: learned one.
+        processes: that train together; None: this one alone.
     """
+    others = None
+    if processes is not None and settings.kind != "triplet":  # the negatives of triplets are of the same pair
+        others = Others(processes.gather_others(embedding), processes.gather_others(truth.building))
     if settings.kind == "infonce":
-        main, counts = info_nce(embedding, temperature, truth, settings.easy)
+        main, counts = info_nce(embedding, temperature, truth, settings.easy, others)
     elif settings.kind == "ntxent":
-        main, counts = info_nce(embedding, embedding.new_tensor(settings.temperature), truth, 1.0)
+        main, counts = info_nce(embedding, embedding.new_tensor(settings.temperature), truth, 1.0, others)
     else:
         main, counts = triplet(embedding, truth, settings.margin)
     # Where another loss than InfoNCE shapes the embedding, only the dustbins and the temperature are fitted to it.
     fixed = embedding if settings.kind == "infonce" else embedding.detach()
     weight = torch.where(truth.clear, 1.0, settings.faint)
-    first = _mean(main, weight * counts)
-    second = _mean(dustbin_loss(fixed, dustbin, temperature, truth), weight)
+    first = _mean(main, weight * counts, processes)
+    second = _mean(dustbin_loss(fixed, dustbin, temperature, truth), weight, processes)
     return {"loss": first + settings.dustbin * second, settings.kind: first.detach(), "dustbin": second.detach()}
 
 
-def _mean(values: Tensor, weight: Tensor) -> Tensor:
-    return (values * weight).sum() / weight.sum().clamp(min=1e-6)
+def _mean(values: Tensor, weight: Tensor, processes: Processes | None) -> Tensor:
+    total = weight.sum() if processes is None else processes.average(weight.sum())
+    return (values * weight).sum() / total.clamp(min=1e-6)
 
 
-def info_nce(embedding: Tensor, temperature: Tensor, truth: Truth, easy: float = 1.0) -> tuple[Tensor, Tensor]:
+def info_nce(
+    embedding: Tensor, temperature: Tensor, truth: Truth, easy: float = 1.0, others: Others | None = None
+) -> tuple[Tensor, Tensor]:
     """(N,) -log(sum of exp(s) of partners / sum of exp(s) of partners and negatives), s being the cosine over the temperature;
-    and (N,) bool, which rooms have a partner; negatives of other pairs count `easy` times (van den Oord et al. 2018)."""
+    and (N,) bool, which rooms have a partner; negatives of other pairs count `easy` times, and not at all where they are of the
+    same building (van den Oord et al. 2018)."""
     logits = embedding @ embedding.T / temperature
     same_pair = truth.pair[:, None] == truth.pair[None]
-    weight = torch.where(same_pair, 1.0, easy) * ~(truth.piece | torch.eye(len(logits), dtype=torch.bool, device=logits.device))
-    candidates = (logits + weight.clamp(min=1e-30).log()).masked_fill(weight == 0, NEVER_LOGIT).logsumexp(dim=1)
+    weight = torch.where(same_pair, 1.0, easy * (truth.building[:, None] != truth.building[None]))
+    weight = weight * ~(truth.piece | torch.eye(len(logits), dtype=torch.bool, device=logits.device))
+    all_logits = logits
+    if others is not None:
+        all_logits = torch.cat([logits, embedding @ others.embedding.T / temperature], dim=1)
+        weight = torch.cat([weight, easy * (truth.building[:, None] != others.building[None])], dim=1)
+    candidates = (all_logits + weight.clamp(min=1e-30).log()).masked_fill(weight == 0, NEVER_LOGIT).logsumexp(dim=1)
     partners = logits.masked_fill(~truth.same, NEVER_LOGIT).logsumexp(dim=1)
     has = truth.same.any(dim=1)
     return torch.where(has, candidates - partners, 0.0), has
@@ -146,14 +192,16 @@ class Objective(nn.Module):
 
     Args:
         network: an `Embedder`.
+        processes: that train together, whose rooms are negatives, too; None: this one alone.
     """
 
-    def __init__(self, network: Embedder, settings: LossSettings) -> None:
+    def __init__(self, network: Embedder, settings: LossSettings, processes: Processes | None = None) -> None:
         super().__init__()
         check(settings)
-        self.network, self.settings = network, settings
+        self.network, self.settings, self.processes = network, settings, processes
 
     def forward(self, tensors: dict[str, Tensor], truth: Truth) -> dict[str, Tensor]:
         embedding, dustbin = self.network(tensors)
         with torch.autocast(embedding.device.type, enabled=False):  # a small temperature magnifies what 8 bits leave out
-            return matching_loss(self.settings, embedding.float(), dustbin.float(), self.network.temperature, truth)
+            rows, bins = embedding.float(), dustbin.float()
+            return matching_loss(self.settings, rows, bins, self.network.temperature, truth, self.processes)

@@ -2,7 +2,7 @@
 
 A folder: the files of the network (of an embedder: `models.weights`), `optimizer.safetensors` and, written last, `state.json`:
 
-    {"format": 2, "class": "topomerge.training", "sha256": {file: …}, "progress": {…}}
+    {"format": 3, "class": "topomerge.training", "sha256": {file: …}, "progress": {…}}
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor
 from topomerge.embedding.weights import WEIGHTS_FILE
 from topomerge.errors import InputError
 
-STATE_FORMAT = 2
+STATE_FORMAT = 3
 STATE_CLASS = "topomerge.training"
 NETWORK_FILE, OPTIMIZER_FILE, STATE_FILE = "network.safetensors", "optimizer.safetensors", "state.json"
 

@@ -24,9 +24,11 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -222,3 +224,32 @@ def _homes(package: Path) -> dict[str, str]:
             homes: dict[str, str] = ast.literal_eval(node.value)
             return {f"{TOP}.{name}": home for name, home in homes.items()}
     return {}
+
+
+def read_commit(package: Path = HERE) -> tuple[str, bool]:
+    """The commit of the checkout that a package runs from, and do its sources differ from it? Empty outside a checkout."""
+
+    def git(*words: str) -> str:
+        try:
+            done = subprocess.run(["git", "-C", str(package.parent), *words], capture_output=True, text=True, check=False)
+        except OSError:  # no git here
+            return ""
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    commit = git("rev-parse", "HEAD") if (package.parent / ".git").exists() else ""
+    return commit, bool(commit and git("status", "--porcelain"))
+
+
+def find_other_clone(script: Path) -> str:
+    """One line where a script of a clone would run another clone's code, since they share an environment; else empty.
+
+    Args:
+        script: of the top folder of a checkout.
+    """
+    own = script.resolve().parent
+    for name in (TOP, *(f"{TOP}.{part}" for part in DATA_BESIDE)):
+        spec = find_spec(name)
+        if spec is not None and spec.origin is not None and not Path(spec.origin).resolve().is_relative_to(own):
+            where = Path(spec.origin).resolve().parent
+            return f"warning: {own} would run the code of another clone: {name} comes from {where}; run make setup here"
+    return ""

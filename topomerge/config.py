@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -87,3 +89,26 @@ def _one_line(error: Exception) -> str:
         texts.append(str(error.__cause__))
     lines = [line.strip() for text in texts for line in text.splitlines()]
     return "; ".join(line for line in lines if line and not line.startswith("object_type="))
+
+
+def name_by_sweep(words: Sequence[str]) -> list[str]:
+    """Words of `train.py`; of a sweep with one more, by which names of runs hold what differs between them only."""
+    if not {"-m", "--multirun"} & set(words):
+        return list(words)
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        overrides = OverridesParser.create().parse_overrides([word for word in words if not word.startswith("-")])
+    except HydraException as error:
+        raise InputError(_one_line(error)) from error
+    fixed = [one.key_or_group for one in overrides if not one.is_sweep_override() and not one.key_or_group.startswith("hydra")]
+    return [*words, f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]"]
+
+
+def read_command() -> str:
+    """The command line that runs, in quotes where a shell needs them; of a sweep that of its one run."""
+    hydra = sys.modules.get("hydra.core.hydra_config")
+    if hydra is not None and hydra.HydraConfig.initialized():
+        return shlex.join(["python", "train.py", *hydra.HydraConfig.get().overrides.task])
+    return shlex.join(["python", *sys.orig_argv[1:]])

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import beta, t
 
 from topomerge.types import Array
 
@@ -32,6 +32,17 @@ def exact_interval(hits: int, n: int) -> tuple[float, float]:
     low = float(beta.ppf(OUTSIDE, hits, n - hits + 1)) if hits else 0.0
     high = float(beta.ppf(1 - OUTSIDE, hits + 1, n - hits)) if hits < n else 1.0
     return low, high
+
+
+def estimate_mean(values: Array) -> tuple[float, float, float]:
+    """Mean of a few independent values (n,), such as scores of seeds, and the ends of its 95 % confidence interval by Student's
+    t, which are nan where there is one value only."""
+    values = np.asarray(values, float)
+    mean = float(values.mean())
+    if len(values) < 2:
+        return mean, float("nan"), float("nan")
+    half = float(t.ppf(1 - OUTSIDE, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
+    return mean, mean - half, mean + half
 
 
 def bootstrap(values: Array, groups: Array, rounds: int = 2000, seed: int = 0) -> tuple[float, float, float]:

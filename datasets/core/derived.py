@@ -74,6 +74,13 @@ def derive(
     return [path for item in items if (path := folder / f"{item.name}.npz").exists()], report
 
 
+def read_sources(path: Path) -> list[str]:
+    """Stems of the names of the files that a file was made from."""
+    about: dict[str, Any] = json.loads(archive.read(path, "cached item", only=["about"])["about"].tobytes())
+    sources: list[str] = about["sources"]
+    return sources
+
+
 def read_derived(path: Path) -> dict[str, Array]:
     """The arrays of a file, but for what it says about itself."""
     arrays = archive.read(path, "cached item")

@@ -1,17 +1,19 @@
 """Build a cached set of extracted pairs: ``python -m topomerge.datasets.pairs.build data=train_small``.
 
-The cache holds `pairs/<hash of the inputs>.npz`, or `.refused` with the reason, and a manifest `<name>.jsonl`. A build that
-was killed goes on where it was; the result has the same bytes. Work is shared out by joblib: over processes of this machine
-(``jobs=2``), or over a Dask cluster (``cluster=tcp://host:8786``), whose workers must see the cache under the same path.
+The cache holds `pairs/<hash of the inputs>.npz`, or `.refused` with the reason, a manifest `<name>.jsonl` and its recipe
+`<name>.recipe.json`. A build that was killed goes on where it was; the result has the same bytes. Work is shared out by joblib:
+over processes of this machine (``jobs=2``), or over a Dask cluster (``cluster=tcp://host:8786``), whose workers must see the
+cache under the same path.
 Machines that share nothing make a part each (``part=[1,2]`` and ``part=[2,2]``); with the files of all parts in one cache, the
 build without a part writes the whole manifest.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from topomerge.datasets.core.builder import Report, build_set, check_sharing
@@ -19,6 +21,9 @@ from topomerge.datasets.core.script import exit_status
 from topomerge.datasets.pairs.example import make_file
 from topomerge.datasets.pairs.items import draw_items, plans_of
 from topomerge.datasets.pairs.recipe import Recipe, check, library
+
+from topomerge.io.atomic import replacing
+from topomerge.io.listing import plain
 
 
 @dataclass
@@ -50,6 +55,9 @@ def build(settings: Build, say: Callable[[str], None] = lambda text: None, every
     items = {item.name: item for item in draw_items(settings.data, plans)[first - 1 :: step]}
     order = sorted(items.values(), key=lambda item: -item.rooms)  # the longest first: all workers end at about the same time
     tasks = [(item, list(plans_of(item, plans)), str(folder)) for item in order]
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(folder.parent / f"{settings.data.name}.recipe.json") as beside:
+        beside.write_text(json.dumps(plain(asdict(settings.data)), indent=1) + "\n", encoding="utf-8")
     return build_set(folder.parent / f"{settings.data.name}.jsonl", tasks, make_file, settings, say, every)
 
 

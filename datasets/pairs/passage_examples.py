@@ -54,6 +54,7 @@ class PassageExamples:
         evidence: (n, 3) `EVIDENCE`.
         parted: (n,) bool, do they part two true rooms?
         kind: "walls", or "" of a scan that shows none at heights (`passages.choose_scorer`).
+        building: the physical one, where that is known.
     """
 
     features: Array
@@ -61,6 +62,7 @@ class PassageExamples:
     evidence: Array
     parted: Array
     kind: str
+    building: str = ""
 
 
 def build_passages(recipe: PlanRecipe, sharing: Sharing, say: Say = lambda text: None) -> list[Path]:
@@ -80,7 +82,7 @@ def load_passages(path: Path) -> PassageExamples:
         InputError: it is damaged.
     """
     arrays = archive.read(path, "cached passages")
-    values = {name: arrays[name] for name in ("features", "plan", "evidence", "parted")}
+    values: dict[str, Any] = {name: arrays[name] for name in ("features", "plan", "evidence", "parted")}
     return PassageExamples(**values, kind=str(arrays["kind"]))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -25,7 +26,7 @@ def truth(matches, pair, side, true=None) -> Truth:
         same[i, j] = same[j, i] = True
     map, true = 2 * torch.tensor(pair) + torch.tensor(side), torch.tensor(true if true else range(n))
     piece = (map[:, None] == map[None]) & (true[:, None] == true[None]) & ~torch.eye(n, dtype=torch.bool)
-    return Truth(torch.tensor(pair), torch.tensor(side), same, piece, torch.ones(n, dtype=torch.bool))
+    return Truth(torch.tensor(pair), torch.tensor(side), same, piece, torch.ones(n, dtype=torch.bool), torch.tensor(pair))
 
 
 FLAT = torch.tensor([[1.0, 0], [0, 1], [1, 0], [0, 1]])  # a: rooms 0 and 1, b: rooms 2 and 3, 0 looks like 2
@@ -52,6 +53,48 @@ def test_easy_negatives_count_less():
     for easy in (0.0, 0.3, 1.0):
         loss, _ = info_nce(embedding, torch.tensor(0.5), other, easy)
         assert loss[0].item() == pytest.approx(math.log((E(2) + easy * E(0)) / E(2)), abs=1e-6)
+
+
+def test_rooms_of_two_pairs_of_one_building_are_no_negatives():
+    """Room 2 looks like room 0 and may be it; room 3 is of another building."""
+    embedding = torch.tensor([[1.0, 0], [1, 0], [1, 0], [0, 1]])
+    other = truth([(0, 1)], [0, 0, 1, 2], [0, 1, 0, 0])
+    one_building = replace(other, building=torch.tensor([7, 7, 7, 8]))
+    apart, _ = info_nce(embedding, torch.tensor(1.0), other, 0.5)
+    together, _ = info_nce(embedding, torch.tensor(1.0), one_building, 0.5)
+    assert apart[0].item() == pytest.approx(math.log((E(1) + 0.5 * E(1) + 0.5) / E(1)), abs=1e-6)
+    assert together[0].item() == pytest.approx(math.log((E(1) + 0.5) / E(1)), abs=1e-6)
+
+
+class _Recorded:
+    """One of two processes, whose other one has these rows."""
+
+    def __init__(self, embedding: torch.Tensor, building: torch.Tensor, mean: float) -> None:
+        self.rows, self.mean = [embedding, building], mean
+
+    def gather_others(self, rows: torch.Tensor) -> torch.Tensor:
+        return self.rows[0 if rows.is_floating_point() else 1]
+
+    def average(self, value: torch.Tensor) -> torch.Tensor:
+        return torch.tensor(self.mean)
+
+
+@pytest.mark.parametrize("kind", ["infonce", "ntxent", "triplet"])
+def test_the_mean_loss_of_two_processes_is_that_of_one_with_all_pairs(kind):
+    """Three pairs, of which the second and the third show one building and are in two processes."""
+    rows = torch.nn.functional.normalize(torch.randn(12, 4, generator=torch.manual_seed(0)), dim=1)
+    bins, hot = torch.randn(12), torch.tensor(0.2)
+    matches, pairs = [(0, 2), (4, 6), (8, 10), (9, 11)], [0] * 4 + [1] * 4 + [2] * 4
+    whole = replace(truth(matches, pairs, [0, 0, 1, 1] * 3), building=torch.tensor(pairs).clamp(max=1))
+    settings = LossSettings(kind, dustbin=0.0)
+    expected = matching_loss(settings, rows, bins, hot, whole)["loss"]
+    halves = []
+    for mine, other in ((slice(0, 8), slice(8, 12)), (slice(8, 12), slice(0, 8))):
+        square = {name: getattr(whole, name)[mine, mine] for name in ("same", "piece")}
+        part = Truth(**{name: getattr(whole, name)[mine] for name in ("pair", "side", "clear", "building")}, **square)
+        others = _Recorded(rows[other], whole.building[other], 4.0)  # rooms with a partner: four in each
+        halves.append(matching_loss(settings, rows[mine], bins[mine], hot, part, others)["loss"])
+    assert sum(halves) / 2 == pytest.approx(expected.item(), rel=1e-5)
 
 
 def test_the_dustbin():
@@ -115,7 +158,7 @@ def test_each_kind_learns_and_stays_finite(kind):
 
 def test_faint_rooms_count_less():
     clear = torch.tensor([False, False, True, True])
-    faint = Truth(ONE.pair, ONE.side, ONE.same, ONE.piece, clear)
+    faint = replace(ONE, clear=clear)
     embedding, bins = torch.nn.functional.normalize(torch.tensor([[1.0, 0.5], [0, 1], [1, 0], [0.3, 1]]), dim=1), torch.zeros(4)
     single, _ = info_nce(embedding, torch.tensor(1.0), ONE, 0.3)
     losses = matching_loss(LossSettings(faint=0.25, dustbin=0.0), embedding, bins, torch.tensor(1.0), faint)

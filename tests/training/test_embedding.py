@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from topomerge.datasets.pairs.plan_examples import example_arrays
+from topomerge.datasets.pairs.scan_items import PlanItem
 from topomerge.models.embedder import Embedder
 from topomerge.models.weights import read_embedder
 
@@ -22,12 +24,15 @@ from topomerge.checkpoint import load_state
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.errors import InputError
+from topomerge.io import archive
+from topomerge.training import embedding
 from topomerge.training.__main__ import main
 from topomerge.training.batches import changed, make_batch
-from topomerge.training.embedding import EmbeddingJob, fit, hold_out
-from topomerge.training.loop import pace
+from topomerge.training.embedding import EmbeddingJob, fit, start_fabric
+from topomerge.training.loop import State, group_parameters, pace
 from topomerge.training.packed import load_pairs
 from topomerge.training.settings import Augment, Training, from_dict, from_file, to_dict
+from topomerge.training.splits import hold_out, mark_watched, read_scan_building
 from topomerge.training.table import write_table
 from topomerge.training.tasks import settings_of as from_words
 from topomerge.training.validate import embed, validate
@@ -251,6 +256,134 @@ def test_pace_and_holding_out():
     assert pace(0.0, 0.1) < 0.02 and pace(0.1, 0.1) == pytest.approx(1) and pace(1.0, 0.1) == pytest.approx(0)
     train, held = hold_out([pair(k, 3) for k in range(60)])
     assert len(train) + len(held) == 60 and 0 < len(held) < 20
+
+
+def test_storeys_of_a_building_are_on_one_side():
+    """Of twelve schools with four storeys each; by raw names they were on both sides."""
+    storeys = [pair(k, 3) for k in range(48)]
+    for k, one in enumerate(storeys):
+        one.about.update({"source": "campus", "building": f"Schule{'abcdefghijkl'[k // 4]}{k % 4}"})
+    train, held = hold_out(storeys)
+    sides = [{one.buildings[0] for one in side} for side in (train, held)]
+    assert len(sides[0]) + len(sides[1]) == 12 and len(held) % 4 == 0 and not sides[0] & sides[1]
+    assert storeys[0].building_numbers == storeys[3].building_numbers != storeys[4].building_numbers
+    stranger = replace(storeys[0], about={**storeys[0].about, "hard": "other-building", "file": "x.npz"})
+    assert stranger.buildings[0] == storeys[0].buildings[0] != stranger.buildings[1]
+
+
+def test_scans_of_a_building_are_watched_together(tmp_path):
+    assert mark_watched(["a", "b", "a", "c", "b", "d"], 2).tolist() == [True, False, True, True, False, False]
+    archive.write(example_arrays(PlanItem(7, "r2v", 3, "house/first", ""), []), tmp_path / "real.npz")
+    archive.write(example_arrays(PlanItem(7, "procedural", 0, "", ""), []), tmp_path / "made.npz")
+    assert (
+        read_scan_building(tmp_path / "real.npz") == "r2v/house" and read_scan_building(tmp_path / "made.npz") == "procedural/7"
+    )
+
+
+def test_biases_norms_and_the_temperature_do_not_decay():
+    network = Embedder(Network(Geometry(["scalars", "pointnet", "surroundings"]), Node("gat", doors=1)))
+    layers, others = group_parameters(network, 0.1)
+    assert layers["weight_decay"] == 0.1 and others["weight_decay"] == 0
+    still = {id(p) for p in others["params"]}
+    undecayed = {name for name, p in network.named_parameters() if id(p) in still}
+    assert "log_temperature" in undecayed and all(name in undecayed for name, _ in network.named_parameters() if "bias" in name)
+    for name, module in network.named_modules():
+        if "Norm" in type(module).__name__:
+            assert all(id(p) in still for p in module.parameters()), name
+        if isinstance(module, torch.nn.Linear):
+            assert id(module.weight) not in still, name
+    assert len(layers["params"]) + len(still) == len(list(network.parameters()))
+
+
+def poisoned(monkeypatch, at: int, value: float) -> None:
+    """Let the gradient of one step of a training be no finite number."""
+    backward, done = torch.Tensor.backward, []
+
+    def spoilt(self, *args, **kwargs):
+        backward(self, *args, **kwargs)
+        done.append(1)
+        if len(done) == at:
+            network = spoilt.network
+            next(p for p in network.parameters() if p.grad is not None).grad.fill_(value)
+
+    start = EmbeddingJob.__init__
+
+    def noted(self, settings, fabric, network, *rest):
+        spoilt.network = network
+        start(self, settings, fabric, network, *rest)
+
+    monkeypatch.setattr(EmbeddingJob, "__init__", noted)
+    monkeypatch.setattr(torch.Tensor, "backward", spoilt)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_gradient_that_is_no_number_ends_the_run_in_one_line(settings, tmp_path, monkeypatch, value):
+    poisoned(monkeypatch, 4, value)  # in the second epoch
+    with pytest.raises(InputError, match="step 2 of epoch 2: a loss or gradient is no finite number") as refused:
+        fit(settings, quiet)
+    assert "\n" not in str(refused.value)
+    assert load_embedder(tmp_path / "run" / "last")  # that of the first epoch, which can be read
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_a_weight_is_not_touched_by_a_gradient_that_is_no_number(settings, fused):
+    """On a device, where nobody waits for the norm, the optimizer itself leaves the step out."""
+    torch.manual_seed(0)
+    fabric, network = start_fabric(settings), Embedder(SMALL)
+    optimizer = torch.optim.AdamW(group_parameters(network, 0.1), 0.1, fused=fused)
+    pairs = [pair(k) for k in range(4)]
+    job = EmbeddingJob(settings, fabric, network, optimizer, (pairs, pairs))
+    batch = next(job.batches(State()))
+    before = [p.detach().clone() for p in network.parameters()]
+    bad = batch.clone()
+    bad["x"] = bad["x"] * float("nan")
+    if fused:
+        assert not job.step(bad, State())["norm"].isfinite()
+    else:
+        with pytest.raises(InputError, match="diverged"):
+            job.step(bad, State())
+    assert all(torch.equal(a, b) for a, b in zip(before, network.parameters(), strict=True))
+    job.step(batch, State())
+    assert all(p.isfinite().all() for p in network.parameters()) and not torch.equal(before[1], list(network.parameters())[1])
+
+
+def test_an_overflow_of_half_precision_skips_a_step(settings, tmp_path, monkeypatch):
+    """A scale of 2^127 makes the first gradients infinite; the scaler halves it until they are not."""
+    from lightning_fabric import Fabric
+    from lightning_fabric.plugins import MixedPrecision
+
+    scaler = torch.amp.GradScaler("cpu", init_scale=2.0**127, backoff_factor=2.0**-64)
+    plugin = MixedPrecision("bf16-mixed", "cpu")
+    plugin.scaler = scaler
+    monkeypatch.setattr(embedding, "start_fabric", lambda settings: Fabric(accelerator="cpu", devices=1, plugins=[plugin]))
+    fit(settings, quiet)
+    rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert rows[0]["train/skipped"] == 0.5 and rows[1]["train/skipped"] == 0  # one of two steps
+    assert all(np.isfinite(row["train/norm"]) and np.isfinite(row["train/loss"]) for row in rows)
+    assert scaler.get_scale() == 2.0**63
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"rate": -1.0}, "rate"),
+        ({"rate": 0.0}, "rate"),
+        ({"rate": float("nan")}, "rate must be a finite number"),
+        ({"precision": "half"}, "precision: unknown 'half'"),
+        ({"precision": "16-mixed"}, "precision=16-mixed needs accelerator=cuda"),
+        ({"accelerator": "tpu"}, "accelerator: unknown 'tpu'"),
+        ({"accelerator": "cuda"}, "accelerator=cuda: torch finds no such device here"),
+        ({"watch": "recall"[:-1]}, "watch: unknown 'recal'"),
+    ],
+)
+def test_what_cannot_train_is_refused_before_data_is_read(settings, tmp_path, monkeypatch, change, said):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr(embedding, "load_pairs", lambda *_, **__: pytest.fail("data was read"))
+    with pytest.raises(InputError, match=said) as refused:
+        fit(replace(settings, **change), quiet)
+    assert "\n" not in str(refused.value) and not (tmp_path / "run").exists()
+    with pytest.raises(InputError, match="rate"):
+        from_words(["rate=fast"])
 
 
 CONFIGS = ROOT / "configs"

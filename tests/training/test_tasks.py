@@ -52,7 +52,7 @@ from topomerge.training.judging import judge_task
 from topomerge.training.loop import State, made_beside
 from topomerge.training.networks import device_of
 from topomerge.training.plan_segmentation import class_scores
-from topomerge.training.tasks import TASKS, settings_of, train, weights_of
+from topomerge.training.tasks import SCORES, TASKS, settings_of, train, weights_of
 from topomerge.types import EDGE_DTYPE, Array
 
 ROOT = Path(__file__).parent.parent.parent
@@ -144,9 +144,11 @@ def test_a_task_is_trained_exported_read_and_judged(task, words, tmp_path, monke
     run = tmp_path / "runs" / task
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert len(rows) == (2 if task in NETWORKS else 1) and all(np.isfinite(value) for value in scores.values())
+    assert {f"val/{name}" for name in SCORES[task]} <= set(rows[0])
     assert json.loads((run / "config.json").read_text())["task"] == task
     card = json.loads((run / "best" / f"{Path(TASKS[task].file).stem}.card.json").read_text())
     assert card["task"] == task and f"task={task}" in card["command"] and card["metrics"]
+    assert card["provenance"]["starts"][0]["versions"]["numpy"] and card["provenance"]["data"]["data"]["name"]
     assert card["data"]["split"] == (
         "validation" if task == "match_belief" else "train"
     )  # it weighs what others were trained for
@@ -226,6 +228,13 @@ def test_fits_learn_what_is_so(words) -> None:
         (["task=match_odds", "pulls=1"], "pulls"),
         (["task=feature_scale", "name=../x"], "name"),
         (["task=embedding", "epoch=3"], "epoch"),
+        (["task=place_evidence", "rate=-1"], "rate"),
+        (["task=place_evidence", "rate=0"], "rate"),
+        (["task=place_evidence", "rate=nan"], "rate"),
+        (["task=place_evidence", "rate=inf"], "rate"),
+        (["task=place_evidence", "rate=fast"], "rate"),
+        (["task=place_evidence", "augment.noise=nan"], "augment.noise"),
+        (["task=place_evidence", "decay=-0.1"], "decay"),
     ],
 )
 def test_a_wrong_word_is_one_line_with_its_key(given: list[str], key: str) -> None:
@@ -239,6 +248,15 @@ def test_a_device_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(InputError, match="accelerator=cuda"):
         device_of(settings_of(["task=plan_segmentation", "accelerator=cuda"]))
     assert device_of(settings_of(["task=door_classification"])).type == "cpu"
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_a_wrong_score_to_watch_is_one_line_before_any_data_is_made(task: str, tmp_path: Path) -> None:
+    settings = settings_of([f"task={task}", f"runs={tmp_path}", f"cache={tmp_path / 'cache'}"])
+    settings.watch = "recal@1"
+    with pytest.raises(InputError, match="watch: unknown 'recal@1'") as refused:
+        train(settings, quiet)
+    assert "\n" not in str(refused.value) and not list(tmp_path.iterdir())
 
 
 def test_batches_made_beside_are_the_same() -> None:

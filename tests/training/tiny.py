@@ -193,6 +193,7 @@ def room_scans(recipe: PlanRecipe, *_: Any) -> list[dict[str, Any]]:
         x = rng.random((9, len(GRID_FEATURES if recipe.flat and recipe.surroundings else ROOM_FEATURES)))
         p = rng.random((9, len(POSE_FEATURES)))
         scan = {"x": x, "one": x[:, 1] > 0.3, "whole": x[:, 2] > 0.5, "entered": x[:, 0] > 0.5, "outside": x[:, 3] < 0.1}
+        scan["building"] = np.array(f"b{k}")
         scans.append(scan if k % 3 == 0 else {**scan, "posed.x": x, "posed.p": p, "posed.entered": p[:, 0] > 0.5})
     return scans
 
@@ -243,5 +244,5 @@ def passage_scans(count: int) -> list[PassageExamples]:
         evidence = np.column_stack([np.maximum(rng.normal(0, 3, 40), 0), rng.random(40) < 0.3, np.zeros(40)]).astype(float)
         parted = evidence[:, 0] + rng.normal(0, 0.5, 40) > 0.5
         plan = np.where(parted, 1.0, -1.0) + rng.normal(0, 2, 40)
-        scans.append(PassageExamples(rng.random((40, 17)), plan, evidence, parted, "walls"))
+        scans.append(PassageExamples(rng.random((40, 17)), plan, evidence, parted, "walls", f"b{k}"))
     return scans

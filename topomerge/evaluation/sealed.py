@@ -16,7 +16,6 @@ import argparse
 import os
 import re
 import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -25,6 +24,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from topomerge import __version__
+from topomerge.code_digest import read_commit
 from topomerge.datasets.core.script import exit_status
 from topomerge.datasets.plans.sealed import SEALED, sealed_run
 from topomerge.errors import InputError
@@ -63,13 +63,8 @@ def run(
 
 def commit() -> str:
     """The commit of the sources, with a word where they differ from it; nothing outside a checkout."""
-
-    def git(*words: str) -> str:
-        done = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=False)
-        return done.stdout.strip() if done.returncode == 0 else ""
-
-    named = git("rev-parse", "--short=12", "HEAD")
-    return f"{named} with changes that are not committed" if named and git("status", "--porcelain") else named
+    named, changed = read_commit()
+    return f"{named[:12]} with changes that are not committed" if changed else named[:12]
 
 
 def blocks(text: str) -> list[str]:

@@ -37,6 +37,7 @@ class MapPair(Data):
     | `side` | (R,) | 0: of a, 1: of b |
     | `true` | (R,) | true room, -1 none |
     | `clear` | (R,) bool | see `seen_well` |
+    | `building` | (R,) int64 | number of the physical building |
     | `match_index` | (2, M) | rooms of a and of b that are one true room |
     | `room_counts` | (2,) | rooms of a and of b |
 
@@ -69,7 +70,7 @@ class MapPair(Data):
         same[first, second] = same[second, first] = True
         map = 2 * pair + side
         piece = (map[:, None] == map[None]) & (true[:, None] == true[None]) & (true >= 0)[:, None]
-        return Truth(pair, side, same, piece.fill_diagonal_(False), self["clear"])
+        return Truth(pair, side, same, piece.fill_diagonal_(False), self["clear"], self["building"])
 
 
 class ChangedPairs(Dataset[MapPair]):
@@ -139,9 +140,11 @@ def map_pair(
     sides = [torch.repeat_interleave(torch.arange(2), counts), torch.ones(again, dtype=torch.long)]
     true_rooms = [numbers[present] for numbers, present in zip(pair.true, rows, strict=True)]
     clear = seen_well(links, pair.a["x"][rows[0]], pair.b["x"][rows[1]])
+    side = torch.cat(sides)
     return MapPair(
         **_joined(graphs, [*counts.tolist(), again], names),
-        side=torch.cat(sides),
+        side=side,
+        building=torch.tensor(pair.building_numbers)[side],
         true=torch.cat([*true_rooms, torch.full((again,), -1)]),
         clear=torch.cat([*clear, torch.zeros(again, dtype=torch.bool)]),
         match_index=torch.nonzero(links).T + torch.tensor([[0], [int(counts[0])]]),

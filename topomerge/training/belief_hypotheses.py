@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from topomerge.registration.pipeline import candidate, repeats, rivals
 from topomerge.registration.prepared import prepare
 from topomerge.registration.search import search, search_scaled
 from topomerge.registration.verify import rank
+from topomerge.training.splits import name_building
 from topomerge.training.task_settings import MergeBelief, PlaceEvidence
 from topomerge.training.tasks import weights_of
 from topomerge.types import Array, Sim3
@@ -81,9 +82,9 @@ def judged_arrays(pair: GridPair, hypotheses: int, inspected: int) -> dict[str, 
     }
 
 
-def half_of(building: str) -> int:
-    """0 or 1: the half of the buildings that one belongs to, of which networks of places are trained on one each."""
-    return hashlib.sha256(building.split(" + ")[0].encode()).digest()[0] % 2
+def half_of(row: Mapping[str, Any]) -> int:
+    """0 or 1: the half of the physical buildings that that of a pair is in; networks of places are trained on one each."""
+    return hashlib.sha256(name_building(row).encode()).digest()[0] % 2
 
 
 def belief_rows(recipe: GridRecipe, settings: MergeBelief, say: Any) -> list[Row]:
@@ -109,7 +110,7 @@ def row_of(path: Path, networks: Sequence[Run]) -> Row:
     buildings: what it was trained on it knows too well."""
     data = read_derived(path)
     row: Row = json.loads(data["row"].tobytes())
-    network = networks[1 - half_of(row["building"])]
+    network = networks[1 - half_of(row)]
     for k, h in enumerate(row["hyps"]):
         if "bent" in h:
             pick = np.flatnonzero(data["owner"] == k)

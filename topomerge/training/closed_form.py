@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -14,7 +14,7 @@ import numpy as np
 from topomerge.io.atomic import replacing
 from topomerge.training.log import Log
 from topomerge.training.loop import Say
-from topomerge.training.run_folder import export_files, write_card, write_settings
+from topomerge.training.run_folder import begin_run, export_files, write_card
 from topomerge.training.shared_settings import TaskSettings
 from topomerge.training.tasks import TASKS
 from topomerge.types import Array
@@ -44,9 +44,9 @@ def run_fit(settings: Settings, make: Callable[[Settings, Say], Fitted], say: Sa
         say(f"{best}: is there")
         row = json.loads(metrics.read_text(encoding="utf-8").splitlines()[-1])
     else:
-        write_settings(settings.folder, asdict(settings))
         began = time.perf_counter()
         fitted = make(settings, say)
+        begin_run(replace(settings, resume=False), threads=settings.jobs)
         log = Log(settings.folder, settings.tensorboard)
         scores = {f"val/{name}": float(value) for name, value in fitted.metrics.items()}
         row = {"epoch": 0, "seconds": time.perf_counter() - began, **scores}

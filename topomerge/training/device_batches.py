@@ -151,6 +151,7 @@ class DevicePairs:
         self.true = np.concatenate([rooms.numpy() for pair in pairs for rooms in pair.true])
         self.matches = np.concatenate([pair.matches.numpy().reshape(-1, 2) for pair in pairs])
         self.first_match = np.concatenate([[0], np.cumsum([len(pair.matches) for pair in pairs])])
+        self.building = torch.tensor([pair.building_numbers for pair in pairs]).flatten().to(device)  # of each map
         self.quarters = np.array([-1 if (k := quarters_between(pair)) is None else k for pair in pairs])
         x = torch.cat([graph["x"] for graph in graphs])
         self.glimpsed = x[:, column("x", "glimpsed")].numpy() != 0
@@ -285,8 +286,9 @@ class DevicePairs:
         """Return the batch of a structure, with values drawn on the device."""
         s, device = structure, self.device
         rows = [s.room, s.room_part, s.edge, s.edge_part, s.true, s.clear, s.pair[s.room_part], s.side[s.room_part]]
+        rows.append(s.part_map[s.room_part])
         sent = torch.from_numpy(np.concatenate(rows).astype(np.int64)).to(device, non_blocking=True)
-        room, room_part, edge, edge_part, true, clear, pair, side = sent.split([len(row) for row in rows])
+        room, room_part, edge, edge_part, true, clear, pair, side, map_of_room = sent.split([len(row) for row in rows])
         ends, match = (torch.from_numpy(index).to(device, non_blocking=True) for index in (s.edge_index, s.match_index))
         seed = torch.from_numpy(s.seed.astype(np.int64)).to(device)
         rotation = torch.from_numpy(s.rotation).to(device)
@@ -297,7 +299,8 @@ class DevicePairs:
         tensors |= self._sample_crops(room, room_part, local, door, views)
         batch = MapPair(
             **{name: tensors[name] for name in self.names if name in tensors}, edge_index=ends, side=side, true=true,
-            clear=clear.bool(), match_index=match, room_counts=torch.from_numpy(s.counts.ravel()), num_nodes=len(s.room),
+            clear=clear.bool(), building=self.building[map_of_room], match_index=match,
+            room_counts=torch.from_numpy(s.counts.ravel()), num_nodes=len(s.room),
         )  # fmt: skip
         batch["batch"] = pair
         return batch

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from topomerge.datasets.core.derived import derive, read_derived
+from topomerge.datasets.core.derived import derive, read_derived, read_sources
 from topomerge.datasets.pairs.plan_examples import PlanRecipe, build_plans, load_examples
 from topomerge.errors import InputError
 from topomerge.extraction.plans.passages import (
@@ -40,15 +40,16 @@ from topomerge.extraction.plans.storey_plan import StoreyPlan
 from topomerge.io.atomic import replacing
 from topomerge.io.weight_files import weights_file
 from topomerge.numpy_nn import perceptron, sigmoid
-from topomerge.training.loop import Say, State, mixed
+from topomerge.training.loop import Say, State, descend_gradient, mixed
 from topomerge.training.networks import NetworkJob, run_network
 from topomerge.training.scan_settings import DoorClassification
+from topomerge.training.splits import number_buildings, read_scan_building
 from topomerge.types import Array
 
 PURE = 0.7  # share of a region in its true room; regions between rooms are no example
 LEAST_FEATURE_SPREAD = 1e-3  # of a feature: weights are written with four digits
 RANGE = (0.005, 0.995)  # quantiles that features are clipped to
-Doors = tuple[Array, Array, Array]  # (n, 17) features, (n,) is it a door, (n,) number of the scan
+Doors = tuple[Array, Array, Array]  # (n, 17) features, (n,) is it a door, (n,) number of the building
 
 
 def fit(settings: DoorClassification, say: Say) -> dict[str, float]:
@@ -57,13 +58,13 @@ def fit(settings: DoorClassification, say: Say) -> dict[str, float]:
     Raises:
         InputError: no scan to train on or to watch.
     """
-    x, y, scan = door_examples(settings.data, settings, say)
-    watched = scan % settings.hold_out == 0
+    x, y, building = door_examples(settings.data, settings, say)
+    watched = building % settings.hold_out == 0
     if len(np.unique(y[~watched])) < 2 or len(np.unique(y[watched])) < 2:
         raise InputError(f"data.scans={settings.data.scans}: too few scans to learn doors from some and watch others")
     torch.manual_seed(mixed(settings.seed))
-    job = DoorJob(settings, (x[~watched], y[~watched], scan[~watched]), (x[watched], y[watched], scan[watched]))
-    say(f"{len(y)} examples of {len(np.unique(scan))} scans, {y.mean():.3f} of them doors")
+    job = DoorJob(settings, (x[~watched], y[~watched], building[~watched]), (x[watched], y[watched], building[watched]))
+    say(f"{len(y)} examples of {len(np.unique(building))} buildings, {y.mean():.3f} of them doors")
     return run_network(job, settings, job.steps, say)
 
 
@@ -76,7 +77,9 @@ def door_examples(recipe: PlanRecipe, settings: DoorClassification, say: Say) ->
     scans = [read_derived(file) for file in files]
     if not scans:
         raise InputError(f"{recipe.name}: no scan could be made; see the reasons above")
-    numbers = np.repeat(np.arange(len(scans)), [len(s["y"]) for s in scans])
+    scan_of = {path.stem: path for path in paths}
+    buildings = number_buildings([read_scan_building(scan_of[read_sources(file)[0]]) for file in files])
+    numbers = np.repeat(buildings, [len(s["y"]) for s in scans])
     return np.concatenate([s["x"] for s in scans]), np.concatenate([s["y"] for s in scans]), numbers
 
 
@@ -159,10 +162,10 @@ class Perceptrons(nn.Module):
 
 
 class DoorJob(NetworkJob):
-    """All examples an epoch, in another order for each network; scans with many examples count less than proportionally."""
+    """All examples an epoch, in another order for each network; buildings with many examples count less than proportionally."""
 
     def __init__(self, settings: DoorClassification, learned: Doors, watched: Doors) -> None:
-        x, y, scan = learned
+        x, y, building = learned
         origin = {"set": settings.data.name, "split": settings.data.split, "examples": len(y), "watched": len(watched[1])}
         super().__init__(settings, Perceptrons(x.shape[1], settings.hidden, settings.networks), origin)
         self.options, self.watched = settings, watched
@@ -171,7 +174,7 @@ class DoorJob(NetworkJob):
         spread = clipped.std(axis=0)  # grids have no lintels: what is the same everywhere says nothing
         scale = np.where(spread > LEAST_FEATURE_SPREAD, spread, 1.0)
         self.scaling = {"low": low, "high": high, "mean": clipped.mean(axis=0), "scale": scale}
-        weight = 1 / np.sqrt(np.unique(scan, return_counts=True)[1][np.unique(scan, return_inverse=True)[1]])
+        weight = 1 / np.sqrt(np.unique(building, return_counts=True)[1][np.unique(building, return_inverse=True)[1]])
         inputs = (clipped - self.scaling["mean"]) / self.scaling["scale"]
         self.tensors = [torch.tensor(v, dtype=torch.float32) for v in (inputs, y, weight / weight.mean())]
         self.steps = math.ceil(len(y) / settings.batch)
@@ -201,10 +204,8 @@ class DoorJob(NetworkJob):
             scores = member(inputs)[:, 0]
             each = nn.functional.binary_cross_entropy_with_logits(scores, answers, reduction="none")
             losses.append((each * weight).mean())
-        self.optimizer.zero_grad()
-        torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]
-        self.optimizer.step()
-        return {"loss": float(torch.stack(losses).mean().detach())}
+        taken = descend_gradient(self.optimizer, torch.stack(losses).sum(), state)
+        return {**taken, "loss": taken["loss"] / len(losses)}
 
     def size(self, batch: list[tuple[Tensor, ...]]) -> int:
         """Examples."""
@@ -255,5 +256,5 @@ def door_scores(p: Array, y: Array, threshold: float = 0.5) -> dict[str, float]:
 
 def judge(settings: DoorClassification, file: Path, say: Say) -> dict[str, Any]:
     """Scores of weights on scans of buildings that trained nothing."""
-    x, y, scan = door_examples(settings.heldout, settings, say)
-    return {**door_scores(probabilities(x, read_classifier(file)), y), "examples": len(y), "scans": len(np.unique(scan))}
+    x, y, building = door_examples(settings.heldout, settings, say)
+    return {**door_scores(probabilities(x, read_classifier(file)), y), "examples": len(y), "buildings": len(np.unique(building))}

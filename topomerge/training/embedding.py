@@ -5,7 +5,6 @@ The loop is `training.loop`; several processes share its steps by fabric.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import sys
@@ -25,10 +24,13 @@ from topomerge.training.batches import ChangedPairs, MapPair
 from topomerge.training.device_batches import DevicePairs, supports_device_batches
 from topomerge.training.embedding_pictures import show_embedder
 from topomerge.training.log import Log
-from topomerge.training.loop import Loop, Schedule, State, made_by_threads, mixed, pace
+from topomerge.training.loop import Loop, Schedule, State, build_diverged, group_parameters, made_by_threads, mixed, pace
 from topomerge.training.packed import EXTRAS, GraphPair, load_pairs
-from topomerge.training.run_folder import export_files, write_settings
-from topomerge.training.settings import Augment, Training, check, to_dict
+from topomerge.training.provenance import describe_provenance
+from topomerge.training.run_folder import begin_run, export_files
+from topomerge.training.settings import Augment, Training, check
+from topomerge.training.splits import hold_out
+from topomerge.training.tasks import check_start
 from topomerge.training.validate import validate
 
 Say = Callable[[str], None]
@@ -47,19 +49,21 @@ def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr,
     if settings.overfit:
         settings = replace(settings, watch="f1", patience=0)
     check(settings)
+    check_start(settings)  # before other processes, if any, have come so far
     fabric = start_fabric(settings)
     chief = fabric.is_global_zero
     say = say if chief else lambda text: None
     train, watched = _data(settings, say, fabric)
     network = _network(settings, train)
-    trained = [p for p in network.parameters() if p.requires_grad]
     fused = fabric.device.type == "cuda"  # one launch for all weights
-    optimizer = torch.optim.AdamW(trained, settings.rate, weight_decay=settings.decay, fused=fused)
+    optimizer = torch.optim.AdamW(group_parameters(network, settings.decay), settings.rate, fused=fused)
     state = State()
     if settings.resume:
         state = State(**load_state(settings.folder / "last", network, optimizer))
-    elif chief:
-        write_settings(settings.folder, to_dict(settings))
+    if chief:
+        on_cuda = fabric.device.type == "cuda"
+        name = torch.cuda.get_device_name() if on_cuda else "cpu"
+        begin_run(settings, f"{fabric.world_size} x {name}, {find_precision(settings)}", torch.get_num_threads())
     fabric.barrier()
     job = EmbeddingJob(settings, fabric, network, optimizer, (train, watched))
     log = Log(settings.folder, settings.tensorboard, state.epoch) if chief else None
@@ -82,7 +86,8 @@ class EmbeddingJob:
         self, settings: Training, fabric: Any, network: Embedder, optimizer: Any, pairs: tuple[Sequence[GraphPair], ...]
     ) -> None:
         self.settings, self.fabric, self.network = settings, fabric, network
-        self.objective, self.optimizer = fabric.setup(Objective(network, settings.loss), optimizer)
+        processes = FabricProcesses(fabric) if fabric.world_size > 1 else None
+        self.objective, self.optimizer = fabric.setup(Objective(network, settings.loss, processes), optimizer)
         self.train, self.watched = pairs
         self.steps = max(len(self.train) // (settings.batch * fabric.world_size), 1)
         self.augment: Augment | None = None if settings.overfit else settings.augment
@@ -124,7 +129,14 @@ class EmbeddingJob:
         yield from made_by_threads(pairs.batch, steps, settings.threads)
 
     def step(self, batch: MapPair, state: State) -> dict[str, torch.Tensor]:
-        """Take one step of the optimizer; return the losses, which may still be under way on the device."""
+        """Take one step of the optimizer; return the losses and the gradient's length, which may be under way on the device.
+
+        A gradient that is no finite number does not reach the weights. Under a scaler of half precision the step is skipped and
+        counted, and the scale lowered; otherwise the training ends, on a device when the loop next reads the losses.
+
+        Raises:
+            InputError: the training diverged.
+        """
         settings, done = self.settings, state.epoch * self.steps + state.step
         for group in self.optimizer.param_groups:
             group["lr"] = settings.rate * pace(done / (settings.epochs * self.steps), settings.warmup)
@@ -133,9 +145,19 @@ class EmbeddingJob:
         losses = self.objective(batch.tensors, batch.truth)
         self.optimizer.zero_grad()
         self.fabric.backward(losses["loss"])
-        self.fabric.clip_gradients(self.objective, self.optimizer, max_norm=settings.clip)
+        norm = self.fabric.clip_gradients(self.objective, self.optimizer, max_norm=settings.clip, error_if_nonfinite=False)
+        lost = ~norm.isfinite()
+        out = {name: value.detach() for name, value in losses.items()}
+        if getattr(self.fabric.strategy.precision, "scaler", None) is not None:
+            out |= {"norm": norm.masked_fill(lost, 0.0), "skipped": lost.float()}
+        elif self.optimizer_state().defaults["fused"]:
+            self.optimizer_state().found_inf, out["norm"] = lost.float(), norm  # type: ignore[attr-defined]
+        elif lost:
+            raise build_diverged(state)
+        else:
+            out["norm"] = norm
         self.optimizer.step()
-        return {name: value.detach() for name, value in losses.items()}
+        return out
 
     def size(self, batch: MapPair) -> int:
         """Rooms."""
@@ -169,9 +191,29 @@ class EmbeddingJob:
         return "recall@1 {:.3f} @5 {:.3f} F1 {:.3f} merged {:.2f}".format(*scores)
 
 
+class FabricProcesses:
+    """The processes of a Fabric, as `models.losses.Processes`."""
+
+    def __init__(self, fabric: Any) -> None:
+        self.fabric = fabric
+
+    def gather_others(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return the rows (M, ...) of all other processes; gradients flow back to where they come from."""
+        counts = self.fabric.all_gather(torch.tensor(len(rows), device=rows.device)).tolist()
+        padded = torch.cat([rows, rows.new_zeros((max(counts) - len(rows), *rows.shape[1:]))])
+        every = self.fabric.all_gather(padded, sync_grads=rows.requires_grad)
+        return torch.cat([every[k, :count] for k, count in enumerate(counts) if k != self.fabric.global_rank])
+
+    def average(self, value: torch.Tensor) -> torch.Tensor:
+        """Return the mean of a value over the processes, without a gradient."""
+        mean: torch.Tensor = self.fabric.all_reduce(value.detach().clone(), reduce_op="mean")
+        return mean
+
+
 def about(settings: Training, row: Mapping[str, Any]) -> dict[str, Any]:
     """What an embedder's file says about its training."""
     origin = {"data": settings.data, "validation": settings.validation, "seed": settings.seed, "loss": settings.loss.kind}
+    origin |= {"provenance": describe_provenance(settings.folder)}
     return {"run": settings.name, **origin, **{k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}}
 
 
@@ -181,16 +223,18 @@ def start_fabric(settings: Training) -> Any:
 
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     devices = int(os.environ.get("LOCAL_WORLD_SIZE", settings.devices))
-    precision = settings.precision
-    if precision == "auto":
-        on_cuda = settings.accelerator in ("cuda", "gpu", "auto") and torch.cuda.is_available()
-        precision = "bf16-mixed" if on_cuda else "32-true"
     fabric = Fabric(
-        accelerator=settings.accelerator, devices=devices, precision=precision,  # type: ignore[arg-type]
+        accelerator=settings.accelerator, devices=devices, precision=find_precision(settings),  # type: ignore[arg-type]
         strategy="ddp" if devices > 1 else "auto",
     )  # fmt: skip
     fabric.launch()
     return fabric
+
+
+def find_precision(settings: Training) -> str:
+    """Return the precision of a training: what is asked for, or what suits the accelerator."""
+    on_cuda = settings.accelerator in ("cuda", "gpu", "auto") and torch.cuda.is_available()
+    return ("bf16-mixed" if on_cuda else "32-true") if settings.precision == "auto" else settings.precision
 
 
 def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], list[GraphPair]]:
@@ -210,26 +254,6 @@ def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], l
     if not train:
         raise InputError(f"{settings.data}: no pairs to train on")
     return train, watched
-
-
-def hold_out(pairs: Sequence[GraphPair]) -> tuple[list[GraphPair], list[GraphPair]]:
-    """A tenth of the pairs, by whole buildings in the order of a hash of their names, is kept from training; at least one of
-    them has rooms that match.
-
-    Raises:
-        InputError: no pair has any, or all that have are of one building.
-    """
-    buildings = [str(p.about.get("building")) for p in pairs]
-    held: set[str] = set()
-    for name in sorted(set(buildings), key=lambda name: hashlib.sha256(name.encode()).digest()):
-        watched = [p for p, of in zip(pairs, buildings, strict=True) if of in held]
-        if 10 * len(watched) >= len(pairs) and any(len(p.matches) for p in watched):
-            break
-        held.add(name)
-    parts = tuple([p for p, of in zip(pairs, buildings, strict=True) if (of in held) is which] for which in (False, True))
-    if not all(any(len(p.matches) for p in part) for part in parts):
-        raise InputError("too few pairs whose rooms match, to train on some buildings and watch others; make more of them")
-    return parts[0], parts[1]
 
 
 def _manifest(settings: Training, name: str) -> Path:

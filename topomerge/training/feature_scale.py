@@ -22,6 +22,7 @@ from topomerge.matching.scores import partner_ranks
 from topomerge.training.closed_form import Fitted, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.match_odds import map_pairs
+from topomerge.training.splits import name_building
 from topomerge.training.task_settings import FeatureScale
 from topomerge.types import Array, mostly_unseen
 
@@ -82,7 +83,7 @@ def features_of(path: Path) -> dict[str, Array]:
     glimpsed = [mostly_unseen(m.rooms) for m in maps]
     i, j = pair.matches.T
     clear = pair.one[0][i] & pair.one[1][j] & ~glimpsed[0][i] & ~glimpsed[1][j]
-    building = np.array(str(pair.about["building"]))
+    building = np.array(name_building(pair.about))
     both = {"glimpsed_a": glimpsed[0], "glimpsed_b": glimpsed[1]}
     return {"building": building, "a": a, "b": b, **both, "matches": pair.matches, "clear": clear}
 

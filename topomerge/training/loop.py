@@ -180,8 +180,8 @@ class Loop:
         """
         state = self.state
         state.sums = {name: float(value) for name, value in state.sums.items()}
-        if not math.isfinite(state.sums.get("loss", 0.0)):
-            raise InputError(f"training diverged in epoch {state.epoch + 1}: lower rate")
+        if not all(math.isfinite(state.sums.get(name, 0.0)) for name in ("loss", "norm")):
+            raise build_diverged(state)
 
     def _keep(self, row: dict[str, Any], better: bool) -> None:
         """Write metrics, the best network and the state after an epoch."""
@@ -217,6 +217,36 @@ class Loop:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def build_diverged(state: State) -> InputError:
+    """What is raised where a loss or its gradient is no finite number."""
+    where = f"step {state.step + 1} of epoch {state.epoch + 1}"
+    return InputError(f"training diverged by {where}: a loss or gradient is no finite number; train anew with a lower rate")
+
+
+def group_parameters(network: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
+    """Weights that are trained, for an optimizer: those of layers decay; biases, gains of norms and lone numbers, such as a
+    temperature, do not."""
+    trained = [p for p in network.parameters() if p.requires_grad]
+    layers, others = [p for p in trained if p.ndim > 1], [p for p in trained if p.ndim < 2]
+    return [{"params": of, "weight_decay": by} for of, by in ((layers, decay), (others, 0.0)) if of]
+
+
+def descend_gradient(optimizer: torch.optim.Optimizer, loss: torch.Tensor, state: State) -> dict[str, float]:
+    """Take one step of an optimizer down the gradient of a loss; return the loss and the gradient's length.
+
+    Raises:
+        InputError: one of them is no finite number; the weights are as they were.
+    """
+    optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+    values = {"loss": float(loss.detach()), "norm": float(torch.nn.utils.get_total_norm(gradients))}
+    if not all(map(math.isfinite, values.values())):
+        raise build_diverged(state)
+    optimizer.step()
+    return values
 
 
 def made_beside(batches: Iterator[T]) -> Generator[T, None, None]:

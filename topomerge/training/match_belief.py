@@ -26,6 +26,7 @@ from topomerge.statistics import calibration
 from topomerge.training.closed_form import Fitted, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.match_odds import STRANGER, map_pairs
+from topomerge.training.splits import name_building
 from topomerge.training.task_settings import MatchBelief
 from topomerge.types import Array
 
@@ -65,7 +66,7 @@ def match_rows(recipe: Recipe, settings: MatchBelief, say: Say) -> list[MatchRow
         InputError: no rooms match.
     """
     pairs = [(path, load_evaluation_pair(path)) for path in map_pairs(recipe, settings, say)]
-    shared = [(path, str(pair.about["building"])) for path, pair in pairs if pair.transform is not None and len(pair.matches)]
+    shared = [(path, name_building(pair.about)) for path, pair in pairs if pair.transform is not None and len(pair.matches)]
     sources = [[path] for path, _ in shared]
     for n, (path, building) in enumerate(shared):
         others = [other for other, name in shared[n:] + shared[:n] if name != building]
@@ -86,7 +87,7 @@ def rows_of(path: Path, other: Path | None = None) -> dict[str, Array]:
     a, b = pair.maps()
     if other is not None:
         b = load_evaluation_pair(other).maps()[1]
-    out = {"building": np.array(str(pair.about["building"])), "sharing": np.array(other is None)}
+    out = {"building": np.array(name_building(pair.about)), "sharing": np.array(other is None)}
     for method in BELIEVED_METHODS:
         matching = match(a, b, method=method)
         i, j = matching.rooms.T

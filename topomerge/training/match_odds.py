@@ -25,6 +25,7 @@ from topomerge.matching.odds import HYPOTHESIS, MATCH, ODDS_LENGTHS, hypothesis_
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.shared_settings import TaskSettings
+from topomerge.training.splits import name_building
 from topomerge.training.task_settings import MatchOdds
 from topomerge.types import Array, Sim3
 
@@ -108,7 +109,7 @@ def evidence_of(path: Path, other: Path | None = None) -> dict[str, Array]:
         rooms = match_features(a, b, meet, overlap)
         one = (pair.true[0][meet[:, 0]] == pair.true[1][meet[:, 1]]) & (pair.true[0][meet[:, 0]] >= 0)
     features = hypothesis_features(evidence)
-    building = np.array(str(pair.about["building"]))
+    building = np.array(name_building(pair.about))
     return {"building": building, "hypotheses": features, "right": np.array(right, bool), "rooms": rooms, "one": one}
 
 

@@ -49,6 +49,7 @@ from topomerge.training.belief_models import (
 )
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
+from topomerge.training.splits import name_building
 from topomerge.training.task_settings import MergeBelief
 from topomerge.types import Array
 
@@ -129,7 +130,7 @@ def tabled(rows: list[dict[str, Any]]) -> Table:
     hyps = [h for row in rows for h in row["hyps"]]
     nothing = np.full(len(BENT_POSE_VECTOR), np.nan)
     poses = np.array([h.get("bent_pose", np.full((4, 4), np.nan)) for h in hyps], float)
-    names = [f"{int('lookalike' in row)}{row['building'].split(' + ')[0]}" for row in rows]  # ordinary ones first
+    names = [f"{int('lookalike' in row)}{name_building(row)}" for row in rows]  # ordinary ones first
     return Table(
         rows, owner, np.array([vector(h) for h in hyps]), np.array([h["label"] for h in hyps]),
         np.array([bent_pose_vector(h["bent"]) if "bent" in h else nothing for h in hyps]), [h.get("bent", {}) for h in hyps],

@@ -11,15 +11,14 @@ from typing import Any, NamedTuple
 import torch
 
 from topomerge.checkpoint import NETWORK_FILE, load_state, write_network
-from topomerge.errors import InputError
 from topomerge.models.export import export_network, run_with_torch
 from topomerge.networks.network import Run
 from topomerge.networks.signature import Signature
 from topomerge.training.log import Log
-from topomerge.training.loop import Job, Loop, Say, Schedule, State, pace
-from topomerge.training.run_folder import export_files, write_card, write_settings
+from topomerge.training.loop import Job, Loop, Say, Schedule, State, descend_gradient, group_parameters, pace
+from topomerge.training.run_folder import begin_run, export_files, write_card
 from topomerge.training.shared_settings import NetworkTask
-from topomerge.training.tasks import TASKS
+from topomerge.training.tasks import TASKS, check_accelerator
 
 
 class Exported(NamedTuple):
@@ -40,7 +39,7 @@ class NetworkJob(ABC):
     def __init__(self, settings: NetworkTask, network: torch.nn.Module, origin: Mapping[str, Any]) -> None:
         self.device = device_of(settings)
         self.settings, self.network, self.origin = settings, network.to(self.device), origin
-        self.optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.decay)
+        self.optimizer = torch.optim.AdamW(group_parameters(network, settings.decay), lr=settings.rate)
 
     def total(self, sizes: int) -> float:
         """Of the one process."""
@@ -63,10 +62,7 @@ class NetworkJob(ABC):
         total, done = options.epochs * options.steps, state.epoch * options.steps + state.step
         for group in self.optimizer.param_groups:
             group["lr"] = options.rate * max(pace(done / total, min(options.warmup / total, 0.5)), 0.01)
-        self.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        self.optimizer.step()
-        return {"loss": float(loss.detach())}
+        return descend_gradient(self.optimizer, loss, state)
 
     @abstractmethod
     def write_weights(self, path: Path) -> None:
@@ -117,10 +113,8 @@ def device_of(settings: NetworkTask) -> torch.device:
     Raises:
         InputError: torch finds no such device here.
     """
-    name = getattr(settings, "accelerator", "cpu")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"accelerator={name}: torch finds no such device here; leave it out to train on the processor")
-    return torch.device(name)
+    check_accelerator(settings)
+    return torch.device(getattr(settings, "accelerator", "cpu"))
 
 
 def run_network(job: Job, settings: NetworkTask, steps: int, say: Say) -> dict[str, float]:
@@ -132,8 +126,8 @@ def run_network(job: Job, settings: NetworkTask, steps: int, say: Say) -> dict[s
     state = State()
     if settings.resume:
         state = State(**load_state(settings.folder / "last", job.network, job.optimizer_state(), NETWORK_FILE))
-    else:
-        write_settings(settings.folder, asdict(settings))
+    device = str(next(job.network.parameters()).device)
+    begin_run(settings, torch.cuda.get_device_name() if device.startswith("cuda") else device, torch.get_num_threads())
     log = Log(settings.folder, settings.tensorboard, state.epoch)
     schedule = Schedule(settings.folder, settings.epochs, steps, settings.watch, settings.patience)
     best = Loop(job, schedule, state, log, say).run()

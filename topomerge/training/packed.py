@@ -11,6 +11,7 @@ import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from topomerge.datasets.core.physical import physical_building
 from topomerge.embedding.door_layout import door_layout
 from topomerge.embedding.rooms_around import with_rooms_around
 from topomerge.embedding.schema import width
@@ -61,6 +63,21 @@ class GraphPair:
     iou: tuple[Tensor, Tensor]
     about: dict[str, Any]
     transform: Tensor
+
+    @cached_property
+    def buildings(self) -> tuple[str, str]:
+        """The physical buildings of a and of b; what b shows is not named where it is another building."""
+        name = str(self.about.get("building", self.about.get("file")))
+        first = physical_building(str(self.about.get("source", "procedural")), name)
+        if self.about.get("hard") == "other-building":
+            return first, f"other than {first}: {self.about.get('file')}"
+        return first, first
+
+    @cached_property
+    def building_numbers(self) -> tuple[int, int]:
+        """A number of each of `buildings`, the same in every process."""
+        first, second = (int.from_bytes(hashlib.sha256(name.encode()).digest()[:7]) for name in self.buildings)
+        return first, second
 
 
 def load_pairs(

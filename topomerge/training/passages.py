@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from topomerge.numpy_nn import sigmoid
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.scan_settings import Passages
+from topomerge.training.splits import number_buildings, read_scan_building
 from topomerge.types import Array
 
 # Weights are pulled to the plan alone, but for doorways that split a segment, of which scans show few (docs/adr/0018).
@@ -35,9 +37,10 @@ def fit(settings: Passages, say: Say) -> dict[str, float]:
 
 
 def fit_passages(settings: Passages, say: Say) -> Fitted:
-    """Weights of the models from all scans, and scores of those that were fitted without each scan."""
+    """Weights of the models from all scans, and scores of those that were fitted without each building."""
     scans = read_scans(settings.data, settings, say)
-    parts = [scans[k :: settings.folds] for k in range(settings.folds)]
+    fold = number_buildings([scan.building for scan in scans]) % settings.folds
+    parts = [[scan for scan, at in zip(scans, fold, strict=True) if at == k] for k in range(settings.folds)]
     left_out = []
     for k, part in enumerate(parts):
         weights = fit_models([scan for j, other in enumerate(parts) if j != k for scan in other], settings.pull)
@@ -52,7 +55,8 @@ def read_scans(recipe: PlanRecipe, settings: Passages, say: Say) -> list[Passage
     Raises:
         InputError: too few scans.
     """
-    scans = [load_passages(path) for path in build_passages(recipe, settings, say)]
+    paths = build_passages(recipe, settings, say)
+    scans = [replace(load_passages(path), building=read_scan_building(path)) for path in paths]
     scans = [scan for scan in scans if scan.kind and len(scan.parted)]
     if len(scans) < settings.folds:
         raise InputError(f"data.scans={recipe.scans}: too few scans for {settings.folds} folds")

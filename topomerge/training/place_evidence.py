@@ -26,6 +26,7 @@ from topomerge.registration.evidence.network import PLACE_SIGNATURE, UPPER_PLANE
 from topomerge.training.belief_hypotheses import fair, half_of, hypothesis_files, judged_files
 from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import Exported, ExportedJob, run_network
+from topomerge.training.splits import name_building
 from topomerge.training.task_settings import PlaceAugment, PlaceEvidence
 from topomerge.types import Array
 
@@ -62,9 +63,9 @@ def gathered(paths: Sequence[Path], half: int = 0) -> Places:
     for path in paths:
         data = read_derived(path)
         row = json.loads(data["row"].tobytes())
-        if row.get("tellable") is False or ("lookalike" not in row and not fair(row)) or half == 2 - half_of(row["building"]):
+        if row.get("tellable") is False or ("lookalike" not in row and not fair(row)) or half == 2 - half_of(row):
             continue
-        name = row["building"].split(" + ")[0]
+        name = name_building(row)
         names.append(name)
         label = np.array([h["label"] for h in row["hyps"]])[data["owner"]] if len(data["owner"]) else np.zeros(0)
         pick = np.flatnonzero(label >= 0)

@@ -34,6 +34,7 @@ from topomerge.training.grid_noise import with_grid_noise
 from topomerge.training.loop import Say, State, made_beside, mixed
 from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.scan_settings import GridSegmentation, PlanAugment, PlanLoss, PlanSegmentation
+from topomerge.training.splits import mark_watched, read_scan_building
 from topomerge.types import Array
 
 LEAST_COLUMNS = 100  # inside of a plan that trains
@@ -52,8 +53,8 @@ def fit(settings: PlanSegmentation, say: Say) -> dict[str, float]:
     """
     paths, _ = build_plans(settings.data, settings, say)
     scans = [load_examples(path) for path in paths]
-    watched = [e for scan in scans[:: settings.hold_out] for e in scan]
-    learned = [e for k, scan in enumerate(scans) if k % settings.hold_out for e in scan]
+    watches = mark_watched([read_scan_building(path) for path in paths], settings.hold_out)
+    learned, watched = ([e for s, w in zip(scans, watches, strict=True) if w == which for e in s] for which in (False, True))
     learned = [e for e in learned if e.plan.inside.sum() > LEAST_COLUMNS]
     if isinstance(settings, GridSegmentation):
         learned, watched = ([as_grid(e, k % BARE_EVERY > 0) for k, e in enumerate(some)] for some in (learned, watched))

@@ -30,6 +30,7 @@ from topomerge.numpy_nn import sigmoid
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.scan_settings import RoomOdds
+from topomerge.training.splits import number_buildings, read_scan_building
 from topomerge.types import Array
 
 CLIPPED = (0.005, 0.995)  # quantiles that features are clipped to
@@ -79,8 +80,8 @@ def with_weights(weights: dict[str, Any], family: Family, fitted: dict[str, Any]
 
 
 def _left_out_scores(family: Family, scans: Sequence[Rows], settings: RoomOdds) -> dict[str, float]:
-    """Scores of a family's models on scans that were left out of the fit, a fold at a time."""
-    fold = np.arange(len(scans)) % settings.folds
+    """Scores of a family's models on buildings that were left out of the fit, a fold at a time."""
+    fold = number_buildings([str(scan["building"]) for scan in scans]) % settings.folds
     guesses: dict[str, list[Array]] = {name: [] for name in family.lengths}
     for k in range(settings.folds):
         rest = [scan for scan, at in zip(scans, fold, strict=True) if at != k]
@@ -96,7 +97,8 @@ def room_scans(recipe: PlanRecipe, settings: RoomOdds, say: Say) -> list[Rows]:
     Raises:
         InputError: no scan could be made.
     """
-    scans: list[Rows] = [read_room_rows(path) for path in build_rooms(recipe, settings, say)]
+    paths = build_rooms(recipe, settings, say)
+    scans: list[Rows] = [{**read_room_rows(path), "building": np.array(read_scan_building(path))} for path in paths]
     scans = [scan for scan in scans if len(scan["x"])]
     if not scans:
         raise InputError(f"{recipe.name}: no scan could be made; see the reasons above")

@@ -1,6 +1,7 @@
 """A run is a folder: its settings, what it reports, the best weights, the state to go on from; and what it exports.
 
 config.json, config.yaml     what was asked for
+run.json                     where it comes from: `training.provenance`
 metrics.jsonl, tb/           `training.log`
 best/                        files as the package has them, and their card
 last/                        `topomerge.checkpoint`, of networks
@@ -12,6 +13,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Mapping
+from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -21,22 +23,34 @@ from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
 from topomerge.io.listing import plain
 from topomerge.networks.network import CARD
+from topomerge.training.provenance import RUN_FILE, describe_data, describe_provenance, record_start
 
 PACKAGE = "package"  # export: into the package itself
 
 
-def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write config.json and config.yaml.
+def begin_run(settings: Any, device: str = "cpu", threads: int = 1) -> None:
+    """Write what a run begins with, or goes on with; what an earlier run left in the folder goes, unless it is this one.
+
+    Args:
+        device: that the network is on; threads: of it.
 
     Raises:
-        InputError: the folder can't be written.
+        InputError: the folder can't be written, or the data of a run that goes on is another.
     """
+    folder: Path = settings.folder
+    if not settings.resume:
+        for name in ("best", "last", "last.new", "last.old", "tb"):
+            shutil.rmtree(folder / name, ignore_errors=True)
+        for name in ("metrics.jsonl", RUN_FILE):
+            (folder / name).unlink(missing_ok=True)
+    record_start(folder, asdict(settings), describe_data(settings), device, threads)
+    write_settings(folder, asdict(settings))
+
+
+def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Write config.json and config.yaml into a folder that is there."""
     import yaml
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: can't be written ({error.strerror or error})") from error
     texts = {"config.json": json.dumps(settings, indent=1) + "\n", "config.yaml": yaml.safe_dump(dict(settings), sort_keys=False)}
     for name, text in texts.items():
         with replacing(folder / name) as beside:
@@ -50,7 +64,8 @@ def write_card(
     metrics: Mapping[str, Any],
     interface: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write the card of a file of weights beside it: what it is trained on, by which command and version, and how good it is.
+    """Write the card of a file of weights, which stands in `best/` of a run, beside it: what it is trained on, by which command
+    and version, and how good it is.
 
     Args:
         settings: of the run.
@@ -69,6 +84,7 @@ def write_card(
         "command": command,
         "settings": settings,
         "data": data,
+        "provenance": describe_provenance(file.parent.parent),
         "metrics": {k: round(v, 5) if isinstance(v, float) else v for k, v in metrics.items()},
     }
     path = file.with_name(f"{file.stem}{CARD}")

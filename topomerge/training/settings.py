@@ -13,8 +13,10 @@ from topomerge.embedding.network import check as check_network
 from topomerge.errors import InputError
 from topomerge.models.losses import LossSettings
 from topomerge.models.losses import check as check_loss
+from topomerge.training.shared_settings import check_numbers
 
 FREEZE = ("", "geometry")
+ACCELERATORS, PRECISIONS = ("cpu", "cuda", "gpu", "auto"), ("auto", "32-true", "bf16-mixed", "16-mixed")
 BATCHES = ("auto", "host", "device")
 
 
@@ -64,10 +66,11 @@ class Training:
     patience: epochs without a better validation after which it ends; 0: never.
     geometry_from: run whose geometry encoder is the start; freeze: `geometry` keeps it as it is.
     overfit: train on one batch, without augmentation, and validate on it.
-    resume: go on where the run of this name stopped.
+    resume: go on where the run of this name stopped, with the same settings; overwrite: replace that run.
     threads: that make batches, of each process; beside an accelerator as many as there are cores.
     watch: what is best: a score of validation.
-    precision: of Fabric, such as `32-true` or `bf16-mixed`; `auto`: bf16 on CUDA, 32 bits elsewhere.
+    accelerator: of `ACCELERATORS`; devices: how many of them, or processes.
+    precision: of `PRECISIONS`; `auto`: bf16 on CUDA, 32 bits elsewhere.
     batches: made on the `device` (`device_batches`), or by threads of the `host`; `auto`: on the device beside an accelerator.
     export: where the best weights go at the end: `package`, or a folder; empty: they stay in the run's.
     """
@@ -97,6 +100,7 @@ class Training:
     freeze: str = ""
     overfit: bool = False
     resume: bool = False
+    overwrite: bool = False
     tensorboard: bool = True
     export: str = ""
     network: Network = field(default_factory=Network)
@@ -117,6 +121,7 @@ def check(settings: Training) -> None:
     """
     if settings.task != "embedding":
         raise InputError(f"task must be embedding, not {settings.task!r}: the other tasks need Hydra, python train.py task=...")
+    check_numbers(asdict(settings))
     check_network(settings.network)
     check_loss(settings.loss)
     for key, least in (("epochs", 1), ("batch", 1), ("devices", 1), ("threads", 1), ("limit", 0), ("patience", 0), ("seed", 0)):
@@ -130,8 +135,13 @@ def check(settings: Training) -> None:
     for key, value in shares.items():
         if not 0 <= value < 1:
             raise InputError(f"{key} must be 0 or more and below 1, not {value}")
-    if settings.batches not in BATCHES:
-        raise InputError(f"batches: unknown {settings.batches!r}; {', '.join(BATCHES)} are possible")
+    if settings.decay < 0:
+        raise InputError(f"decay must be 0 or more, not {settings.decay}")
+    for key, possible in (("batches", BATCHES), ("accelerator", ACCELERATORS), ("precision", PRECISIONS)):
+        if getattr(settings, key) not in possible:
+            raise InputError(f"{key}: unknown {getattr(settings, key)!r}; {', '.join(possible)} are possible")
+    if settings.precision == "16-mixed" and settings.accelerator == "cpu":
+        raise InputError("precision=16-mixed needs accelerator=cuda; a processor takes bf16-mixed or 32-true")
     if settings.freeze not in FREEZE:
         raise InputError(f"freeze: unknown {settings.freeze!r}; geometry or nothing are possible")
     if settings.freeze and not settings.geometry_from:

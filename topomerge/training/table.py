@@ -1,14 +1,23 @@
-"""The runs of a folder as one table, Markdown: ``python -m topomerge.training.table runs/sweep``."""
+"""The runs of a folder as one table, Markdown: ``python -m topomerge.training.table runs/sweep``.
+
+A second table has the mean over the seeds of runs that differ in nothing else, with its 95 % interval (Student's t).
+"""
 
 from __future__ import annotations
 
 import json
+import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
+from topomerge.statistics import estimate_mean
+from topomerge.training.provenance import MAY_CHANGE
 
 SHOWN = ("recall@1", "recall@1_single", "recall@1_twin", "recall@5", "mrr", "precision", "recall", "f1", "merged")
 
@@ -41,13 +50,43 @@ def write_table(folder: str | Path) -> Path:
     rows.sort(key=lambda row: -row["best"])
     columns = ["run", "geometry", "node", "edges", "loss", "seed", *SHOWN, "epoch", "s an epoch"]
     if any("geometry" not in row for row in rows):  # of other tasks: all their scores
-        columns = list(dict.fromkeys(name for row in rows for name in row if name not in ("best", "geometry")))
-    head = [name for name in columns if any(name in row for row in rows)]
-    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
-    lines += [f"| {' | '.join(_cell(row.get(name, '–')) for name in head)} |" for row in rows]
+        columns = list(dict.fromkeys(name for row in rows for name in row if name not in ("best", "geometry", "same")))
+    lines = _table(rows, columns)
+    if gathered := gather_seeds(rows):
+        lines += [
+            "",
+            "Mean over seeds, with its 95 % interval:",
+            "",
+            *_table(gathered, ["seeds" if n == "seed" else n for n in columns]),
+        ]
     with replacing(folder / "table.md") as beside:
         beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder / "table.md"
+
+
+def gather_seeds(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row for all runs that differ in nothing but the seed, where there are several: numbers as mean and interval."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row["same"], []).append(row)
+    out = []
+    for group in groups.values():
+        if len({row["seed"] for row in group}) < 2:
+            continue
+        first = group[0]
+        row = {"run": re.sub(r"(^|,)seed=[^,]*", "", first["run"]).strip(",") or "all", "seeds": len(group)}
+        for name in (name for name in first if name not in ("run", "seed", "same", "best")):
+            values = [one[name] for one in group]
+            numbers = isinstance(first[name], float) and name != "s an epoch"
+            row[name] = "{:.3f} [{:.3f}, {:.3f}]".format(*estimate_mean(np.array(values))) if numbers else first[name]
+        out.append({key: value for key, value in row.items() if key not in ("epoch", "s an epoch")})
+    return out
+
+
+def _table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> list[str]:
+    head = [name for name in columns if any(name in row for row in rows)]
+    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+    return lines + [f"| {' | '.join(_cell(row.get(name, '–')) for name in head)} |" for row in rows]
 
 
 def _cell(value: Any) -> str:
@@ -63,14 +102,16 @@ def _best(run: Path) -> dict[str, Any] | None:
     best = max(rows, key=lambda row: float(row[f"val/{config['watch']}"]))
     score = float(best[f"val/{config['watch']}"])
     seconds = sum(float(row["seconds"]) for row in rows) / len(rows)
+    same = json.dumps({key: value for key, value in config.items() if key not in MAY_CHANGE - {"epochs", "patience"} | {"seed"}})
     if config.get("task", "embedding") != "embedding":
         scores = {name.removeprefix("val/"): value for name, value in best.items() if name.startswith("val/")}
-        row = {"run": run.name, "best": score, "seed": config["seed"], **scores}
+        row = {"run": run.name, "best": score, "same": same, "seed": config["seed"], **scores}
         return {**row, "epoch": best["epoch"] + 1, "s an epoch": seconds}
     geometry, node = config["network"]["geometry"], config["network"]["node"]
     return {
         "run": run.name,
         "best": score,
+        "same": same,
         "geometry": "+".join(geometry["parts"]),
         "node": node["kind"] if node["kind"] == "none" else f"{node['kind']} {node['layers']}",
         "edges": "–"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import WALL_CLASSES
 from topomerge.training.scan_settings import PlanSegmentation, WallSegmentation
-from topomerge.training.shared_settings import TaskSettings
+from topomerge.training.shared_settings import TaskSettings, check_numbers
 from topomerge.training.task_settings import LOOKALIKES_TAKEN, MergeBelief
 
 
@@ -17,6 +18,7 @@ def check_task(settings: TaskSettings) -> None:
     Raises:
         InputError: names the key.
     """
+    check_numbers(asdict(settings))
     keys = ("epochs", "batch", "steps", "hidden", "networks", "hypotheses", "inspected")
     at_least = {**dict.fromkeys(keys, 1), "jobs": 1, "patience": 0, "seed": 0, "warmup": 0, "folds": 2, "hold_out": 2}
     for key, least in at_least.items():
@@ -25,6 +27,8 @@ def check_task(settings: TaskSettings) -> None:
     for key in ("rate", "pose_strength", "winner_strength", "kinds_strength"):
         if not getattr(settings, key, 1.0) > 0:
             raise InputError(f"{key} must be above 0, not {getattr(settings, key)}")
+    if getattr(settings, "decay", 0.0) < 0:
+        raise InputError(f"decay must be 0 or more, not {settings.decay}")  # type: ignore[attr-defined]
     if not 0 < getattr(settings, "risk", 20.0) <= 1000:
         raise InputError(f"risk must be above 0 and at most 1000, not {settings.risk}")  # type: ignore[attr-defined]
     if not 0 <= getattr(settings, "floor", 0.5) <= 10:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,25 @@ TASKS = {
     "merge_belief": Task("merge_belief", "MergeBelief", "topomerge.registration", "calibration.json", 4.0),
     "embedding": Task("embedding", "", "topomerge.embedding.pretrained", "embedder.safetensors", 0.6),
     "room_matcher": Task("room_matcher", "RoomMatching", "topomerge.networks", "room_matcher.onnx", 0.3),
+}
+RANKINGS = tuple(f"recall@{k}{of}" for k in (1, 5) for of in ("", "_single", "_twin"))
+PLAN_CLASSES = ("inside", "wall", "doorway", "shut", "outside")
+PLAN_SCORES = ("mean_iou", "mean_f1", "accuracy", *(f"{of}_{name}" for of in ("iou", "f1") for name in PLAN_CLASSES))
+SCORES = {  # of each task: what may be watched; the higher, the better
+    "plan_segmentation": PLAN_SCORES,
+    "grid_segmentation": PLAN_SCORES,
+    "door_classification": ("auc", "precision", "recall", "accuracy"),
+    "wall_segmentation": ("f1_doors", "f1_wall", "f1_open", "f1_shut", "f1_window", "f1_half", "f1_niche", "f1_cupboard"),
+    "passages": ("log_loss", "accuracy"),
+    "wall_doors": ("precision", "recall"),
+    "room_odds": ("entered_auc", "whole_auc", "confidence_auc"),
+    "feature_scale": ("recall@1", "recall@5", "mrr"),
+    "match_odds": ("match_accuracy", "hypothesis_accuracy"),
+    "place_evidence": ("auc",),
+    "match_belief": ("attention_all_after_accuracy",),
+    "merge_belief": ("right_believed", "right_first"),
+    "embedding": (*RANKINGS, "recall@1_clear", "recall@5_clear", "mrr", "precision", "recall", "f1", "merged"),
+    "room_matcher": (*RANKINGS, "mrr", "precision", "recall", "f1", "turn"),
 }
 
 
@@ -139,9 +158,43 @@ def train(settings: Any, say: Say) -> Mapping[str, float]:
         InputError: settings that make no sense, data or a state that can't be read.
         KeyboardInterrupt: after Ctrl-C or SIGTERM.
     """
+    if settings.task != "embedding":  # which does so itself, with and without Hydra
+        check_start(settings)
     module = import_module(f"topomerge.training.{TASKS[settings.task].module}")
     scores: Mapping[str, float] = module.fit(settings, say)
     return scores
+
+
+def check_start(settings: Any) -> None:
+    """Refuse, before any data is made, what a training would stumble over later.
+
+    Raises:
+        InputError: a score to watch that there is not, an accelerator that is not here, a folder that holds another run.
+    """
+    from topomerge.training.provenance import check_folder
+
+    possible = SCORES[settings.task]
+    if settings.watch not in possible:
+        raise InputError(f"watch: unknown {settings.watch!r}; {', '.join(possible)} are possible for task={settings.task}")
+    check_accelerator(settings)
+    check_folder(settings.folder, asdict(settings))
+
+
+def check_accelerator(settings: Any) -> None:
+    """Refuse an accelerator that is not here.
+
+    Raises:
+        InputError: names the key.
+    """
+    name, wanted = getattr(settings, "accelerator", "cpu"), getattr(settings, "devices", 1)
+    if name not in ("cuda", "gpu"):
+        return
+    import torch
+
+    if not torch.cuda.is_available():
+        raise InputError(f"accelerator={name}: torch finds no such device here; leave it out to train on the processor")
+    if torch.cuda.device_count() < wanted:
+        raise InputError(f"devices={wanted}: torch finds {torch.cuda.device_count()} here")
 
 
 def weights_of(task: str, run: str) -> Path:

@@ -36,6 +36,7 @@ from topomerge.metrics import match_places
 from topomerge.training.closed_form import Fitted, calibration_error, run_fit
 from topomerge.training.loop import Say
 from topomerge.training.scan_settings import WallDoors
+from topomerge.training.splits import number_buildings, read_scan_building
 from topomerge.types import Array, TopometricMap
 
 FEWEST_DOORS = 5  # among the candidates of a source
@@ -49,10 +50,11 @@ def fit(settings: WallDoors, say: Say) -> dict[str, float]:
 
 
 def fit_doors(settings: WallDoors, say: Say) -> Fitted:
-    """Weights of the models from all scans, and scores of those that were fitted without each scan."""
+    """Weights of the models from all scans, and scores of those that were fitted without each building."""
     recipes = (settings.data, settings.frameless, settings.flat)
-    scans = [scan for recipe in recipes for scan in candidates_of(recipe, settings, say)]
-    parts = [scans[k :: settings.folds] for k in range(settings.folds)]
+    named = [scan for recipe in recipes for scan in candidates_of(recipe, settings, say)]
+    scans, fold = [scan for _, scan in named], number_buildings([name for name, _ in named]) % settings.folds
+    parts = [[scan for scan, at in zip(scans, fold, strict=True) if at == k] for k in range(settings.folds)]
     left_out = []
     for k, part in enumerate(parts):
         weights = doors_model([scan for j, other in enumerate(parts) if j != k for scan in other], settings.pull)
@@ -61,8 +63,8 @@ def fit_doors(settings: WallDoors, say: Say) -> Fitted:
     return Fitted(doors_model(scans, settings.pull), door_figures(left_out), origin)
 
 
-def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Candidates]:
-    """The candidates of each scan of a set, by the network of elevations that ships.
+def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[tuple[str, Candidates]]:
+    """The building of each scan of a set, and its candidates, by the network of elevations that ships.
 
     Raises:
         InputError: too few scans.
@@ -74,7 +76,7 @@ def candidates_of(recipe: PlanRecipe, settings: WallDoors, say: Say) -> list[Can
         candidates = find_candidates_of_map(example.map, example.storeys, example.elevations)
         right = np.zeros(len(candidates.edges), bool)
         right[match_places(example.doors, candidates.edges["centre"], NEAR_DOOR)[:, 1]] = True
-        scans.append((candidates, right))
+        scans.append((read_scan_building(path), (candidates, right)))
     if len(scans) < settings.folds:
         raise InputError(f"data.scans={recipe.scans}: too few scans for {settings.folds} folds")
     return scans
@@ -134,5 +136,5 @@ def judge(settings: WallDoors, file: Path, say: Say) -> dict[str, Any]:
     """Scores of weights on scans of buildings that trained nothing."""
     weights = json.loads(file.read_text(encoding="utf-8"))
     recipes = (settings.heldout, settings.heldout_frameless, settings.heldout_flat)
-    scans = [scan for recipe in recipes for scan in candidates_of(recipe, settings, say)]
+    scans = [scan for recipe in recipes for _, scan in candidates_of(recipe, settings, say)]
     return door_figures([(door_chance(c, weights), y) for c, y in scans])

@@ -1,7 +1,7 @@
 """Task `wall_segmentation`: the network that says what is in each place along a wall (`extraction.elevations.elevation`).
 
 Stretches of the walls of simulated scans, mirrored, seen from a little nearer or farther, with points taken away now and then.
-Every n-th scan is watched.
+Those of every n-th building are watched.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from topomerge.networks.network import Run
 from topomerge.training.loop import Say, State, mixed
 from topomerge.training.networks import Exported, ExportedJob, run_network
 from topomerge.training.scan_settings import WallAugment, WallSegmentation
+from topomerge.training.splits import mark_watched, read_scan_building
 from topomerge.types import Array
 
 COARSE_CLASSES = ("wall", "open", "shut", "window")
@@ -48,20 +49,23 @@ def fit(settings: WallSegmentation, say: Say) -> dict[str, float]:
     """
     paths, _ = build_walls(settings.data, settings, say)
     scans = [load_walls(path) for path in paths]
-    learned, watched = learned_and_watched(scans, settings)
+    learned, watched = learned_and_watched(scans, [read_scan_building(path) for path in paths], settings)
     torch.manual_seed(mixed(settings.seed))
     job = WallJob(settings, learned, watched)
     say(f"{len(learned)} scans, {sum(p.numel() for p in job.network.parameters())} weights")
     return run_network(job, settings, settings.steps, say)
 
 
-def learned_and_watched(scans: Sequence[ScanT], settings: WallSegmentation) -> tuple[list[ScanT], list[ScanT]]:
-    """The scans to train on, and every n-th one, which is watched.
+def learned_and_watched(
+    scans: Sequence[ScanT], buildings: Sequence[str], settings: WallSegmentation
+) -> tuple[list[ScanT], list[ScanT]]:
+    """The scans to train on, and those of every n-th building, which are watched.
 
     Raises:
         InputError: too few for both.
     """
-    watched, learned = list(scans[:: settings.hold_out]), [s for k, s in enumerate(scans) if k % settings.hold_out]
+    watches = mark_watched(buildings, settings.hold_out)
+    learned, watched = ([s for s, w in zip(scans, watches, strict=True) if w == which] for which in (False, True))
     if not learned or not watched:
         raise InputError(f"data.scans={settings.data.scans}: too few scans to train on some and watch others")
     return learned, watched

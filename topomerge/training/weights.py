@@ -61,7 +61,7 @@ def make_task(task: str, runs: Path, shared: Sequence[str]) -> None:
             words = [f"data={text.split()[0]}", *text.split()[1:], *build_words]
             build(compose("build", Build, words), _say)
         training_words = [word for word in shared if not word.startswith(("jobs=", "cluster=", "part="))]
-    resume = f"resume={'true' if (runs / task / 'last').exists() else 'false'}"
+    resume = "resume=true" if (runs / task / "last").exists() else "overwrite=true"
     exported = [] if any(word.startswith("export=") for word in shared) else ["export=package"]
     words = [f"task={task}", *SHIPPED.get(task, []), f"runs={runs}", f"name={task}", resume, *exported, *training_words]
     train(settings_of(words), _say)
