@@ -38,7 +38,8 @@ def main(config: DictConfig) -> float:
         job = HydraConfig.get()
         if job.mode == RunMode.MULTIRUN:  # each run of a sweep gets a folder of its own
             settings.runs, settings.name = str(job.sweep.dir), str(job.sweep.subdir) or settings.name
-            settings.resume = settings.resume and (settings.folder / "last").exists()  # the others have not begun
+            begun = any((settings.folder / name).exists() for name in ("last", "last.new", "best"))
+            settings.resume = settings.resume and begun
         return train(settings, say)[f"val/{settings.watch}"]
     except InputError as error:
         sys.exit(f"train: {error}")

@@ -55,10 +55,10 @@ def build(settings: Build, say: Callable[[str], None] = lambda text: None, every
     items = {item.name: item for item in draw_items(settings.data, plans)[first - 1 :: step]}
     order = sorted(items.values(), key=lambda item: -item.rooms)  # the longest first: all workers end at about the same time
     tasks = [(item, list(plans_of(item, plans)), str(folder)) for item in order]
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    report = build_set(folder.parent / f"{settings.data.name}.jsonl", tasks, make_file, settings, say, every)
     with replacing(folder.parent / f"{settings.data.name}.recipe.json") as beside:
         beside.write_text(json.dumps(plain(asdict(settings.data)), indent=1) + "\n", encoding="utf-8")
-    return build_set(folder.parent / f"{settings.data.name}.jsonl", tasks, make_file, settings, say, every)
+    return report
 
 
 def main(words: list[str] | None = None) -> int:

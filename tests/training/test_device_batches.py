@@ -21,7 +21,7 @@ from topomerge.training.settings import Augment, Training
 from topomerge.training.turned_views import mirrored
 
 NAMES = ("x", "edge_index", "edge_attr", "edge_way", *CROP_SHAPES)
-TRUTH = ("side", "true", "clear", "match_index", "batch", "room_counts")
+TRUTH = ("side", "true", "clear", "building", "match_index", "batch", "room_counts")
 STILL = Augment(0.0, 0.0, 0.0, noise=0.0, shift=0.0, walks=0.0, slices=0.0, rough=0.0, tilt=0.0, zoom=0.0, bend=0.0)
 CPU = torch.device("cpu")
 

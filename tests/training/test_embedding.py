@@ -371,6 +371,7 @@ def test_an_overflow_of_half_precision_skips_a_step(settings, tmp_path, monkeypa
         ({"rate": float("nan")}, "rate must be a finite number"),
         ({"precision": "half"}, "precision: unknown 'half'"),
         ({"precision": "16-mixed"}, "precision=16-mixed needs accelerator=cuda"),
+        ({"precision": "16-mixed", "accelerator": "auto"}, "accelerator=auto: torch finds no such device here"),
         ({"accelerator": "tpu"}, "accelerator: unknown 'tpu'"),
         ({"accelerator": "cuda"}, "accelerator=cuda: torch finds no such device here"),
         ({"watch": "recall"[:-1]}, "watch: unknown 'recal'"),
@@ -456,6 +457,10 @@ def test_train_py_and_a_sweep(settings, tmp_path):
     assert done.returncode == 0 and (tmp_path / "gat_scalars" / "best" / "embedder.json").exists(), done.stderr
     done = run([sys.executable, "train.py", "-m", *common, "geometry=scalars,pointnet", "node=none,gat"])
     assert done.returncode == 0 and (tmp_path / "sweep" / "table.md").read_text().count("\n") == 6, done.stderr
+    names = {path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir()}
+    assert names == {f"geometry={geometry},node={node}" for geometry in ("scalars", "pointnet") for node in ("none", "gat")}
+    start = json.loads((tmp_path / "sweep" / "geometry=scalars,node=gat" / "run.json").read_text())["starts"][0]
+    assert start["command"].startswith("python train.py runs=") and "geometry=scalars" in start["command"]
     done = run([sys.executable, "train.py", *common, "epoch=3"])
     assert done.returncode == 1 and "epoch" in done.stderr
 

@@ -65,7 +65,8 @@ def test_a_run_with_other_settings_does_not_go_on(settings, tmp_path):
     starts = read_run(tmp_path / "run")["starts"]
     assert [start["resumed"] for start in starts] == [False, True]
     assert starts[1]["changed"] == {"epochs": [1, 2], "threads": [1, 2]} and not starts[0]["changed"]
-    assert json.loads((tmp_path / "run" / "config.json").read_text())["epochs"] == 2
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["epochs"] == 2 and not config["resume"]  # another run may begin with it
     assert len(load_embedder(tmp_path / "run" / "last").about["provenance"]["starts"]) == 2
 
 
@@ -125,6 +126,7 @@ def test_a_run_and_what_it_exports_say_where_they_come_from(settings, tmp_path, 
     assert run["data"]["data"]["recipe"] == {"name": "some", "seed": 3} and run["data"]["validation"]["recipe"] is None
     assert run["data"]["data"]["sha256"] != run["data"]["validation"]["sha256"]
     told = load_embedder(tmp_path / "exported").about["provenance"]
+    assert load_embedder(tmp_path / "exported").about["settings"]["rate"] == 0.002
     assert told == describe_provenance(tmp_path / "run") and "began" not in told["starts"][0]
     (tmp_path / "run" / "run.json").write_text("{")
     with pytest.raises(InputError, match=r"run\.json: damaged"):

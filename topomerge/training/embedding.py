@@ -28,7 +28,7 @@ from topomerge.training.loop import Loop, Schedule, State, build_diverged, group
 from topomerge.training.packed import EXTRAS, GraphPair, load_pairs
 from topomerge.training.provenance import describe_provenance
 from topomerge.training.run_folder import begin_run, export_files
-from topomerge.training.settings import Augment, Training, check
+from topomerge.training.settings import Augment, Training, check, to_dict
 from topomerge.training.splits import hold_out
 from topomerge.training.tasks import check_start
 from topomerge.training.validate import validate
@@ -213,7 +213,7 @@ class FabricProcesses:
 def about(settings: Training, row: Mapping[str, Any]) -> dict[str, Any]:
     """What an embedder's file says about its training."""
     origin = {"data": settings.data, "validation": settings.validation, "seed": settings.seed, "loss": settings.loss.kind}
-    origin |= {"provenance": describe_provenance(settings.folder)}
+    origin |= {"settings": to_dict(settings), "provenance": describe_provenance(settings.folder)}
     return {"run": settings.name, **origin, **{k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}}
 
 

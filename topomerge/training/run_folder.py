@@ -44,7 +44,7 @@ def begin_run(settings: Any, device: str = "cpu", threads: int = 1) -> None:
         for name in ("metrics.jsonl", RUN_FILE):
             (folder / name).unlink(missing_ok=True)
     record_start(folder, asdict(settings), describe_data(settings), device, threads)
-    write_settings(folder, asdict(settings))
+    write_settings(folder, {**asdict(settings), "resume": False, "overwrite": False})  # what another run may begin with
 
 
 def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:

@@ -187,7 +187,8 @@ def check_accelerator(settings: Any) -> None:
         InputError: names the key.
     """
     name, wanted = getattr(settings, "accelerator", "cpu"), getattr(settings, "devices", 1)
-    if name not in ("cuda", "gpu"):
+    scaled = name == "auto" and getattr(settings, "precision", "") == "16-mixed"  # which no processor has
+    if name not in ("cuda", "gpu") and not scaled:
         return
     import torch
 

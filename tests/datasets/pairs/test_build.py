@@ -56,7 +56,11 @@ def test_what_is_there_is_not_made_again(whole: Path) -> None:
     before = contents(whole)
     report = build(Build(SMALL, str(whole)))
     assert report.made == 0 and report.items == 3
-    assert contents(whole) == before and set(before) == {"small.jsonl", *(f"pairs/{i.name}.npz" for i in draw_items(SMALL, {}))}
+    assert contents(whole) == before and set(before) == {
+        "small.jsonl",
+        "small.recipe.json",
+        *(f"pairs/{i.name}.npz" for i in draw_items(SMALL, {})),
+    }
 
 
 @pytest.mark.longer
