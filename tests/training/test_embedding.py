@@ -267,6 +267,8 @@ def test_storeys_of_a_building_are_on_one_side():
     sides = [{one.buildings[0] for one in side} for side in (train, held)]
     assert len(sides[0]) + len(sides[1]) == 12 and len(held) % 4 == 0 and not sides[0] & sides[1]
     assert storeys[0].building_numbers == storeys[3].building_numbers != storeys[4].building_numbers
+    building = make_batch([storeys[0], storeys[3], storeys[4]], ("x",)).truth.building.split([6, 6, 6])
+    assert torch.equal(building[0], building[1]) and len({int(b[0]) for b in building}) == 2
     stranger = replace(storeys[0], about={**storeys[0].about, "hard": "other-building", "file": "x.npz"})
     assert stranger.buildings[0] == storeys[0].buildings[0] != stranger.buildings[1]
 
