@@ -72,6 +72,7 @@ def _traced(module: nn.Module, signature: Signature, sample: Sequence[Tensor], s
     )  # fmt: skip
     assert program is not None
     model = program.model_proto
+    _count_axes_from_front(model.graph)
     _strip(model.graph)
     for function in model.functions:
         _strip(function)
@@ -108,6 +109,24 @@ def _joined(models: Sequence[Any], choice: str) -> Any:
         chosen = helper.make_graph(nodes, f"from_{k}", [], values)
     joined.graph.node.extend(chosen.node)
     return joined
+
+
+def _count_axes_from_front(graph: Any) -> None:
+    """Name the axes of sums and the like from the front: ONNX Runtime 1.31 mistakes those from the end in empty tensors."""
+    from onnx import helper, numpy_helper
+
+    ranks = {value.name: len(value.type.tensor_type.shape.dim) for value in (*graph.value_info, *graph.input)}
+    constants = {node.output[0]: node.attribute[0] for node in graph.node if node.op_type == "Constant"}
+    nodes = []
+    for node in graph.node:
+        if node.op_type.startswith("Reduce") and len(node.input) > 1 and node.input[0] in ranks and node.input[1] in constants:
+            given = constants[node.input[1]]
+            axes = np.array(given.ints) if given.name == "value_ints" else numpy_helper.to_array(given.t).reshape(-1)
+            node.input[1] = f"{node.output[0]}_axes"
+            nodes.append(helper.make_node("Constant", [], [node.input[1]], value_ints=(axes % ranks[node.input[0]]).tolist()))
+        nodes.append(node)
+    del graph.node[:]
+    graph.node.extend(nodes)
 
 
 def _strip(graph: Any) -> None:

@@ -106,9 +106,10 @@ def read_state(folder: Path) -> tuple[Embedder, dict[str, Any]]:
     if hashlib.sha256(data).hexdigest() != values["sha256"]:
         raise InputError(f"{path}: cut off, damaged, or not the weights that {STATE_SETTINGS} is about; copy both again")
     try:
-        return _filled(network, load(data), path), values["about"]
+        weights = load(data)
     except (SafetensorError, KeyError, TypeError, AttributeError, ValueError) as error:  # of headers that lie
         raise InputError(f"{path}: is no safetensors file ({' '.join(str(error).split())[:80]}); copy both again") from error
+    return _filled(network, weights, path), values["about"]
 
 
 def _filled(network: Embedder, weights: Mapping[str, Tensor], path: str | Path | None) -> Embedder:

@@ -298,7 +298,7 @@ def test_check_takes_the_defaults():
     [
         ({"size": 10**9}, "size must be 1 to 4096"),
         ({"node": {"kind": "gat", "doors": 10**12}}, "node.doors must be 0 to 4"),
-        ({"geometry": {"parts": [["scalars"]]}}, "unknown"),
+        ({"geometry": {"parts": [["scalars"]]}}, "must be names"),
     ],
 )
 def test_settings_that_would_take_all_memory_or_fail_oddly_are_refused(tmp_path, table, message):

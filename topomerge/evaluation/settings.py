@@ -12,7 +12,7 @@ from typing import Any
 from topomerge.datasets.pairs.recipe import Recipe
 from topomerge.embedding.context import CONTEXT_KINDS
 from topomerge.embedding.embedders import EMBEDDERS
-from topomerge.embedding.weights import EMBEDDER_FILE, find_embedder, read_embedder_card
+from topomerge.embedding.weights import EMBEDDER_FILE, PRETRAINED, find_embedder, read_embedder_card
 from topomerge.errors import InputError
 from topomerge.fusion.inputs import POSE_SOURCES
 from topomerge.io.listing import plain
@@ -130,7 +130,7 @@ def check(settings: Evaluation) -> None:
     if not settings.only and not settings.run:
         raise InputError("nothing to evaluate: name descriptors with only=[...], or run=runs/x")
     for run in settings.run:
-        if not Path(run).exists():
+        if run != PRETRAINED and not Path(run).exists():
             raise InputError(f"run={run}: no such folder or file; name a run that was trained")
         if not runs_in(run):
             raise InputError(f"run={run}: no run, and no folder of runs; name a run that was trained")
