@@ -208,8 +208,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     model = onnx.load(str(path), load_external_data=False)
     prefix = "network."
     arrays = {i.name: onnx.numpy_helper.to_array(i) for i in model.graph.initializer}
-    named = {n.removeprefix(prefix): torch.from_numpy(a.copy()) for n, a in arrays.items() if n.startswith(prefix)}
-    return {name.removeprefix(prefix): value for name, value in named.items()}  # once more of `Ordered`
+    return {n.removeprefix(prefix): torch.from_numpy(a.copy()) for n, a in arrays.items() if n.startswith(prefix)}
 
 
 class Branches(nn.Module):

@@ -82,7 +82,8 @@ def read_embedder(path: str | Path | None = None) -> tuple[Embedder, dict[str, A
     card = read_embedder_card(find_embedder(path))
     network = Embedder(card.network)
     unread = {"log_temperature": torch.tensor(card.temperature).log()}  # what no output depends on is not in the file
-    weights = {**network.state_dict(), **unread, **read_weights(card.path)}
+    read = {name.removeprefix("network."): value for name, value in read_weights(card.path).items()}  # those of `Ordered`
+    weights = {**network.state_dict(), **unread, **read}
     return _filled(network, {name: weights[name] for name in network.state_dict()}, path), card.about
 
 
