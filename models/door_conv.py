@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
-from topomerge.embedding.network import DOOR_KNOT_STEP, DOOR_KNOTS
+DOOR_KNOTS, DOOR_KNOT_STEP = 24, 0.5  # bumps of the distance between two doors, and m between them
 
 # Maxima of a few thousand rows: torch's own are quick enough, and the package that the warning asks for has to be compiled.
 warnings.filterwarnings("ignore", message="The usage of `scatter", module="torch_geometric")

@@ -8,8 +8,8 @@ from torch.nn.functional import leaky_relu
 from torch_geometric.nn import MessagePassing
 from torch_geometric.utils import softmax
 
-from topomerge.embedding.network import SCORE_BOUND
-from topomerge.numpy_nn import LEAKY_SLOPE
+SCORE_BOUND = 30.0  # of attention
+LEAKY_SLOPE = 0.2  # of the leaky rectifier below 0 (Velickovic et al. 2018)
 
 
 class EdgeValueConv(MessagePassing):

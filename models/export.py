@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ import torch
 from topomerge.models.embedder import Embedder
 from torch import Tensor, nn
 
+import topomerge
 from topomerge.embedding.network import build_embedder_signature
+from topomerge.embedding.weights import EMBEDDER_FILE, build_card
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
-from topomerge.networks.network import Run
+from topomerge.networks.network import Run, write_card
 from topomerge.networks.signature import Signature
 from topomerge.types import Array
 
@@ -33,10 +36,7 @@ def export_network(module: nn.Module, signature: Signature, sample: Sequence[Ten
     Raises:
         InputError: onnx is not installed, a weight is no finite number, or the path can't be written.
     """
-    try:
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise InputError("ONNX needs onnx and onnxscript: pip install topomerge[learn]") from error
+    check_exporter()
     if not all(torch.isfinite(value).all() for value in module.state_dict().values()):
         raise InputError(f"{path}: weights are no finite numbers; training diverged, take another run")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
@@ -47,6 +47,16 @@ def export_network(module: nn.Module, signature: Signature, sample: Sequence[Ten
         else:
             model = _traced(module, signature, sample)
         beside.write_bytes(model.SerializeToString(deterministic=True))
+
+
+def check_exporter() -> None:
+    """Refuse to train what could not be exported.
+
+    Raises:
+        InputError: onnx is not installed.
+    """
+    if not all(map(find_spec, ("onnx", "onnxscript"))):
+        raise InputError("ONNX needs onnx and onnxscript: pip install topomerge[learn]")
 
 
 def _traced(module: nn.Module, signature: Signature, sample: Sequence[Tensor], start: int = 0) -> Any:
@@ -62,6 +72,7 @@ def _traced(module: nn.Module, signature: Signature, sample: Sequence[Tensor], s
     )  # fmt: skip
     assert program is not None
     model = program.model_proto
+    _count_axes_from_front(model.graph)
     _strip(model.graph)
     for function in model.functions:
         _strip(function)
@@ -100,6 +111,24 @@ def _joined(models: Sequence[Any], choice: str) -> Any:
     return joined
 
 
+def _count_axes_from_front(graph: Any) -> None:
+    """Name the axes of sums and the like from the front: ONNX Runtime 1.31 mistakes those from the end in empty tensors."""
+    from onnx import helper, numpy_helper
+
+    ranks = {value.name: len(value.type.tensor_type.shape.dim) for value in (*graph.value_info, *graph.input)}
+    constants = {node.output[0]: node.attribute[0] for node in graph.node if node.op_type == "Constant"}
+    nodes = []
+    for node in graph.node:
+        if node.op_type.startswith("Reduce") and len(node.input) > 1 and node.input[0] in ranks and node.input[1] in constants:
+            given = constants[node.input[1]]
+            axes = np.array(given.ints) if given.name == "value_ints" else numpy_helper.to_array(given.t).reshape(-1)
+            node.input[1] = f"{node.output[0]}_axes"
+            nodes.append(helper.make_node("Constant", [], [node.input[1]], value_ints=(axes % ranks[node.input[0]]).tolist()))
+        nodes.append(node)
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
 def _strip(graph: Any) -> None:
     """Remove what tells of the machine: stack traces with paths of files."""
     del graph.metadata_props[:]
@@ -134,14 +163,25 @@ def build_embedder_sample(
     return sample
 
 
-def export_embedder(network: Embedder, path: str | Path) -> None:
-    """Write an embedder, as `embedding.network.build_embedder_signature` describes it.
+def export_embedder(network: Embedder, folder: str | Path, about: Mapping[str, Any] | None = None) -> Path:
+    """Write an embedder and its card into a folder, which is made if need be; the network, on the processor, is not changed.
+
+    Args:
+        about: on what it was trained, how good it is.
 
     Raises:
         InputError: as `export_network`.
     """
+    path = Path(folder) / EMBEDDER_FILE
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be written ({error.strerror or error})") from error
     sample = list(build_embedder_sample(network).values())
-    export_network(Turned(network), build_embedder_signature(network.network), sample, path)
+    export_network(Ordered(network), build_embedder_signature(network.network), sample, path)
+    card = build_card(network.network, float(network.temperature.detach()), about)
+    write_card(path, {**card, "version": topomerge.__version__})
+    return path
 
 
 def run_with_torch(module: nn.Module, signature: Signature) -> Run:
@@ -184,8 +224,8 @@ class Branches(nn.Module):
         return outputs
 
 
-class Turned(nn.Module):
-    """An embedder on all quarter turns of a map (`Embedder.turned`), with its tensors in order."""
+class Ordered(nn.Module):
+    """An embedder that takes its tensors in order."""
 
     def __init__(self, network: Embedder) -> None:
         super().__init__()
@@ -193,7 +233,8 @@ class Turned(nn.Module):
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         """Rows and dustbins."""
-        return self.network.turned(dict(zip(self.network.tensors, tensors, strict=True)))
+        outputs: tuple[Tensor, Tensor] = self.network(dict(zip(self.network.tensors, tensors, strict=True)))
+        return outputs
 
 
 class _Positional(nn.Module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -12,8 +13,11 @@ from topomerge.models.layers import Standardise
 from torch import Tensor, nn
 from torch_geometric.nn import GATv2Conv, SAGEConv
 
-from topomerge.embedding.network import ROOM_KNOTS, WAY_LIMIT, WAY_UNIT, Node, pair_tensors
+from topomerge.embedding.network import Node, pair_tensors
 from topomerge.embedding.schema import column, width
+
+ROOM_KNOTS = 11  # bumps of the distance between two rooms, 1 m apart
+WAY_UNIT, WAY_LIMIT = 5.0, 3.0  # m that ways to neighbours are divided by, and how far they tell then
 
 
 def dense(*widths: int) -> nn.Sequential:
@@ -27,14 +31,22 @@ def bumps(distance: Tensor) -> Tensor:
     return (-((distance[:, None] - knots) ** 2)).exp()
 
 
-def room_layer(settings: Node, channels: int) -> nn.Module:
-    """One layer over the rooms: (R, channels), edge_index, edges (E, settings.width) if there are features -> (R, channels)."""
+def build_sage(settings: Node, channels: int) -> nn.Module:
+    """A layer of means over the neighbours."""
+    return EdgeSAGEConv(channels, settings.width) if settings.edges else SAGEConv(channels, channels)
+
+
+def build_gat(settings: Node, channels: int) -> nn.Module:
+    """A layer of attention over the neighbours."""
     edge_dim = settings.width if settings.edges else None
-    if settings.kind == "sage":
-        return EdgeSAGEConv(channels, edge_dim) if edge_dim else SAGEConv(channels, channels)
     if settings.edge_values:
         return EdgeValueConv(channels, edge_dim, settings.heads)
     return GATv2Conv(channels, channels // settings.heads, settings.heads, edge_dim=edge_dim, add_self_loops=False)
+
+
+# Kind of node encoder (`Node.kind`, `embedding.network.NODES`) -> what builds one of its layers over the rooms:
+# (R, channels), edge_index, edges (E, settings.width) if there are features -> (R, channels).
+ROOM_LAYERS: dict[str, Callable[[Node, int], nn.Module]] = {"sage": build_sage, "gat": build_gat}
 
 
 class NodeEncoder(nn.Module):
@@ -61,7 +73,7 @@ class NodeEncoder(nn.Module):
             self.pairs = Standardise(pair_dim)
             self.doors = nn.ModuleList(DoorConv(settings.width, pair_dim) for _ in range(settings.doors))
         count = 0 if settings.kind == "none" else settings.layers
-        self.layers = nn.ModuleList(room_layer(settings, channels) for _ in range(count))
+        self.layers = nn.ModuleList(ROOM_LAYERS[settings.kind](settings, channels) for _ in range(count))
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(count))
         self.drop = nn.Dropout(dropout)
         self.out = channels * (count + 1) if settings.jump == "cat" else channels

@@ -11,9 +11,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from topomerge.embedding.network import CROP_CHANNELS
-from topomerge.embedding.surroundings import CROP_PLANES, CROP_SHAPES, DOOR_PART
+from topomerge.embedding.surroundings import CROP_PART, CROP_PLANES, CROP_SHAPES, DOOR_PART, WIDE_PART
 
+CROP_CHANNELS = {  # of the convolutions of crops, each of which halves the sides
+    CROP_PART: (16, 32, 64, 128), WIDE_PART: (16, 32, 64), DOOR_PART: (16, 32, 64),
+}  # fmt: skip
 FULL_VALUE = 255.0  # of a pixel
 CROPS_A_PLAN = 512  # convolutions on CUDA see multiples of so many crops while training
 

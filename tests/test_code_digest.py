@@ -52,7 +52,7 @@ def test_comments_docstrings_and_layout_keep_the_digest(before, after):
     [
         ("topomerge.fusion.pipeline", "registration/calibration.json"),
         ("topomerge.embedding.engineered", "embedding/engineered.json"),
-        ("topomerge.embedding.learned", "embedding/pretrained/embedder.safetensors"),
+        ("topomerge.embedding.learned", "networks/embedder.onnx"),
         (EXTRACT, "networks/plan_network.onnx"),
         (EXTRACT, "networks/grid_network.onnx"),
         (EXTRACT, "networks/wall_network.onnx"),

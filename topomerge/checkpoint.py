@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from topomerge.embedding.weights import WEIGHTS_FILE
+from topomerge.embedding.weights import STATE_FILE as EMBEDDER_STATE
 from topomerge.errors import InputError
 
 STATE_FORMAT = 3
@@ -57,8 +58,21 @@ def write_network(network: torch.nn.Module, folder: Path) -> None:
     (folder / NETWORK_FILE).write_bytes(save(state))
 
 
+def read_network(network: torch.nn.Module, folder: Path) -> None:
+    """Put what `write_network` wrote into a network.
+
+    Raises:
+        InputError: it is damaged, or of another network.
+    """
+    try:
+        network.load_state_dict(load((folder / NETWORK_FILE).read_bytes()))
+    except (RuntimeError, OSError, ValueError, SafetensorError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise InputError(f"{folder / NETWORK_FILE}: is not of the network configured ({reason}); train again") from error
+
+
 def load_state(
-    folder: str | Path, network: torch.nn.Module, optimizer: torch.optim.Optimizer, weights: str = WEIGHTS_FILE
+    folder: str | Path, network: torch.nn.Module, optimizer: torch.optim.Optimizer, weights: str = EMBEDDER_STATE
 ) -> dict[str, Any]:
     """Put the state into a network and its optimizer; `progress` comes back.
 

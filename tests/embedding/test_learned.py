@@ -1,34 +1,33 @@
-"""The NumPy run of trained networks: it says what torch says, reads nothing but what it should, and torch stays away."""
+"""Trained embedders as they are run: they say what torch says, whatever they are made of, and torch stays away."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import pickle
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from safetensors import numpy
 
 from tests.scenes_map import building
-from topomerge.embedding.embedders import embedder
+from topomerge.embedding import network as parts
 from topomerge.embedding.graph import graph_arrays
 from topomerge.embedding.learned import load_embedder
 from topomerge.embedding.network import Geometry, Network, Node
 from topomerge.embedding.room_cells import joined
 from topomerge.embedding.sheets import sheet_arrays
+from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.embedding.turns import TurnedRows
-from topomerge.embedding.weights import SETTINGS_FILE, WEIGHTS_FILE, embedder_folder, read_weights, unpacked
+from topomerge.embedding.weights import EMBEDDER_FILE, find_embedder, read_embedder_card
 from topomerge.errors import InputError
+from topomerge.networks.network import card_of
 
 ROOT = Path(__file__).parent.parent.parent
-CONFIGS = ROOT / "configs"
-PRETRAINED = ROOT / "topomerge" / "embedding" / "pretrained"
-GEOMETRIES = ("scalars", "engineered", "shapedna", "scalars_engineered", "scalars_shapedna")
-GEOMETRIES += ("surroundings", "scalars_surroundings", "scalars_wide", "scalars_doors", "scalars_crops")
-SAGE = Network(Geometry(["scalars"], width=8), Node("sage", 1, width=4), size=8)
+EARLIER = Path(__file__).parent / "earlier"
 
 
 def graphs() -> dict[str, dict[str, np.ndarray]]:
@@ -48,22 +47,23 @@ def graphs() -> dict[str, dict[str, np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def torch():
+    pytest.importorskip("onnxscript")
     return pytest.importorskip("torch")
 
 
-def saved(torch, network: Network, folder: Path, seed: int = 0) -> Path:
-    """A network with weights and statistics that are far from those of a fresh one."""
+def exported(torch, network: Network, folder: Path):
+    """A network with weights and statistics that are far from those of a fresh one, and its files."""
     from topomerge.models.embedder import Embedder
-    from topomerge.models.weights import save_embedder
+    from topomerge.models.export import export_embedder
 
-    torch.manual_seed(seed)
-    made = Embedder(network)
+    torch.manual_seed(0)
+    made = Embedder(network).eval()
     with torch.no_grad():
         for name, value in made.state_dict().items():
             if name != "log_temperature":
                 value.add_(0.1 * torch.rand(value.shape))
-    save_embedder(made, folder, {"data": "none"})
-    return folder
+    export_embedder(made, folder, {"data": "none"})
+    return made
 
 
 def plain(rows):
@@ -71,59 +71,113 @@ def plain(rows):
     return rows.flat() if isinstance(rows, TurnedRows) else rows
 
 
-def compare(folder: Path, several: dict[str, dict[str, np.ndarray]]) -> None:
-    """Both ways give the same embeddings and dustbins."""
-    from topomerge.models.learned import load_with_torch
+def compare(ours, network, several: dict[str, dict[str, np.ndarray]]) -> None:
+    """What is loaded gives the embeddings and dustbins of a network of torch."""
+    from topomerge.models.weights import learned
 
-    ours, theirs = load_embedder(folder), load_with_torch(folder)
-    assert ours.temperature == pytest.approx(theirs.temperature, abs=1e-7) and ours.about == theirs.about
+    theirs = learned(network)
+    assert ours.temperature == pytest.approx(theirs.temperature, abs=1e-7) and ours.embedder
     for name, arrays in several.items():
-        for rows, wanted in zip(*(map(plain, learned.graph(arrays)) for learned in (ours, theirs)), strict=True):
-            assert rows.shape == wanted.shape and rows.dtype == np.float64
-            assert np.abs(rows - wanted).max() < 1e-5, name
+        for rows, expected in zip(*(map(plain, one.graph(arrays)) for one in (ours, theirs)), strict=True):
+            assert rows.shape == expected.shape and rows.dtype == np.float64
+            assert np.abs(rows - expected).max() < 1e-5, name
 
 
 def test_the_embedder_that_ships_is_as_with_torch(torch):
-    compare(PRETRAINED, graphs())
-    ours, map = load_embedder(), building(2, 2)
-    from topomerge.models.learned import load_with_torch
+    from topomerge.models.weights import learned, read_embedder
 
-    theirs = load_with_torch(PRETRAINED)
-    assert np.abs(ours.matchability(map) - theirs.matchability(map)).max() < 1e-5
+    network, about = read_embedder()
+    ours, theirs, map = load_embedder(), learned(network), building(2, 2)
+    compare(ours, network, graphs())
+    assert ours.about == about and np.abs(ours.matchability(map) - theirs.matchability(map)).max() < 1e-5
     for one, other in zip(ours.probabilities(map, building(3)), theirs.probabilities(map, building(3)), strict=True):
         assert np.abs(one - other).max() < 1e-5 and np.allclose(one.sum(axis=1), 1)
 
 
-@pytest.mark.longer
-@pytest.mark.parametrize("file", sorted(path.stem for path in (CONFIGS / "node").glob("*.yaml")))
-def test_every_node_encoder_is_as_with_torch(torch, file, tmp_path):
-    yaml = pytest.importorskip("yaml")
-    options = yaml.safe_load((CONFIGS / "node" / f"{file}.yaml").read_text())
-    node = Node(**{k: v for k, v in options.items() if not k.startswith("_")})
-    compare(saved(torch, Network(Geometry(["scalars"], width=16), node, size=24), tmp_path), graphs())
+NETWORKS = {
+    "values": Network(Geometry(["scalars"], width=16), Node("gat", 2, doors=1, width=8), size=24),
+    "paper": Network(Geometry(["scalars"], width=16), Node("gat", 1, edge_values=False, jump="max"), size=8),
+    "bare": Network(Geometry(["scalars"], width=8), Node("gat", 1, edges=False, edge_values=False, skip=False), size=8),
+    "means": Network(Geometry(["engineered", "shapedna"], width=8), Node("sage", 1, width=8, jump="last"), size=8),
+    "bare means": Network(Geometry(["scalars"], width=8), Node("sage", 2, edges=False), size=8),
+    "near": Network(Geometry(["scalars"], width=8), Node("sage", 1, doors=2, near=True), size=8),
+    "crops": Network(Geometry(["scalars", *CROP_SHAPES], width=8), Node("gat", 1, around=10.0, ways=True), size=8),
+    "points": Network(Geometry(["pointnet", "voxelcnn"], width=8), Node("none"), size=8),
+    "local": Network(Geometry(["pointnet_local"], width=8, yaws=2, canonical=True), Node("none"), size=8),
+}
 
 
 @pytest.mark.longer
-@pytest.mark.parametrize("file", GEOMETRIES)
-@pytest.mark.parametrize("jump", ["last", "cat", "max"])
-def test_every_geometry_of_numbers_is_as_with_torch(torch, file, jump, tmp_path):
-    yaml = pytest.importorskip("yaml")
-    options = yaml.safe_load((CONFIGS / "geometry" / f"{file}.yaml").read_text())
-    node = Node("sage", 2, skip=jump == "max", jump=jump, width=8)
-    network = Network(Geometry(options["parts"], width=16), node, size=8)
-    rows = {"small": graphs()["small"], "one": graphs()["one"]}
-    compare(saved(torch, network, tmp_path), rows)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("points", "local"))) for n in NETWORKS])
+def test_every_encoder_is_as_with_torch(torch, name, tmp_path):
+    from topomerge.models.weights import read_embedder
+
+    made = exported(torch, NETWORKS[name], tmp_path)
+    rng = np.random.default_rng(0)  # of points as far away as each other, others come first elsewhere
+    several = {
+        n: g | {"room_points": g["room_points"] + rng.normal(0, 0.01, g["room_points"].shape)} for n, g in graphs().items()
+    }
+    compare(load_embedder(tmp_path), made, several)
+    read, about = read_embedder(tmp_path)
+    assert about == {"data": "none"} and read.network == made.network
+    left, right = read.state_dict(), made.state_dict()
+    assert left.pop("log_temperature") == pytest.approx(float(right.pop("log_temperature")), abs=1e-6)
+    assert all(torch.equal(left[key], right[key]) for key in right)
 
 
-def test_networks_that_read_points_go_through_torch(torch, tmp_path, monkeypatch):
-    saved(torch, Network(Geometry(["scalars", "pointnet"], width=8), Node("none"), size=8), tmp_path)
-    assert load_embedder(tmp_path)(building(1)).shape == (3, 8)
-    for name in [n for n in sys.modules if n.startswith("topomerge.models.")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "torch", None)  # as if it were not installed
-    with pytest.raises(InputError, match=r"reads points, for which it needs torch: pip install topomerge\[learn\]"):
-        load_embedder(tmp_path)
-    assert embedder("learned")(building(1)).shape == (3, 4, 64)
+def test_a_node_encoder_of_somebody_else_trains_is_exported_and_loads(torch, tmp_path, monkeypatch):
+    """Registered by two lines. Those who load it need not know it."""
+    from topomerge.models.nodes import ROOM_LAYERS
+    from topomerge.models.weights import read_embedder
+    from torch_geometric.nn import TransformerConv
+
+    from tests.graphs import write_set
+    from topomerge.training.embedding import fit
+    from topomerge.training.settings import Training
+
+    def build(settings: Node, channels: int):
+        return TransformerConv(channels, channels // settings.heads, settings.heads, edge_dim=settings.width, beta=True)
+
+    write_set(tmp_path, "some", 6)
+    with monkeypatch.context() as registered:
+        registered.setitem(ROOM_LAYERS, "transformer", build)
+        registered.setattr(parts, "NODES", (*parts.NODES, "transformer"))
+        network = Network(Geometry(["scalars"], width=16), Node("transformer", 2, width=8), size=8)
+        common = {"runs": str(tmp_path), "cache": str(tmp_path), "data": "some", "validation": "", "tensorboard": False}
+        settings = Training(**common, epochs=2, batch=2, network=network)
+        assert np.isfinite(fit(settings, lambda text: None)["train/loss"])
+        made, _ = read_embedder(tmp_path / "run")
+    assert sorted(p.name for p in (tmp_path / "run" / "best").iterdir()) == ["embedder.card.json", "embedder.onnx"]
+    ours = load_embedder(tmp_path / "run")
+    compare(ours, made, graphs())
+    assert ours.network.node.kind == "transformer" and ours.about["loss"] == "infonce"
+    with pytest.raises(InputError, match="node.kind: unknown 'transformer'"):
+        read_embedder(tmp_path / "run")
+
+
+@pytest.mark.parametrize("name", ["gat_around", "one_crop"])
+def test_what_earlier_versions_wrote_is_exported_and_says_the_same(torch, name, tmp_path):
+    """Weights of torch, of which the program of then said what is kept here."""
+    from topomerge.cli.main import main as cli
+
+    with pytest.raises(InputError, match=r"^[^\n]*holds weights of torch, [^\n]* run topomerge export-embedder [^\n]*$"):
+        load_embedder(EARLIER / name)
+    assert cli(["export-embedder", str(EARLIER / name), "-o", str(tmp_path / "new"), "--quiet"]) == 0
+    ours = load_embedder(tmp_path / "new")
+    if name == "one_crop":
+        with np.load(EARLIER / "expected_rows.npz", allow_pickle=False) as file:
+            assert np.abs(ours(building(2)).rows - file["one_crop"]).max() < 1e-5
+        return
+    with np.load(EARLIER / "expected.npz", allow_pickle=False) as file:
+        embedding, dustbin = ours.graph({n.removeprefix("graph."): file[n] for n in file.files if n.startswith("graph.")})
+        assert np.abs(embedding - file["pretrained.embedding"]).max() < 1e-5
+        assert np.abs(dustbin - file["pretrained.dustbin"]).max() < 1e-5
+
+
+def test_an_embedder_is_sent_to_another_process():
+    ours, map = load_embedder(), building(1)
+    again = pickle.loads(pickle.dumps(ours))
+    assert np.array_equal(again(map).rows, ours(map).rows) and again.embedder == ours.embedder
 
 
 @pytest.mark.longer
@@ -131,84 +185,90 @@ def test_torch_is_never_imported():
     code = (
         "import sys, topomerge as tm; from tests.scenes_map import building; from topomerge.cli.main import COMMANDS\n"
         "result = tm.merge([building(1), building(2)]); tm.load_embedder()(building(1)); assert result.descriptor == 'learned'\n"
-        "print([m for m in ('torch', 'torch_geometric', 'hydra', 'lightning_fabric') if m in sys.modules])"
+        "print([m for m in ('torch', 'torch_geometric', 'hydra', 'lightning_fabric', 'safetensors') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
-def header(data: bytes) -> tuple[dict, bytes]:
-    size = int.from_bytes(data[:8], "little")
-    return json.loads(data[8 : 8 + size]), data[8 + size :]
-
-
-def packed(table: object, body: bytes) -> bytes:
-    text = json.dumps(table).encode()
-    return len(text).to_bytes(8, "little") + text + body
-
-
-def write_weights(data: bytes, folder: Path) -> None:
-    """Bytes as the weights of the embedder that ships, with the digest that fits."""
-    settings = json.loads((PRETRAINED / SETTINGS_FILE).read_text())
-    (folder / WEIGHTS_FILE).write_bytes(data)
-    (folder / SETTINGS_FILE).write_text(json.dumps({**settings, "sha256": hashlib.sha256(data).hexdigest()}))
+def shipped(folder: Path) -> Path:
+    """The embedder that ships, elsewhere."""
+    for path in (find_embedder(), card_of(find_embedder())):
+        shutil.copy(path, folder)
+    return folder / EMBEDDER_FILE
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t["project.0.bias"].update(dtype="I64"), "no safetensors"),
-        (lambda t: [row.update(dtype="I32") for row in t.values()], "is no float32"),
-        (lambda t: t["project.0.bias"].update(dtype="BF17"), "no safetensors"),
-        (lambda t: t["project.0.bias"].update(shape=[-128]), "no safetensors"),
-        (lambda t: t["project.0.bias"].update(shape=[1 << 62]), "no safetensors"),
-        (lambda t: t["project.0.bias"].update(data_offsets=[1 << 40, (1 << 40) + 512]), "no safetensors"),
-        (lambda t: t["project.0.bias"].update(data_offsets=[0]), "no safetensors"),
-        (lambda t: t.update({"project.0.bias": 3}), "no safetensors"),
-        (lambda t: t.update({"more": t["project.0.bias"]}), "no safetensors"),
-        (lambda t: t["project.0.bias"].update(shape=[1, 1, 1, 1, 1, 128]), "at most five axes"),
-        (lambda t: t.update({"x" * (1 << 20): t.pop("project.0.bias")}), "its header is cut off"),
+        (lambda t: t.update(format=99), "has format 99"),
+        (lambda t: t.update({"class": "os.system"}), "is of class 'os.system'"),
+        (lambda t: t.pop("network"), "lacks network"),
+        (lambda t: t.pop("sha256"), "lacks network, sha256"),
+        (lambda t: t.update(about=3), "lacks network, sha256, about"),
+        (lambda t: t.update(temperature=0), "temperature must be above 0"),
+        (lambda t: t.update(temperature=float("nan")), "temperature must be above 0"),
+        (lambda t: t["network"].update(kind="x"), "unknown key kind"),
+        (lambda t: t["network"].update(size=10**9), "size must be 1 to 4096"),
+        (lambda t: t["network"]["node"].update(around=1e9), "node.around must be 0 to 100"),
+        (lambda t: t["network"]["geometry"].update(parts=[["scalars"]]), "geometry.parts must be names"),
+        (lambda t: t["network"]["geometry"].update(parts=[]), "geometry.parts must be one or more"),
+        (lambda t: t["features"]["x"].reverse(), r"16 columns of x, this version has 16 \(other: their order\); train it again"),
+        (lambda t: t["features"]["edge_attr"].append("colour"), r"12 columns of edge_attr, .* 11 \(other: colour\)"),
+        (lambda t: t["features"].pop("x"), "0 columns of x"),
+        (lambda t: t["features"].update(x=3), "0 columns of x"),
     ],
 )
-def test_headers_that_lie_are_refused(change, message, tmp_path):
-    table, body = header((PRETRAINED / WEIGHTS_FILE).read_bytes())
-    change(table)
-    write_weights(packed(table, body), tmp_path)
-    with pytest.raises(InputError, match=rf"^[^\n]*embedder\.safetensors: does not fit [^\n]*{message}[^\n]*$"):
+def test_cards_that_do_not_fit_are_refused(change, message, tmp_path):
+    card = card_of(shipped(tmp_path))
+    values = json.loads(card.read_text())
+    change(values)
+    card.write_text(json.dumps(values))
+    with pytest.raises(InputError, match=rf"^[^\n]*embedder\.card\.json: [^\n]*{message}[^\n]*$"):
         load_embedder(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda w: w.pop("project.0.bias"), "project.0.bias"),
-        (lambda w: w.update({"more": w["project.0.bias"]}), "more is of no layer"),
-        (lambda w: w.update({"project.0.bias": w["project.0.bias"][:64]}), r"is \(64,\), not \(128,\)"),
-        (lambda w: w.update({"project.0.weight": w["project.0.weight"].T.copy()}), ""),
-        (lambda w: w.update({"node.edges.spread": 0 * w["node.edges.spread"]}), "spread: is not above 0"),
+        (lambda t: t["network"].update(size=32), "is of other outputs: embedding is "),
+        (lambda t: t["network"]["geometry"].update(parts=["scalars"]), "is of other inputs: door_surroundings is "),
+        (lambda t: t.update(sha256="0" * 64), "cut off, damaged, or not the network"),
     ],
 )
-def test_weights_that_do_not_fit_are_refused(change, message, tmp_path):
-    weights = numpy.load((PRETRAINED / WEIGHTS_FILE).read_bytes())
-    change(weights)
-    write_weights(numpy.save(weights), tmp_path)
-    with pytest.raises(InputError, match=rf"embedder\.safetensors: does not fit .*{message}"):
+def test_networks_that_do_not_fit_their_card_are_refused(change, message, tmp_path):
+    card = card_of(shipped(tmp_path))
+    values = json.loads(card.read_text())
+    change(values)
+    card.write_text(json.dumps(values))
+    with pytest.raises(InputError, match=rf"^[^\n]*embedder\.onnx: {message}[^\n]*$"):
         load_embedder(tmp_path)
 
 
-@pytest.mark.parametrize("data", [b"", b"\xff" * 8, b"\xff" * 100, b"\x05\0\0\0\0\0\0\0[1,2]", b"\x02\0\0\0\0\0\0\0{"])
-def test_what_is_no_safetensors_file_is_refused(data):
-    with pytest.raises(ValueError):
-        unpacked(data)
-
-
-def test_folders_of_an_embedder(tmp_path):
-    assert embedder_folder(PRETRAINED / WEIGHTS_FILE) == PRETRAINED == embedder_folder(PRETRAINED)
-    network, weights, about = read_weights(PRETRAINED)
-    assert (
-        network.geometry.parts == ["scalars", "surroundings", "wide_surroundings", "door_surroundings"]
-        and len(weights) > 40
-        and "data" in about
-    )
-    with pytest.raises(InputError, match="give a run's folder"):
+def test_a_pickle_under_another_name_is_not_run(torch, tmp_path):
+    """What torch.save wrote could run anything when unpickled: it is refused by its digest, or as no network."""
+    path = shipped(tmp_path)
+    torch.save({"x": torch.ones(1)}, path)
+    with pytest.raises(InputError, match="cut off, damaged"):
         load_embedder(tmp_path)
+    values = json.loads(card_of(path).read_text())
+    card_of(path).write_text(json.dumps({**values, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}))
+    with pytest.raises(InputError, match="is no network that can be run"):
+        load_embedder(tmp_path)
+
+
+def test_where_an_embedder_is_looked_for(tmp_path, monkeypatch):
+    (tmp_path / "run" / "best").mkdir(parents=True)
+    path = shipped(tmp_path / "run" / "best")
+    assert path == find_embedder(tmp_path / "run") == find_embedder(tmp_path / "run" / "best") == find_embedder(path)
+    assert find_embedder() == find_embedder("pretrained") != path
+    card = read_embedder_card(path)
+    assert card.network.geometry.parts == ["scalars", *CROP_SHAPES] and "data" in card.about
+    monkeypatch.setenv("TOPOMERGE_WEIGHTS", str(path.parent))
+    assert find_embedder() == path
+    for wrong in (tmp_path, tmp_path / "no_such"):
+        with pytest.raises(InputError, match=r"embedder\.onnx: No such file; give a run's folder"):
+            load_embedder(wrong)
+    card_of(path).unlink()
+    with pytest.raises(InputError, match="copy a network together with its card"):
+        load_embedder(path)

@@ -87,27 +87,27 @@ def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
 def test_a_run_is_told_by_its_weights(tmp_path: Path) -> None:
     for name, weights in (("a", b"one"), ("b", b"two")):
         (tmp_path / name / "best").mkdir(parents=True)
-        (tmp_path / name / "best" / "weights.safetensors").write_bytes(weights)
+        (tmp_path / name / "best" / "embedder.onnx").write_bytes(weights)
     runs = [str(tmp_path / name) for name in "ab"]
     settings = Evaluation(SMALL, run=runs, methods=["assignment", "mutual"], folder=str(tmp_path))
     assert [v.name for v in variants(settings)] == ["a", "b"] and folder_of(settings).name == "two-a-b"
     assert next(variants(settings)).methods == ("assignment", "mutual")
     before = prediction_settings(settings)
     assert before["run"]["a"] != before["run"]["b"]
-    (tmp_path / "b" / "best" / "weights.safetensors").write_bytes(b"three")
+    (tmp_path / "b" / "best" / "embedder.onnx").write_bytes(b"three")
     assert difference(before, prediction_settings(settings)).startswith("run.b")
 
 
 def test_runs_are_called_by_what_they_are_made_of() -> None:
     run, title = (
-        "topomerge/embedding/pretrained",
+        "pretrained",
         "scalars + surroundings + wide_surroundings + door_surroundings, gat around ways, infonce",
     )
     assert run_title(run) == title
     settings = Evaluation(SMALL, run=[run], titles=True, mergers=[])
     assert [v.name for v in variants(settings)] == [title] == list(prediction_settings(settings)["run"])
     with pytest.raises(InputError, match=re.escape(f"two are called '{title}'")):
-        check(replace(settings, run=[run, f"{run}/embedder.json"]))
+        check(replace(settings, run=[run, "topomerge/networks"]))
 
 
 def test_the_first_difference_is_told() -> None:

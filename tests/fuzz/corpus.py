@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import shutil
@@ -21,7 +20,7 @@ from topomerge.errors import InputError
 MOST_TAKEN = 5_000_000  # points that are taken of a file; the rest of a large surface is no danger, as it comes in portions
 
 
-PARTNERS = {"plan.yaml": "plan.pgm", "embedder.safetensors": "embedder.json", "embedder.json": "embedder.safetensors"}
+PARTNERS = {"plan.yaml": "plan.pgm", "embedder.onnx": "embedder.card.json", "embedder.card.json": "embedder.onnx"}
 
 
 def read_cloud(path: Path) -> int:
@@ -87,13 +86,12 @@ def read_atlas(path: Path) -> int:
 
 
 def read_embedder(path: Path) -> int:
-    """Read an embedder whose settings or weights are damaged. Its checksum is made to fit: whoever means harm can do that."""
+    """Read an embedder whose card or network is damaged. Its checksum is made to fit: whoever means harm can do that."""
     from topomerge.embedding.learned import load_embedder
+    from topomerge.networks.network import write_card
 
-    settings = path.with_name("embedder.json")
-    if path.suffix == ".safetensors":
-        told = json.loads(settings.read_text())
-        settings.write_text(json.dumps({**told, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}))
+    if path.suffix == ".onnx":
+        write_card(path, json.loads(path.with_name("embedder.card.json").read_text()))
     return len(load_embedder(path.parent)(building(1)))
 
 
@@ -103,8 +101,8 @@ READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others a
     "plan.vectormap.json": read_plans,
     "plans.tar.xz": read_plans,
     "atlas.json": read_atlas,
-    "embedder.json": read_embedder,
-    "embedder.safetensors": read_embedder,
+    "embedder.card.json": read_embedder,
+    "embedder.onnx": read_embedder,
     ".las": read_las,
     ".laz": read_las,
     ".tmap": read_map,
@@ -182,19 +180,11 @@ def write_plans(folder: Path) -> dict[str, Path]:
 
 
 def write_embedder(folder: Path) -> dict[str, Path]:
-    """A network that was not trained; nothing where torch is missing."""
-    if find_spec("torch_geometric") is None:
-        return {}
-    import torch
-    from topomerge.models.embedder import Embedder
-    from topomerge.models.weights import save_embedder
+    """The embedder that ships, and its card."""
+    from topomerge.embedding.weights import find_embedder
+    from topomerge.networks.network import card_of
 
-    from topomerge.embedding.network import Geometry, Network, Node
-    from topomerge.embedding.weights import SETTINGS_FILE, WEIGHTS_FILE
-
-    torch.manual_seed(0)
-    save_embedder(Embedder(Network(Geometry(width=8), Node("sage", 1), size=8)), folder)
-    return {name: folder / name for name in (SETTINGS_FILE, WEIGHTS_FILE)}
+    return {path.name: Path(shutil.copy(path, folder)) for path in (find_embedder(), card_of(find_embedder()))}
 
 
 def write_atlas(folder: Path) -> dict[str, Path]:

@@ -16,7 +16,7 @@ from topomerge.errors import InputError
 from topomerge.training import device_batches
 from topomerge.training.batches import make_batch
 from topomerge.training.device_batches import DevicePairs, concatenate_ranges, draw_normal, draw_uniform, draw_uniforms
-from topomerge.training.embedding import fit
+from topomerge.training.embedding import EmbeddingJob, fit
 from topomerge.training.settings import Augment, Training
 from topomerge.training.turned_views import mirrored
 
@@ -165,7 +165,8 @@ def test_what_the_device_cannot_make_is_refused(cache, tmp_path):
         fit(settings, lambda text: None)
 
 
-def test_a_training_with_batches_of_the_device_learns_and_repeats(cache, tmp_path):
+def test_a_training_with_batches_of_the_device_learns_and_repeats(cache, tmp_path, monkeypatch):
+    monkeypatch.setattr(EmbeddingJob, "export_best", lambda self, folder: None)  # seconds
     network = Network(
         Geometry(["scalars", "surroundings"], width=8), Node("gat", 1, heads=2, around=10.0, ways=True, width=8), size=8
     )

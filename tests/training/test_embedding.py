@@ -60,6 +60,12 @@ def settings(cache, tmp_path) -> Training:
     return Training(**common, epochs=3, batch=4, rate=0.01, network=SMALL)
 
 
+@pytest.fixture
+def unexported(monkeypatch):
+    """For tests of the training alone: an export takes six seconds; without it `best/` keeps the weights of torch."""
+    monkeypatch.setattr(EmbeddingJob, "export_best", lambda self, folder: None)
+
+
 @pytest.mark.longer
 def test_a_set_is_packed_once(cache):
     said: list[str] = []
@@ -129,17 +135,20 @@ def test_validation_of_a_perfect_and_of_a_blind_network():
     assert scored["recall@1"] == 0 and scored["rooms"] == 36 and scored["mergeable"] == 3 and 0 <= scored["f1"] <= 1
 
 
+@pytest.mark.usefixtures("unexported")
 def test_overfit_one_batch(settings):
     best = fit(replace(settings, overfit=True, epochs=60, batch=3, rate=0.02), quiet)
     assert best["val/f1"] == 1.0 and best["val/recall@1"] == 1.0
 
 
+@pytest.mark.usefixtures("unexported")
 @pytest.mark.parametrize("kind", ["ntxent", "triplet"])
 def test_other_losses_train(settings, kind):
     settings.loss.kind = kind
     assert np.isfinite(fit(replace(settings, epochs=1), quiet)["train/loss"])
 
 
+@pytest.mark.usefixtures("unexported")
 def test_more_threads_train_the_same_network(settings):
     runs = [replace(settings, epochs=1, name=f"of_{threads}", threads=threads) for threads in (1, 3)]
     losses = [fit(run, quiet)["train/loss"] for run in runs]
@@ -147,6 +156,7 @@ def test_more_threads_train_the_same_network(settings):
     assert losses[0] == losses[1] and weights[0] == weights[1]
 
 
+@pytest.mark.usefixtures("unexported")
 def test_half_precision_trains(settings):
     """Fabric once refused the truth of a batch, so that no run with `precision=bf16-mixed` took a step."""
     assert np.isfinite(fit(replace(settings, epochs=1, precision="bf16-mixed"), quiet)["train/loss"])
@@ -163,12 +173,14 @@ def test_a_run_is_a_folder(settings, tmp_path):
         == replace(settings, name="a", tensorboard=True)
     )
     assert any((tmp_path / "a" / "tb").rglob("events*")) and list((tmp_path / "a" / "tb").rglob("tensors.tsv"))
-    assert load_embedder(tmp_path / "a").about["data"] == "some" and load_embedder(tmp_path / "a" / "last")
+    assert load_embedder(tmp_path / "a").about["data"] == "some" and read_embedder(tmp_path / "a" / "last")
+    with pytest.raises(InputError, match=r"a training that has not ended .*export-embedder"):
+        load_embedder(tmp_path / "a" / "last")
     assert "| a | scalars | gat 1 | near doors | infonce |" in write_table(tmp_path).read_text()
 
 
 def weights(folder: Path) -> bytes:
-    return (folder / "embedder.safetensors").read_bytes()
+    return (folder / ("embedder.onnx" if folder.name == "best" else "embedder.safetensors")).read_bytes()
 
 
 @pytest.mark.longer
@@ -187,6 +199,7 @@ def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch, parts):
     monkeypatch.setattr(EmbeddingJob, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fit(replace(settings, name="cut"), quiet)
+    assert {path.name for path in (tmp_path / "cut" / "best").iterdir()} == {"embedder.json", "embedder.safetensors"}
     state = json.loads((tmp_path / "cut" / "last" / "state.json").read_text())["progress"]
     assert (state["epoch"], state["step"]) == (1, 2)
     monkeypatch.setattr(EmbeddingJob, "step", step)
@@ -200,12 +213,14 @@ def test_resumed_equals_uninterrupted(settings, tmp_path, monkeypatch, parts):
         }
 
 
+@pytest.mark.usefixtures("unexported")
 def test_another_seed_gives_other_weights(settings, tmp_path):
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         fit(replace(settings, name=name, seed=seed, epochs=1), quiet)
     assert weights(tmp_path / "a" / "last") == weights(tmp_path / "b" / "last") != weights(tmp_path / "c" / "last")
 
 
+@pytest.mark.usefixtures("unexported")
 def test_it_stops_early(settings):
     said: list[str] = []
     fit(replace(settings, epochs=30, patience=2, rate=1e-9), said.append)
@@ -223,6 +238,7 @@ def test_geometry_alone_then_frozen(settings, tmp_path):
         fit(replace(settings, freeze="geometry"), quiet)
 
 
+@pytest.mark.usefixtures("unexported")
 def test_bad_states_are_refused(settings, tmp_path):
     with pytest.raises(InputError, match="nothing to resume"):
         fit(replace(settings, resume=True), quiet)
@@ -456,7 +472,7 @@ def short(settings):
 def test_train_py_and_a_sweep(settings, tmp_path):
     common = short(settings)
     done = run([sys.executable, "train.py", *common, "experiment=gat_scalars", "--overfit"])
-    assert done.returncode == 0 and (tmp_path / "gat_scalars" / "best" / "embedder.json").exists(), done.stderr
+    assert done.returncode == 0 and (tmp_path / "gat_scalars" / "best" / "embedder.onnx").exists(), done.stderr
     done = run([sys.executable, "train.py", "-m", *common, "geometry=scalars,pointnet", "node=none,gat"])
     assert done.returncode == 0 and (tmp_path / "sweep" / "table.md").read_text().count("\n") == 6, done.stderr
     names = {path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir()}

@@ -186,6 +186,8 @@ def test_resumed_equals_uninterrupted(task, words, tmp_path, monkeypatch) -> Non
     train(settings_of(words(task, "name=cut", "resume=true")), quiet)
     files = [tmp_path / "runs" / name / "last" / "network.safetensors" for name in ("cut", "whole")]
     assert files[0].read_bytes() == files[1].read_bytes()
+    exported = [tmp_path / "runs" / name / "best" / TASKS[task].file for name in ("cut", "whole")]
+    assert exported[0].read_bytes() == exported[1].read_bytes() and len(list(exported[0].parent.iterdir())) == 2
     with pytest.raises(InputError, match="nothing to resume"):
         train(settings_of(words(task, "name=none", "resume=true")), quiet)
 

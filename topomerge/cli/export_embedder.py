@@ -3,29 +3,37 @@
 from __future__ import annotations
 
 import argparse
+import shutil
+from pathlib import Path
 
 from topomerge.cli.command import Command, option
 from topomerge.cli.console import output_folder, say_line
 from topomerge.cli.options import output, quiet
+from topomerge.embedding.weights import EMBEDDER_FILE, find_state, read_embedder_card
 from topomerge.errors import InputError
+from topomerge.networks.network import card_of
 
 
 def export_embedder_command(args: argparse.Namespace) -> int:
-    """`topomerge export-embedder`: the best embedder of a run, as safetensors and JSON, and as ONNX."""
-    try:
-        from topomerge.models.weights import read_embedder, save_embedder
-    except ModuleNotFoundError as error:
-        raise InputError(f"a learned embedder needs {error.name}: pip install topomerge[learn]") from error
-    network, about = read_embedder(args.run_folder)
-    with output_folder(args.output) as folder:
-        save_embedder(network, folder, about)
-        if args.onnx:
+    """`topomerge export-embedder`: the best embedder of a run, or what an earlier version wrote, as ONNX with its card."""
+    state = find_state(args.run_folder)
+    if state is None:
+        card = read_embedder_card(args.run_folder)
+        with output_folder(args.output) as folder:
+            for file in (card.path, card_of(card.path)):
+                shutil.copyfile(file, folder / file.name.replace(card.path.stem, Path(EMBEDDER_FILE).stem, 1))
+    else:
+        try:
             from topomerge.models.export import export_embedder
-
-            export_embedder(network, folder / "embedder.onnx")
+            from topomerge.models.weights import read_state
+        except ModuleNotFoundError as error:
+            raise InputError(f"weights of torch need {error.name}: pip install topomerge[learn]") from error
+        network, about = read_state(state)
+        with output_folder(args.output) as folder:
+            export_embedder(network, folder, about)
     if not args.quiet:
-        count = sum(p.numel() for p in network.parameters())
-        say_line(f"{count} weights, {network.network.size} numbers a room -> {folder}")
+        card = read_embedder_card(folder)
+        say_line(f"{card.path.stat().st_size} bytes, {card.network.size} numbers a room -> {folder}")
     return 0
 
 
@@ -37,9 +45,8 @@ EXPORT_EMBEDDER = Command(
     (
         option("run_folder", metavar="RUN", help="folder of a run of train.py, or its best/ or last/"),
         output("DIR", "folder for the files"),
-        option("--onnx", action="store_true", default=False, help="also write embedder.onnx, for any number of rooms and doors"),
         quiet(),
     ),
     paths=("run_folder", "output"),
-    description="Write the best embedder of a run as embedder.safetensors and embedder.json; topomerge.load_embedder reads them.",
+    description="Write the best embedder of a run as embedder.onnx and embedder.card.json; topomerge.load_embedder reads them.",
 )

@@ -1,70 +1,51 @@
 """A trained embedder as what `match`, `merge` and the command line take: a callable map -> (R, D), or `TurnedRows` where what a
-room looks like depends on how the map is turned.
-
-Networks that read numbers (of rooms, doors and pairs of doors) and what stands around a room are run with NumPy
-(`embedding.forward`): no torch, which takes seconds to import. Networks that read points need torch.
+room looks like depends on how the map is turned. ONNX Runtime runs it (`topomerge.networks`), whatever it was trained as.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from topomerge.embedding.door_layout import door_layout
-from topomerge.embedding.forward import Forward
 from topomerge.embedding.graph import graph_arrays, resized
-from topomerge.embedding.network import TABLE_PARTS, Network, tensors
+from topomerge.embedding.network import Network, build_embedder_signature, tensors
 from topomerge.embedding.point_features import point_features, point_spectra
 from topomerge.embedding.rooms_around import with_rooms_around
 from topomerge.embedding.schema import POINTS_PER_ROOM
 from topomerge.embedding.sheets import sheet_arrays
 from topomerge.embedding.surroundings import CROP_SHAPES, crops
 from topomerge.embedding.turns import Rows, TurnedRows, aligned, along_walls, edge_ways, quarter_turned, room_facts
-from topomerge.embedding.weights import does_not_fit, embedder_hash, read_weights
-from topomerge.errors import InputError
+from topomerge.embedding.weights import read_embedder_card
+from topomerge.networks.network import Run, open_network
 from topomerge.numpy_nn import softmax
 from topomerge.types import Array, TopometricMap
 
 POINT_TABLES = {"engineered": point_features, "shapedna": point_spectra}  # computed from the points where a network reads them
-Run = Callable[[Mapping[str, Array]], tuple[Array, Array]]
 
 
 def load_embedder(path: str | Path | None = None) -> Learned:
-    """A trained embedder. Neither Hydra nor the training code is needed, and torch only for one that reads points.
+    """A trained embedder. Neither torch, Hydra nor the training code is needed.
 
     Args:
-        path: a run, its `best` or `last`, or what `topomerge export-embedder` wrote; None: the one that ships with the package.
+        path: a run, or what `topomerge export-embedder` wrote; None: the one that ships with the package.
 
     Raises:
-        InputError: no embedder there, or damaged, of another format or class; or it reads points and torch is missing.
+        InputError: no embedder there, or damaged, of another format or class, or trained on other features.
     """
-    if path is None:
-        with resources.as_file(resources.files("topomerge.embedding").joinpath("pretrained")) as folder:
-            return load_embedder(folder)
-    network, weights, about = read_weights(path)
-    if not set(network.geometry.parts) <= {*TABLE_PARTS, *CROP_SHAPES}:
-        try:  # the networks of torch stand above this package
-            embedder: Learned = import_module("topomerge.models.learned").load_with_torch(path)
-        except ModuleNotFoundError as error:
-            raise InputError(f"{path}: reads points, for which it needs {error.name}: pip install topomerge[learn]") from error
-        return embedder
-    try:
-        run = Forward(network, weights)
-        run.check_weights()
-    except (KeyError, ValueError) as error:
-        raise does_not_fit(path, error) from error
-    return Learned(run, network, run.temperature, about, embedder_hash(path))
+    card = read_embedder_card(path)
+    run = open_network(card.path, card.digest, build_embedder_signature(card.network), card.values)
+    return Learned(run, card.network, card.temperature, card.about, card.digest)
 
 
 class Learned:
     """Callable map -> (R, D) float64 of length 1, or `TurnedRows`; the same map gives the same rows.
 
     Args:
-        run: arrays of a graph -> embeddings (R, D), dustbins (R,).
+        run: as of `build_embedder_signature`.
         network: what it is made of.
         temperature: that divides similarities.
         about: on what it was trained, how good it is.
@@ -118,9 +99,10 @@ class Learned:
         if "edge_way" in names:
             inputs["edge_way"] = edge_ways(inputs)
         read = {name: inputs[name] for name in names}
+        computed = [self.run(**(quarter_turned(read, k) if k else read)) for k in range(turns)]
+        rows, bins = ([array.astype(np.float64) for array in arrays] for arrays in zip(*computed, strict=True))
         if turns == 1:
-            return self.run(read)
-        rows, bins = zip(*(self.run(quarter_turned(read, k)) for k in range(turns)), strict=True)
+            return rows[0], bins[0]
         dustbin = np.mean(bins, axis=0)
         facts = room_facts(arrays["x"], dustbin, arrays["pos"][:, 2])
         return TurnedRows(np.stack(rows, axis=1), along_walls(arrays), self.embedder, facts), dustbin

@@ -7,24 +7,17 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from topomerge.embedding.schema import POINTS_PER_ROOM, TABLES
-from topomerge.embedding.surroundings import CROP_PART, CROP_SHAPES, DOOR_PART, WIDE_PART
+from topomerge.embedding.surroundings import CROP_SHAPES
 from topomerge.errors import InputError
 from topomerge.networks.signature import Signature, Tensor
 
 TABLE_PARTS = {"scalars": "x", "engineered": "engineered", "shapedna": "shapedna"}  # part -> table of the graph that it reads
 POINT_PARTS = ("pointnet", "pointnet_local", "voxelcnn")  # these read the points
 GEOMETRY_PARTS = (*TABLE_PARTS, *POINT_PARTS, *CROP_SHAPES)
-CROP_CHANNELS = {  # of the convolutions of crops, each of which halves the sides
-    CROP_PART: (16, 32, 64, 128), WIDE_PART: (16, 32, 64), DOOR_PART: (16, 32, 64),
-}  # fmt: skip
 GRAPH = ("edge_index", "edge_attr")
 LARGEST_WIDTH = 4096  # more is a mistake, or a file that was made to take all memory
 FARTHEST_AROUND = 100.0  # m
-DOOR_KNOTS, DOOR_KNOT_STEP = 24, 0.5  # bumps of the distance between two doors, and m between them
-ROOM_KNOTS = 11  # of that between two rooms, 1 m apart
-WAY_UNIT, WAY_LIMIT = 5.0, 3.0  # m that ways to neighbours are divided by, and how far they tell then
-SCORE_BOUND = 30.0  # of attention
-NODES = ("none", "sage", "gat")
+NODES = ("none", "sage", "gat")  # those that `models.nodes` has layers of
 JUMPS = ("last", "cat", "max")
 
 
@@ -113,7 +106,7 @@ def tensors(network: Network) -> tuple[str, ...]:
 
 
 def build_embedder_signature(network: Network) -> Signature:
-    """Describe an embedder as one call runs it, with all quarter turns where these matter."""
+    """Describe an embedder as one call runs it: on a map as it is turned."""
     counted = {"edge_attr": "edges", "edge_way": "edges", "door_attr": "pairs", "near_attr": "pairs"}
     inputs = {}
     for name in tensors(network):
@@ -128,9 +121,8 @@ def build_embedder_signature(network: Network) -> Signature:
             inputs[name] = Tensor((2, "edges"), "rooms at both ends of each edge", "int64")
         else:
             inputs[name] = Tensor((2, "pairs"), "both edges of each pair of doors", "int64")
-    rows = ("rooms", network.size) if network.turns == 1 else ("rooms", network.turns, network.size)
     outputs = {
-        "embedding": Tensor(rows, "rows of length 1, of the map turned by each of its quarter turns"),
+        "embedding": Tensor(("rooms", network.size), "rows of length 1, of the map as it is turned"),
         "dustbin": Tensor(("rooms",), "logit of having no partner"),
     }
     return Signature("Says what each room of a map looks like, from itself and its neighbours.", inputs, outputs)
@@ -142,14 +134,21 @@ def check(network: Network) -> None:
     Raises:
         InputError: names the key.
     """
+    for part in network.geometry.parts:
+        if not isinstance(part, str) or part not in GEOMETRY_PARTS:
+            raise InputError(f"geometry.parts: unknown {part!r}; {', '.join(GEOMETRY_PARTS)} are possible")
+    if network.node.kind not in NODES:
+        raise InputError(f"node.kind: unknown {network.node.kind!r}; {', '.join(NODES)} are possible")
+    _check_sizes(network)
+
+
+def _check_sizes(network: Network) -> None:
+    """Refuse what no network can have, whatever its encoders are."""
     geometry, node = network.geometry, network.node
     if not geometry.parts or len(set(map(str, geometry.parts))) < len(geometry.parts):
         raise InputError("geometry.parts must be one or more, each once")
-    for part in geometry.parts:
-        if not isinstance(part, str) or part not in GEOMETRY_PARTS:
-            raise InputError(f"geometry.parts: unknown {part!r}; {', '.join(GEOMETRY_PARTS)} are possible")
-    if node.kind not in NODES:
-        raise InputError(f"node.kind: unknown {node.kind!r}; {', '.join(NODES)} are possible")
+    if not all(isinstance(part, str) for part in geometry.parts):
+        raise InputError(f"geometry.parts must be names, not {geometry.parts!r}")
     if node.jump not in JUMPS:
         raise InputError(f"node.jump: unknown {node.jump!r}; {', '.join(JUMPS)} are possible")
     if node.kind != "none" and not 1 <= node.layers <= 4:
@@ -176,8 +175,11 @@ def check(network: Network) -> None:
         raise InputError(f"dropout must be 0 or more and below 1, not {network.dropout}")
 
 
-def network_from(table: Mapping[str, Any]) -> Network:
+def network_from(table: Mapping[str, Any], known: bool = True) -> Network:
     """From what `dataclasses.asdict` gave.
+
+    Args:
+        known: its encoders must be; False: an exported network brings them along.
 
     Raises:
         InputError: an unknown key, a value of another type, or what can't be built.
@@ -187,7 +189,7 @@ def network_from(table: Mapping[str, Any]) -> Network:
         node=_filled(Node, table.get("node", {}), "node."),
         **{k: v for k, v in _values(Network, table, "").items() if k not in ("geometry", "node")},
     )
-    check(network)
+    check(network) if known else _check_sizes(network)
     return network
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from topomerge.datasets.pairs.recipe import Recipe
 from topomerge.embedding.context import CONTEXT_KINDS
 from topomerge.embedding.embedders import EMBEDDERS
-from topomerge.embedding.weights import read_weights
+from topomerge.embedding.weights import EMBEDDER_FILE, PRETRAINED, find_embedder, read_embedder_card
 from topomerge.errors import InputError
 from topomerge.fusion.inputs import POSE_SOURCES
 from topomerge.io.listing import plain
@@ -130,7 +130,7 @@ def check(settings: Evaluation) -> None:
     if not settings.only and not settings.run:
         raise InputError("nothing to evaluate: name descriptors with only=[...], or run=runs/x")
     for run in settings.run:
-        if not Path(run).exists():
+        if run != PRETRAINED and not Path(run).exists():
             raise InputError(f"run={run}: no such folder or file; name a run that was trained")
         if not runs_in(run):
             raise InputError(f"run={run}: no run, and no folder of runs; name a run that was trained")
@@ -156,9 +156,10 @@ def variants(settings: Evaluation) -> Iterator[Variant]:
 def runs_in(run: str) -> list[str]:
     """The run itself, or those in a folder of runs that have a trained embedder, by name."""
     path = Path(run)
-    if path.is_file() or any(path.glob("*.safetensors")) or any(path.glob("best/*.safetensors")):
+    runs = sorted(path.glob(f"*/best/{EMBEDDER_FILE}"))
+    if not runs or (path / EMBEDDER_FILE).exists() or (path / "best" / EMBEDDER_FILE).exists():
         return [run]
-    return [str(best.parent.parent) for best in sorted(path.glob("*/best/*.safetensors"))]
+    return [str(best.parent.parent) for best in runs]
 
 
 def run_name(run: str) -> str:
@@ -176,8 +177,8 @@ def run_title(run: str) -> str:
     Raises:
         InputError: no trained embedder there.
     """
-    network, _, about = read_weights(run)
-    node = network.node
+    card = read_embedder_card(run)
+    network, about, node = card.network, card.about, card.network.node
     features = {
         "bare": not node.edges,
         "paper": not node.edge_values,
@@ -207,19 +208,14 @@ def prediction_settings(settings: Evaluation) -> dict[str, Any]:
         options["poses"] = settings.poses
     if not settings.run:
         options["methods"] = [m for m in settings.methods if m not in LEARNED_METHODS]
-    runs = {v.name: digest_of(Path(v.run)) for v in variants(settings) if v.run}
+    runs = {v.name: digest_of(v.run) for v in variants(settings) if v.run}
     plain_settings: dict[str, Any] = plain({"format": PREDICTIONS_FORMAT, **options, "run": runs})
     return plain_settings
 
 
-def digest_of(path: Path) -> str:
+def digest_of(run: str) -> str:
     """Hash of a trained embedder's weights."""
-    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.suffix == ".safetensors")
-    best = [f for f in files if "best" in f.parts or f.stem == "best"] or files
-    digest = hashlib.sha256()
-    for file in best:
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:16]
+    return hashlib.sha256(find_embedder(run).read_bytes()).hexdigest()[:16]
 
 
 def difference(old: Mapping[str, Any], new: Mapping[str, Any], at: str = "") -> str:

@@ -9,16 +9,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from topomerge.errors import InputError
-from topomerge.types import Array
 
 VARIABLE = "TOPOMERGE_WEIGHTS"
 
@@ -37,29 +33,6 @@ def weights_file(package: str, name: str) -> Path:
 @cache
 def _packaged(package: str, name: str) -> Path:
     return Path(str(resources.files(package).joinpath(name)))
-
-
-def read_layers(path: Path, what: str, taps: Mapping[str, int]) -> dict[str, Array]:
-    """Layers of a network as float32: of each name a matrix ``<name>.w`` and ``<name>.b``.
-
-    Args:
-        what: network it should be, for messages.
-        taps: layer -> what the number of rows of its matrix is a multiple of.
-
-    Raises:
-        InputError: another file, a damaged one, or one without these layers.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            layers = {name: file[name].astype(np.float32) for name in file.files}
-    except Exception as error:  # zip, header and data each have their own errors
-        raise InputError(f"{path}: is no network of {what} ({error}); install topomerge again") from error
-    for name, rows in taps.items():
-        w, b = layers.get(f"{name}.w"), layers.get(f"{name}.b")
-        fits = w is not None and b is not None and w.ndim == 2 and not w.shape[0] % rows and b.shape == w.shape[1:]
-        if not fits or not np.isfinite(layers[f"{name}.w"]).all() or not np.isfinite(layers[f"{name}.b"]).all():
-            raise InputError(f"{path}: is no network of {what} (layer {name}); install topomerge again")
-    return layers
 
 
 def read_weights_json(package: str, name: str) -> dict[str, Any]:

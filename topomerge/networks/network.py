@@ -17,6 +17,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from topomerge.errors import InputError, is_memory_short
+from topomerge.io.atomic import replacing
+from topomerge.io.listing import plain
 from topomerge.io.weight_files import weights_file
 from topomerge.networks.signature import Signature
 from topomerge.types import Array
@@ -45,6 +47,10 @@ class Network:
 
     def __init__(self, session: Any, signature: Signature, path: Path, card: Mapping[str, Any]) -> None:
         self.session, self.signature, self.path, self.card = session, signature, path, card
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Sent to another process as its file, which is opened there."""
+        return open_network, (self.path, str(self.card.get("sha256")), self.signature, self.card)
 
     def __call__(self, outputs: Sequence[str] | None = None, /, **inputs: Array) -> list[Array]:
         """Compute the outputs; of those that are not named, only what the others need.
@@ -82,13 +88,18 @@ def load_shipped_network(name: str, signature: Signature) -> Network:
     return load_network(weights_file(WEIGHTS_PACKAGE, name), signature)
 
 
+def card_of(path: Path) -> Path:
+    """The card beside a file of weights."""
+    return path.with_name(f"{path.stem}{CARD}")
+
+
 def read_card(path: Path) -> dict[str, Any]:
     """Read the card of a file of weights.
 
     Raises:
         InputError: there is none, or it is damaged.
     """
-    card = path.with_name(f"{path.stem}{CARD}")
+    card = card_of(path)
     try:
         values = json.loads(card.read_text(encoding="utf-8"))
     except OSError as error:
@@ -98,6 +109,15 @@ def read_card(path: Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise InputError(f"{card}: is no card of a network; copy both files again")
     return values
+
+
+def write_card(path: Path, values: Mapping[str, Any]) -> Path:
+    """Write the card of a file of weights beside it, with its digest; the same values give the same bytes."""
+    card = card_of(path)
+    known = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    with replacing(card) as beside:
+        beside.write_text(json.dumps(plain({**values, **known}), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    return card
 
 
 def open_network(path: Path, digest: str, signature: Signature, card: Mapping[str, Any]) -> Network:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
@@ -16,10 +17,13 @@ from typing import Any
 import torch
 
 from topomerge.checkpoint import load_state
+from topomerge.embedding.weights import STATE_FILE, STATE_SETTINGS
 from topomerge.errors import InputError
 from topomerge.models.embedder import Embedder
+from topomerge.models.export import check_exporter, export_embedder
 from topomerge.models.losses import Objective
-from topomerge.models.weights import read_embedder, save_embedder
+from topomerge.models.weights import read_embedder, read_state, save_state
+from topomerge.networks.network import WEIGHTS_PACKAGE
 from topomerge.training.batches import ChangedPairs, MapPair
 from topomerge.training.device_batches import DevicePairs, supports_device_batches
 from topomerge.training.embedding_pictures import show_embedder
@@ -49,6 +53,7 @@ def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr,
     if settings.overfit:
         settings = replace(settings, watch="f1", patience=0)
     check(settings)
+    check_exporter()
     check_start(settings)  # before other processes, if any, have come so far
     fabric = start_fabric(settings)
     chief = fabric.is_global_zero
@@ -71,7 +76,7 @@ def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr,
     schedule = Schedule(settings.folder, settings.epochs, job.steps, settings.watch, settings.patience, perfect)
     best = Loop(job, schedule, state, log, say).run()
     if settings.export and chief:
-        export_files(settings.folder / "best", settings.export, "topomerge.embedding.pretrained")
+        export_files(settings.folder / "best", settings.export, WEIGHTS_PACKAGE)
     return best
 
 
@@ -177,12 +182,21 @@ class EmbeddingJob:
         return optimizer
 
     def write_network(self, folder: Path) -> None:
-        """The embedder's two files."""
-        save_embedder(self.network, folder, about(self.settings, {}))
+        """The embedder's state."""
+        save_state(self.network, folder, about(self.settings, {}))
+
+    def export_best(self, folder: Path) -> None:
+        """Export the best embedder, in the place of its state."""
+        if (folder / STATE_SETTINGS).exists():
+            network, origin = read_state(folder)
+            export_embedder(network, folder, origin)
+            for name in (STATE_FILE, STATE_SETTINGS):
+                (folder / name).unlink()
 
     def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
-        """The embedder's two files, and pictures of what it does."""
-        save_embedder(self.network, folder, about(self.settings, row))
+        """The embedder's state, and pictures of what it does; what was exported of an earlier one goes."""
+        shutil.rmtree(folder, ignore_errors=True)
+        save_state(self.network, folder, about(self.settings, row))
         show_embedder(log.board, self.network, self.watched, row["epoch"], row["val/least"], self.fabric.device)
 
     def line(self, row: Mapping[str, Any]) -> str:

@@ -91,7 +91,10 @@ class Job(Protocol):
         """Write the network's files of `last/`."""
 
     def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
-        """Write what is exported into `best/`."""
+        """Write the best network so far into `best/`."""
+
+    def export_best(self, folder: Path) -> None:
+        """Make of `best/` what the package reads, once at the end of a run."""
 
     def line(self, row: Mapping[str, Any]) -> str:
         """What an epoch's line says of the scores."""
@@ -140,6 +143,7 @@ class Loop:
             )
         if self.log is not None:
             self.log.close()
+            self.job.export_best(schedule.folder / "best")
         return {name: value for name, value in best.items() if isinstance(value, float)}
 
     def _enough(self) -> bool:

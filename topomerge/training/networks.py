@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -10,8 +12,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from topomerge.checkpoint import NETWORK_FILE, load_state, write_network
-from topomerge.models.export import export_network, run_with_torch
+from topomerge.checkpoint import NETWORK_FILE, load_state, read_network, write_network
+from topomerge.models.export import check_exporter, export_network, run_with_torch
 from topomerge.networks.network import Run
 from topomerge.networks.signature import Signature
 from topomerge.training.log import Log
@@ -19,6 +21,8 @@ from topomerge.training.loop import Job, Loop, Say, Schedule, State, descend_gra
 from topomerge.training.run_folder import begin_run, export_files, write_card
 from topomerge.training.shared_settings import NetworkTask
 from topomerge.training.tasks import TASKS, check_accelerator
+
+METRICS_FILE = "metrics.json"  # of the best network, beside its weights while the run goes on
 
 
 class Exported(NamedTuple):
@@ -73,12 +77,24 @@ class NetworkJob(ABC):
         return {}
 
     def write_best(self, folder: Path, row: Mapping[str, Any], log: Log) -> None:
-        """The file of weights and its card."""
-        folder.mkdir(parents=True, exist_ok=True)
+        """The weights as torch has them, and their scores; what was exported of earlier ones goes."""
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        metrics = {k: v for k, v in row.items() if k.startswith("val/")}
+        (folder / METRICS_FILE).write_text(json.dumps(metrics) + "\n", encoding="utf-8")
+        write_network(self.network, folder)
+
+    def export_best(self, folder: Path) -> None:
+        """Write the file of weights and its card, in the place of what `write_best` wrote."""
+        if not (folder / NETWORK_FILE).exists():
+            return
+        read_network(self.network, folder)
         path = folder / TASKS[self.settings.task].file
         self.write_weights(path)
-        metrics = {k: v for k, v in row.items() if k.startswith("val/")}
+        metrics = json.loads((folder / METRICS_FILE).read_text(encoding="utf-8"))
         write_card(path, asdict(self.settings), self.origin, metrics, self.interface())
+        for name in (NETWORK_FILE, METRICS_FILE):
+            (folder / name).unlink()
 
     def line(self, row: Mapping[str, Any]) -> str:
         """The score that is watched."""
@@ -123,6 +139,7 @@ def run_network(job: Job, settings: NetworkTask, steps: int, say: Say) -> dict[s
     Returns:
         The row of the best epoch.
     """
+    check_exporter()
     state = State()
     if settings.resume:
         state = State(**load_state(settings.folder / "last", job.network, job.optimizer_state(), NETWORK_FILE))

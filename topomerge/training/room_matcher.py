@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from topomerge.embedding.turns import QUARTERS, TurnedRows, along_walls, room_facts
-from topomerge.embedding.weights import embedder_hash
+from topomerge.embedding.weights import read_embedder_card
 from topomerge.errors import InputError
 from topomerge.matching.room_matcher import Matcher, RoomsSeen, build_signature, every_turn, read_matcher, rooms_seen
 from topomerge.matching.scores import assign_certain, has_twin, pair_counts, partner_ranks
@@ -244,14 +244,10 @@ def shipped_embedder() -> tuple[Embedder, str]:
     Raises:
         InputError: it has no rows for turns.
     """
-    import topomerge
-
-    folder = Path(topomerge.__path__[0]) / "embedding" / "pretrained"
-    network, _ = read_embedder(folder)
+    network, _ = read_embedder()
     if network.network.turns == 1:
         raise InputError("task=room_matcher: the embedder that ships tells no turns apart; train experiment=surroundings")
-    network.eval()
-    return network, embedder_hash(folder)
+    return network, read_embedder_card().digest
 
 
 def read_examples(settings: RoomMatching, name: str, network: Embedder, number: int, say: Say) -> list[Example]:

@@ -9,7 +9,6 @@ last/                        `topomerge.checkpoint`, of networks
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Mapping
@@ -21,8 +20,7 @@ from typing import Any
 import topomerge
 from topomerge.errors import InputError
 from topomerge.io.atomic import replacing
-from topomerge.io.listing import plain
-from topomerge.networks.network import CARD
+from topomerge.networks import network as networks
 from topomerge.training.provenance import RUN_FILE, describe_data, describe_provenance, record_start
 
 PACKAGE = "package"  # export: into the package itself
@@ -77,9 +75,7 @@ def write_card(
     command = f"python train.py task={settings['task']} {' '.join(keys)} export=package".replace("  ", " ")
     card = {
         **(interface or {}),
-        "file": file.name,
         "task": settings["task"],
-        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
         "version": topomerge.__version__,
         "command": command,
         "settings": settings,
@@ -87,10 +83,7 @@ def write_card(
         "provenance": describe_provenance(file.parent.parent),
         "metrics": {k: round(v, 5) if isinstance(v, float) else v for k, v in metrics.items()},
     }
-    path = file.with_name(f"{file.stem}{CARD}")
-    with replacing(path) as beside:
-        beside.write_text(json.dumps(plain(card), indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    return path
+    return networks.write_card(file, card)
 
 
 def export_files(best: Path, target: str, package: str) -> list[Path]:

@@ -55,7 +55,7 @@ TASKS = {
     "place_evidence": Task("place_evidence", "PlaceEvidence", "topomerge.networks", "place_network.onnx", 4.0),
     "match_belief": Task("match_belief", "MatchBelief", "topomerge.fusion", "match_belief.json", 0.3),
     "merge_belief": Task("merge_belief", "MergeBelief", "topomerge.registration", "calibration.json", 4.0),
-    "embedding": Task("embedding", "", "topomerge.embedding.pretrained", "embedder.safetensors", 0.6),
+    "embedding": Task("embedding", "", "topomerge.networks", "embedder.onnx", 0.6),
     "room_matcher": Task("room_matcher", "RoomMatching", "topomerge.networks", "room_matcher.onnx", 0.3),
 }
 RANKINGS = tuple(f"recall@{k}{of}" for k in (1, 5) for of in ("", "_single", "_twin"))

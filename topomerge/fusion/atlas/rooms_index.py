@@ -20,6 +20,7 @@ import numpy as np
 from topomerge.embedding.embedders import DEFAULT
 from topomerge.embedding.room_cells import Descriptor
 from topomerge.embedding.turns import Rows, TurnedRows, numbers
+from topomerge.embedding.weights import read_embedder_card
 from topomerge.errors import InputError
 from topomerge.fusion.atlas.folder import Entry, Stored
 from topomerge.fusion.atlas.partners import ROOM_NEIGHBOURS, owners, vectors
@@ -203,17 +204,9 @@ def signed(signature: str) -> Array:
 
 def embedder_signature(name: str) -> str:
     """What tells rows of one embedder from those of another."""
-    from topomerge.embedding.weights import SETTINGS_FILE, embedder_folder
-
-    if name == DEFAULT:
-        from importlib import resources
-
-        settings = resources.files("topomerge.embedding").joinpath("pretrained", SETTINGS_FILE).read_bytes()
-    elif Path(name).is_dir():
-        settings = (embedder_folder(name) / SETTINGS_FILE).read_bytes()
-    else:
-        settings = name.encode()
-    return hashlib.sha256(settings).hexdigest()
+    if name == DEFAULT or Path(name).is_dir():
+        return read_embedder_card(None if name == DEFAULT else name).digest
+    return hashlib.sha256(name.encode()).hexdigest()
 
 
 @dataclass(eq=False)
