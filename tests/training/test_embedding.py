@@ -340,7 +340,7 @@ def test_a_gradient_that_is_no_number_ends_the_run_in_one_line(settings, tmp_pat
     with pytest.raises(InputError, match="step 2 of epoch 2: a loss or gradient is no finite number") as refused:
         fit(settings, quiet)
     assert "\n" not in str(refused.value)
-    assert load_embedder(tmp_path / "run" / "last")  # that of the first epoch, which can be read
+    assert read_embedder(tmp_path / "run" / "last")  # that of the first epoch, which can be read
 
 
 @pytest.mark.parametrize("fused", [False, True])
