@@ -28,7 +28,7 @@ from topomerge.training.log import Log
 from topomerge.training.loop import Loop, Schedule, State, made_by_threads, mixed, pace
 from topomerge.training.packed import EXTRAS, GraphPair, load_pairs
 from topomerge.training.run_folder import export_files, write_settings
-from topomerge.training.settings import Augment, Training, check, to_dict
+from topomerge.training.settings import VALIDATION, Augment, Training, check, to_dict
 from topomerge.training.validate import validate
 
 Say = Callable[[str], None]
@@ -50,6 +50,7 @@ def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr,
     fabric = start_fabric(settings)
     chief = fabric.is_global_zero
     say = say if chief else lambda text: None
+    settings = with_own_pairs(settings, say, fabric)
     train, watched = _data(settings, say, fabric)
     network = _network(settings, train)
     trained = [p for p in network.parameters() if p.requires_grad]
@@ -191,6 +192,22 @@ def start_fabric(settings: Training) -> Any:
     )  # fmt: skip
     fabric.launch()
     return fabric
+
+
+def with_own_pairs(settings: Training, say: Say, fabric: Any) -> Training:
+    """Name the sets of a folder of one's own captures, made by one process while the others wait.
+
+    Raises:
+        InputError: whatever is wrong with the folder.
+    """
+    if not settings.path:
+        return settings
+    from topomerge.datasets.pairs.own_pairs import build_own_sets
+
+    with fabric.rank_zero_first():
+        manifests = build_own_sets(settings.path, settings.cache, say=say).manifests
+    watched = str(manifests["val"]) if settings.validation == VALIDATION else settings.validation
+    return replace(settings, data=str(manifests["train"]), validation=watched)
 
 
 def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], list[GraphPair]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from topomerge.datasets.pairs.own_pairs import check_own_path
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import WALL_CLASSES
 from topomerge.training.scan_settings import PlanSegmentation, WallSegmentation
@@ -39,6 +40,7 @@ def check_task(settings: TaskSettings) -> None:
         raise InputError(f"accelerator must be cpu or cuda, not {settings.accelerator!r}")  # type: ignore[attr-defined]
     if len(getattr(settings, "halves", [])) not in (0, 2):
         raise InputError(f"halves must name two runs, not {settings.halves}")  # type: ignore[attr-defined]
+    check_own_path(settings.data.name if hasattr(settings, "path") else "", getattr(settings, "path", ""))
     if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
         raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
     if isinstance(settings, PlanSegmentation):
