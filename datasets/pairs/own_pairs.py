@@ -281,27 +281,22 @@ def _drawn(buildings: Sequence[str], listing: PairsFile) -> dict[str, str]:
 
 
 def _captures_held_out(listing: PairsFile, pairs: Sequence[PairTruth]) -> dict[str, str]:
-    """Part of each capture of one building, so that every part has a pair.
+    """Part of each capture of one building, so that every part has a pair; of few captures none are watched.
 
     Raises:
         InputError: there are too few.
     """
     names = sorted({name for pair in pairs for name in (pair.a, pair.b)})
-    part_of: dict[str, str] = {}
-    for attempt in range(ATTEMPTS):
+    watched, tested = (max(round(share * len(names)), 1) for share in listing.split.shares[1:])
+    for number, attempt in itertools.product(sorted({watched, 0}, reverse=True), range(ATTEMPTS)):
         order = sorted(names, key=lambda name: _hash([listing.split.seed, attempt, name]))
-        counts = [max(round(share * len(order)), 1) for share in listing.split.shares[1:]]
-        counts[0] = counts[0] if len(order) > 3 else 0
-        drawn = dict.fromkeys(order, "train") | dict.fromkeys(order[: counts[1]], "test")
-        drawn |= dict.fromkeys(order[counts[1] : sum(counts)], "val")
+        drawn = dict.fromkeys(order, "train") | dict.fromkeys(order[:tested], "test")
+        drawn |= dict.fromkeys(order[tested : tested + number], "val")
         found = {max((drawn[pair.a], drawn[pair.b]), key=PARTS.index) for pair in pairs}
-        if found >= set(drawn.values()) and "train" in found:
-            part_of = drawn
-            break
-    if not part_of:
-        said = f"its {len(pairs)} pair{'s are' if len(pairs) > 1 else ' is'} of one building, and no capture can be held out"
-        raise InputError(f"{listing.path}: {said}; add captures of it, or of another building")
-    return {name: part_of.get(name, "train") for name in listing.captures}
+        if found >= set(drawn.values()) | {"train"}:
+            return {name: drawn.get(name, "train") for name in listing.captures}
+    said = f"of its {len(names)} captures, all of one building, none can be held out"
+    raise InputError(f"{listing.path}: {said}; add captures of it, or of another building")
 
 
 def _negatives(

@@ -16,7 +16,7 @@ from topomerge.types import Array, Sim3, TopometricMap, between_maps
 
 LEAST_COMMON = 1.0  # m2 that both captures of a pair see
 MOST_TILT = 3.0  # degrees by which a transform may tip a map over
-AGREEING_ROOMS = 0.5  # share of the rooms in `rooms` that one pose must lay over each other
+AGREEING_ROOMS = 0.6  # share of the rooms in `rooms` that one pose must lay over each other
 NO_OVERLAP = "share no floor"
 
 
