@@ -52,6 +52,8 @@ OWN_SOURCE, OWN_FOLDER = "own", "own"  # source of the pairs; folder of the cach
 LONGEST_CAPTURE, LONGEST_OWN_PAIR = 7200.0, 600.0  # s
 TWIN_COLUMNS = (0, 3, 4)  # area, length, width of a room in its graph's `x`
 NAMING = (".yaml", ".yml", ".gltf")  # files that name others
+CAPTURE_FORMAT = 1  # of the files of captures: raise it when `make_capture` writes others
+CAPTURE_CODE = tuple(f"topomerge.{name}" for name in ("io.points", "extraction.extract", "embedding.graph", "embedding.sheets"))
 ATTEMPTS = 100  # draws of captures into parts
 
 
@@ -166,7 +168,7 @@ def extract_captures(
         Item of each capture by its name; and what is wrong with those that have no map.
     """
     folder = Path(cache).resolve() / OWN_FOLDER / "captures"
-    code = code_digest(__name__)
+    code = f"{CAPTURE_FORMAT} {code_digest(*CAPTURE_CODE)}"
     items: dict[str, CaptureItem] = {}
     tasks = []
     for capture in listing.captures.values():

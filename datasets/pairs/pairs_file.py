@@ -40,6 +40,8 @@ PAIR_KEYS = ("a", "b", "transform", "rooms", "different")
 POSE_KEYS = ("x", "y", "z", "yaw_deg", "scale")
 NO_ROTATION = 1e-3  # by which the entries of a rotation that was written down may be off
 SCALES = (0.01, 100.0)
+MOST_ROOMS = 1_000_000  # of a map
+LONGEST_TEXT = 1000  # letters of a name or path
 
 
 @dataclass(frozen=True)
@@ -182,12 +184,16 @@ def _capture(entry: Any, where: str, folder: Path) -> Capture:
         raise InputError(f"{where}: names no file; give file: and its path from {folder}")
     texts = {key: _text(entry.get(key, ""), f"{where}.{key}") for key in CAPTURE_KEYS[:-1]}
     path = folder / texts["file"]
-    if not path.exists():
+    try:
+        found, above = path.exists(), path.parent.resolve()
+    except (OSError, RuntimeError) as error:  # a name that is too long, links in a circle
+        raise InputError(f"{where}: {path}: can't be read ({error}); correct its path") from error
+    if not found:
         raise InputError(f"{where}: {path}: no such file; correct its path")
-    above = path.parent.resolve()
     read = dict(_table(entry.get("read", {}), f"{where}.read", OPTION_NAMES))
-    if read.get("poses") and (folder / str(read["poses"])).exists():  # else it names what a bag holds
-        read["poses"] = str(folder / str(read["poses"]))
+    if read.get("poses"):
+        poses = folder / _text(read["poses"], f"{where}.read.poses")
+        read["poses"] = str(poses) if poses.name and poses.is_file() else read["poses"]  # else it names what a bag holds
     texts["building"] = texts["building"] or (folder.resolve() if above == folder.resolve() else above).name
     texts["name"] = texts["name"] or path.stem
     del texts["file"]
@@ -209,7 +215,7 @@ def _pair(row: Any, where: str, captures: Mapping[str, Capture]) -> PairTruth:
         raise InputError(f"{where}: {said}; give one of {', '.join(PAIR_KEYS[2:])}, or both captures the same frame")
     if given and given[0] == "different":
         if row["different"] is not True:
-            raise InputError(f"{where}.different: must be true, not {row['different']!r}; else leave it out")
+            raise InputError(f"{where}.different: must be true, not {_shown(row['different'])}; else leave it out")
         return PairTruth(a, b, different=True)
     if captures[a].building != captures[b].building:
         said = f"{a} is of building {captures[a].building!r}, {b} of {captures[b].building!r}"
@@ -222,9 +228,9 @@ def _pair(row: Any, where: str, captures: Mapping[str, Capture]) -> PairTruth:
 def _rooms(value: Any, where: str) -> tuple[tuple[int, int], ...]:
     rows = _list(value, where)
     for row in rows:
-        proper = isinstance(row, list) and len(row) == 2 and all(type(room) is int and room >= 0 for room in row)
+        proper = isinstance(row, list) and len(row) == 2 and all(type(room) is int and 0 <= room < MOST_ROOMS for room in row)
         if not proper:
-            raise InputError(f"{where}: {row!r} is no pair of rooms; give [room of a, room of b], counted from 0")
+            raise InputError(f"{where}: {_shown(row)} is no pair of rooms; give [room of a, room of b], counted from 0")
     if not rows:
         raise InputError(f"{where}: lists no rooms; give [room of a, room of b]")
     return tuple(sorted({(row[0], row[1]) for row in rows}))
@@ -247,7 +253,7 @@ def _split(value: Any, where: str, buildings: set[str]) -> Split:
     entries = _table(value, where, (*PARTS, "seed"))
     seed = entries.get("seed", 0)
     if type(seed) is not int or seed < 0:
-        raise InputError(f"{where}.seed: must be a whole number, 0 or more, not {seed!r}")
+        raise InputError(f"{where}.seed: must be a whole number, 0 or more, not {_shown(seed)}")
     given = {part: entries[part] for part in PARTS if part in entries}
     if not given:
         return Split(seed=seed)
@@ -274,7 +280,7 @@ def _table(value: Any, where: str, keys: Sequence[str]) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise InputError(f"{where}: must be a table of {', '.join(keys)}, not {type(value).__name__}")
     if unknown := next((key for key in value if key not in keys), None):
-        raise InputError(f"{where}: unknown key {unknown!r}; {', '.join(keys)} are possible")
+        raise InputError(f"{where}: unknown key {_shown(unknown)}; {', '.join(keys)} are possible")
     return value
 
 
@@ -288,13 +294,27 @@ def _list(value: Any, where: str) -> list[Any]:
 
 def _text(value: Any, where: str) -> str:
     if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise InputError(f"{where}: must be a text, not {value!r}")
-    return str(value).strip()
+        raise InputError(f"{where}: must be a text, not {_shown(value)}")
+    text = str(value).strip()
+    if not text.isprintable() or len(text) > LONGEST_TEXT:
+        raise InputError(f"{where}: must be one line of at most {LONGEST_TEXT} letters, not {_shown(text)}")
+    return text
 
 
 def _number(value: Any, where: str, least: float = -1e9, most: float = 1e9) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: must be a number, not {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or (isinstance(value, float) and not math.isfinite(value)):
+        raise InputError(f"{where}: must be a number, not {_shown(value)}")
     if not least <= value <= most:
-        raise InputError(f"{where}: must be {least:g} to {most:g}, not {value:g}")
+        raise InputError(f"{where}: must be {least:g} to {most:g}, not {_shown(value)}")
     return float(value)
+
+
+def _shown(value: Any) -> str:
+    """A short text of a value of a stranger's file, which may be huge."""
+    if isinstance(value, list) and len(value) <= 4 and not any(isinstance(v, list | Mapping) for v in value):
+        return f"[{', '.join(_shown(v) for v in value)}]"
+    if value is None or isinstance(value, bool | float):
+        return repr(value)
+    if isinstance(value, int):
+        return repr(value) if abs(value) < 10**30 else "a huge number"
+    return repr(value[:60]) if isinstance(value, str) else f"a {type(value).__name__}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from topomerge.datasets.pairs import own_pairs
 from topomerge.datasets.pairs.evaluation_pair import load_set
 from topomerge.datasets.pairs.own_pairs import build_own_sets, extract_captures, split_pairs
 from topomerge.datasets.pairs.own_truth import find_overlap
-from topomerge.datasets.pairs.pairs_file import PARTS, PairTruth, read_pairs_file, read_transform
+from topomerge.datasets.pairs.pairs_file import CAPTURE_KEYS, KEYS, PARTS, PairTruth, read_pairs_file, read_transform
 from topomerge.datasets.pairs.simulate import save_cloud
 
 import topomerge
@@ -37,6 +38,7 @@ from topomerge.types import TopometricMap, TrueRoom
 
 SHIFT = (7.0, -3.0, 1.5)
 HOUSES = (3, 4, 5)
+ROOT = Path(__file__).parent.parent.parent.parent
 
 
 def quiet(text: str) -> None:
@@ -180,6 +182,10 @@ PAIR = {"a": "one", "b": "two", "transform": {"x": 1}}
         ({"captures": [ONE, TWO], "pairs": [PAIR], "split": {"seed": "x"}}, "seed: must be a whole number"),
         ({"captures": [{**ONE, "read": {"colour": 1}}, TWO], "pairs": [PAIR]}, "read: unknown key 'colour'"),
         ({"captures": [ONE, TWO], "pairs": [PAIR], "voxel_size": NAN}, "voxel_size: must be a number"),
+        ({"captures": [ONE, TWO], "pairs": [PAIR], "voxel_size": 10**400}, "voxel_size: must be 0.02 to 1, not a huge number"),
+        ({"captures": [{**ONE, "building": "a\nb"}, TWO], "pairs": [PAIR]}, "building: must be one line"),
+        ({"captures": [{"file": "x" * 400}]}, "captures.0.: .*(can't be read|no such file)"),
+        ({"captures": [ONE, TWO], "pairs": [{"a": "one", "b": "two", "rooms": [[0, 10**30]]}]}, "is no pair of rooms"),
     ],
 )
 def test_a_file_that_cannot_be_used(maps_folder: Path, values: Mapping[str, Any], said: str) -> None:
@@ -187,6 +193,23 @@ def test_a_file_that_cannot_be_used(maps_folder: Path, values: Mapping[str, Any]
     with pytest.raises(InputError, match=said) as raised:
         read_pairs_file(maps_folder)
     assert str(maps_folder / "pairs.yaml") in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_the_documented_file_is_taken(tmp_path: Path) -> None:
+    text = re.findall(r"(?ms)^```yaml\n(captures.*?)^```$", (ROOT / "docs" / "training.md").read_text())[0]
+    (tmp_path / "pairs.yaml").write_text(text)
+    for entry in yaml.safe_load(text)["captures"]:
+        (tmp_path / entry["file"]).parent.mkdir(exist_ok=True)
+        (tmp_path / entry["file"]).touch()
+    listing = read_pairs_file(tmp_path)
+    assert set(yaml.safe_load(text)) == set(KEYS)
+    assert {key for entry in yaml.safe_load(text)["captures"] for key in entry} == set(CAPTURE_KEYS)
+    assert [(p.a, p.b, p.listed) for p in listing.pairs] == [
+        *(("a", "b", True), ("d", "e", True), ("a", "c", True), ("c", "d", True)),
+        ("b", "c", False),
+    ]
+    assert listing.captures["a"].building == "home" and listing.captures["d"].building == "office"
+    assert listing.captures["c"].read == {"resolution": 0.05} and listing.captures["b"].sensor == "lidar"
 
 
 def test_an_empty_folder_and_a_file_that_is_no_yaml(tmp_path: Path) -> None:
