@@ -57,7 +57,7 @@ CAPTURE_CODE = tuple(f"topomerge.{name}" for name in ("io.points", "extraction.e
 ATTEMPTS = 100  # draws of captures into parts
 
 
-@dataclass(frozen=True)
+@dataclass
 class OwnSharing:
     """Where and by how many processes sets are made (`core.builder.Sharing`)."""
 
@@ -317,7 +317,7 @@ def _negatives(
     ]
     number = min(int(np.ceil(listing.negatives * len(positives))), len(choices))
     order = np.random.default_rng([listing.split.seed, PARTS.index(part)]).permutation(len(choices))[:number]
-    return [PairTruth(*choices[k], different=True, listed=False) for k in sorted(order.tolist())]
+    return [PairTruth(a, b, different=True, listed=False) for a, b in (choices[k] for k in sorted(order.tolist()))]
 
 
 def _pair_item(listing: PairsFile, items: Mapping[str, CaptureItem], pair: PairTruth) -> OwnPairItem:

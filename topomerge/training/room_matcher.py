@@ -253,8 +253,8 @@ def with_own_sets(settings: RoomMatching, say: Say) -> RoomMatching:
 
     manifests = build_own_sets(settings.path, settings.cache, settings.jobs, say).manifests
     train, val, test = (str(manifests[part]) for part in PARTS)
-    own = {"data": replace(settings.data, name=train), "heldout": replace(settings.heldout, name=test)}
-    return replace(settings, validation=val, **own)
+    data, heldout = replace(settings.data, name=train), replace(settings.heldout, name=test)
+    return replace(settings, data=data, heldout=heldout, validation=val)
 
 
 def shipped_embedder() -> tuple[Embedder, str]:

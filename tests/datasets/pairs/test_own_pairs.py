@@ -414,6 +414,8 @@ def test_a_path_needs_its_data_and_data_its_path(houses: Path) -> None:
             settings_of([f"task={task}", "data=folder"])
         with pytest.raises(InputError, match="is of data=folder, not of data=train_small"):
             settings_of([f"task={task}", "data=train_small", f"path={houses}"])
+    with pytest.raises(InputError, match="data=folder: is for the tasks embedding and room_matcher"):
+        settings_of(["task=match_odds", "data=folder"])
     settings = Evaluation(descriptors={"engineered": {"name": "engineered"}}, only=["engineered"])
     settings.data.name = "folder"
     with pytest.raises(InputError, match="data=folder needs path="):
