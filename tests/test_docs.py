@@ -21,7 +21,7 @@ from topomerge.cli.main import COMMANDS, EXIT_STATUSES
 from topomerge.cli.main import main as cli
 
 QUICK = ("cli.md",)  # pages whose examples need no scans; those of all others are slow
-LONGER = ("extend.md",)  # run by every change all the same
+LONGER = ("extend.md", "training.md")  # run by every change all the same
 NEW = r"\*\*One (?:file|YAML)\*\*, `([^`]+)`"  # what a reader of extend.md adds
 
 
@@ -32,7 +32,7 @@ def mark_of(page: Path) -> list[pytest.MarkDecorator]:
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the examples find in their folder: two scans of an office, and a walk through a house as a SLAM system leaves it."""
+    """What the examples find in their folder: two scans of an office, a house walk as of SLAM, and the scripts."""
     folder = tmp_path_factory.mktemp("workshop")
     small = ["--building", "office", "--seed", "5", "--rooms", "8", "--overlap", "0.7", "--quiet"]
     assert cli(["simulate", *small, "-o", str(folder / "pair")]) == 0
@@ -41,6 +41,8 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.rmtree(folder / "pair")
     write_scans(folder / "walk", house_walk())
     write_kitti(folder / "walk" / "poses.txt", house_walk().poses)
+    for script in ("train.py", "evaluate.py"):
+        shutil.copy(ROOT / script, folder)
     return folder
 
 

@@ -37,6 +37,8 @@ def physical_building(source: str, name: str) -> str:
     """
     name = name.split(" + ")[0]
     source = source.removesuffix("-plan")
+    if source == "own":  # its name is what its owner calls it
+        return f"own/{name}"
     if source in OF_ONE_PLACE:
         return OF_ONE_PLACE[source]
     if source == "procedural":  # kind-seed-storeys; kinds may have hyphens

@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import shapely
@@ -32,6 +32,14 @@ UNDER_FLOOR = 0.15  # m: what is that far below a floor is the ceiling of the st
 STOREY_APART = 1.0  # m between two storeys, at least
 FEWEST_COLUMNS = 50  # columns: maps that share fewer have no middle of what both saw
 LAID_IOU = 0.4  # IoU from which rooms that lie over each other are one
+
+
+class HasTruth(Protocol):
+    """What has a true transform, or None."""
+
+    @property
+    def truth(self) -> Sim3 | None:
+        """T_ab, maps b into a."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +198,7 @@ def _columns(map: TopometricMap, into: Sim3, floors: Array) -> Array:
     return np.unique(rows[:, 0] * 2**40 + (rows[:, 1] + 2**18) * 2**20 + rows[:, 2] + 2**18)
 
 
-def anchor(pair: Pair, maps: Sequence[TopometricMap]) -> Array:
+def anchor(pair: HasTruth, maps: Sequence[TopometricMap]) -> Array:
     """(3,) middle of the cells of b that a has seen, too; of all where these are hardly any."""
     cells = maps[1].grid.centroids()
     if pair.truth is not None:

@@ -20,6 +20,19 @@ from topomerge.errors import InputError
 MOST_TAKEN = 5_000_000  # points that are taken of a file; the rest of a large surface is no danger, as it comes in portions
 
 
+OWN_PAIRS = """\
+captures:
+  - {file: pairs.yaml, building: home, storey: 1, frame: survey, sensor: tls}
+  - {name: b, file: pairs.yaml, building: home, frame: survey, read: {up: y}}
+  - {name: c, file: pairs.yaml, building: home}
+  - {name: d, file: pairs.yaml, building: other}
+pairs:
+  - {a: pairs, b: c, transform: {x: 1.5, y: -2, z: 0, yaw_deg: 30, scale: 1}}
+  - {a: b, b: c, rooms: [[0, 3], [2, 5]]}
+  - {a: c, b: d, different: true}
+split: {train: 0.6, val: 0.2, test: 0.2, seed: 0}
+negatives: 0.25
+"""
 PARTNERS = {"plan.yaml": "plan.pgm", "embedder.onnx": "embedder.card.json", "embedder.card.json": "embedder.onnx"}
 
 
@@ -95,6 +108,13 @@ def read_embedder(path: Path) -> int:
     return len(load_embedder(path.parent)(building(1)))
 
 
+def read_own_pairs(path: Path) -> int:
+    """Read what lists somebody's captures."""
+    from topomerge.datasets.pairs.pairs_file import read_pairs_file
+
+    return len(read_pairs_file(path).pairs)
+
+
 READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others are clouds
     "plan.xml": read_plans,
     "plan.building.yaml": read_plans,
@@ -103,6 +123,7 @@ READERS: dict[str, Callable[[Path], int]] = {  # by name or suffix; all others a
     "atlas.json": read_atlas,
     "embedder.card.json": read_embedder,
     "embedder.onnx": read_embedder,
+    "pairs.yaml": read_own_pairs,
     ".las": read_las,
     ".laz": read_las,
     ".tmap": read_map,
@@ -138,6 +159,8 @@ def write_corpus(folder: Path) -> dict[str, Path]:
     save_map(with_bends(building(2, 2), {1: Placement(Sim3(0.3), turn)}, ["a.ply", "b.ply"]), found["map.tmap"])
     found["plain.npz"] = folder / "plain.npz"
     np.savez(found["plain.npz"], points=samples.box_points(50), poses=np.eye(4)[None], pose_of=np.zeros(50, np.int32))
+    found["pairs.yaml"] = folder / "pairs.yaml"
+    found["pairs.yaml"].write_text(OWN_PAIRS)
     return found | write_walks(folder) | write_plans(folder) | write_embedder(folder) | write_atlas(folder)
 
 

@@ -20,6 +20,7 @@ from topomerge.cli.atlas import ATLAS
 from topomerge.cli.command import Command
 from topomerge.cli.completion import COMPLETION
 from topomerge.cli.console import PrintError, check_memory_limit, failure_line, printing, signal_behind
+from topomerge.cli.dataset import DATASET
 from topomerge.cli.embed import EMBED
 from topomerge.cli.export import EXPORT
 from topomerge.cli.export_embedder import EXPORT_EMBEDDER
@@ -33,7 +34,7 @@ from topomerge.cli.view import VIEW
 from topomerge.cli.watch import WATCH
 from topomerge.errors import printable
 
-COMMANDS = (EXTRACT, INFO, EMBED, MATCH, MERGE, SIMULATE, COMPLETION, ATLAS, WATCH, EXPORT, EXPORT_EMBEDDER, VIEW)
+COMMANDS = (EXTRACT, INFO, EMBED, MATCH, MERGE, SIMULATE, COMPLETION, ATLAS, WATCH, EXPORT, EXPORT_EMBEDDER, VIEW, DATASET)
 
 EXIT_STATUSES = """\
 exit status:

@@ -12,6 +12,7 @@ from typing import Any
 
 from topomerge.code_digest import code_digest
 from topomerge.datasets.pairs.build import Build, build
+from topomerge.datasets.pairs.own_pairs import build_own_sets, check_own_path
 from topomerge.datasets.pairs.recipe import Recipe
 from topomerge.datasets.real.maps import real_evaluation_pairs
 from topomerge.errors import InputError
@@ -60,6 +61,7 @@ def evaluate(settings: Evaluation, say: Say = lambda text: None, command: str = 
         InputError: settings that nothing can be made of, or a folder that was made with others.
     """
     check(settings)
+    settings = with_own_pairs(settings, say)
     folder = folder_of(settings)
     claim(folder, prediction_settings(settings))
     pairs = listed_pairs(folder / "pairs.json", settings, say)
@@ -127,9 +129,39 @@ def listed_pairs(listed: Path, settings: Evaluation, say: Say) -> list[Path]:
     return files
 
 
+def with_own_pairs(settings: Evaluation, say: Say) -> Evaluation:
+    """Name the set of a folder of one's own captures by a hash of all that it is made of; `path` becomes its manifest.
+
+    Raises:
+        InputError: whatever is wrong with the folder.
+    """
+    check_own_path(settings.data.name, settings.path)
+    if not settings.path:
+        return settings
+    cache = Path(settings.cache)
+    manifests = build_own_sets(settings.path, own_cache(cache), settings.jobs, say).manifests
+    part = {"validation": "val"}.get(settings.data.split, settings.data.split)
+    if part not in manifests:
+        raise InputError(f"data.split={settings.data.split}: {', '.join(manifests)} are possible of data=folder")
+    return replace(settings, path=str(manifests[part]), data=replace(settings.data, name=manifests[part].stem))
+
+
+def own_cache(cache: Path) -> Path:
+    """The cache of one's own pairs, which is that of the training: the folder above one that is called `evaluation`."""
+    return cache.parent if cache.name == "evaluation" else cache
+
+
+def list_files(manifest: Path) -> list[Path]:
+    """List the files of the pairs of a manifest."""
+    rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
+    return [manifest.parent / "pairs" / row["file"] for row in rows]
+
+
 def pairs_of(settings: Evaluation, say: Say) -> list[Path]:
     """Files of the kept pairs, made where they are missing."""
     data = settings.data
+    if settings.path:
+        return list_files(Path(settings.path))[: settings.limit or None]
     if data.real:
         real_pairs = real_evaluation_pairs(data.folder, Path(settings.cache), data.real, data.voxel_size, say)
         return real_pairs[: settings.limit or None]
@@ -139,8 +171,7 @@ def pairs_of(settings: Evaluation, say: Say) -> list[Path]:
     name = f"{data.name}-first{pairs}" if pairs < data.pairs else data.name  # the manifest of all pairs stays as it is
     recipe = Recipe(**{f.name: getattr(replace(data, pairs=pairs, name=name), f.name) for f in fields(Recipe)})
     manifest = build(Build(recipe, settings.cache, settings.jobs), say).manifest
-    rows = [json.loads(line) for line in manifest.read_text(encoding="utf-8").splitlines()]
-    return [manifest.parent / "pairs" / row["file"] for row in rows]
+    return list_files(manifest)
 
 
 def report(matches: list[Row], ranks: list[Row], merges: list[Row], settings: Evaluation) -> list[Table]:

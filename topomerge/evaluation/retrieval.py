@@ -17,6 +17,7 @@ import numpy as np
 
 from topomerge.datasets.core.physical import physical_building
 from topomerge.datasets.pairs.evaluation_pair import EvaluationPair, load_evaluation_pair, load_set
+from topomerge.datasets.pairs.own_pairs import build_own_sets, check_own_path
 from topomerge.datasets.real.maps import real_evaluation_pairs
 from topomerge.datasets.real.sources import REAL_SOURCES
 from topomerge.embedding.embedders import embedder
@@ -39,10 +40,12 @@ class Settings(TaskSettings):
     Args:
         descriptor: as of topomerge match.
         manifest: of the cached pairs, below `cache`.
+        path: of ``data=folder``: a folder of captures with a `pairs.yaml`, whose test pairs are taken instead.
     """
 
     descriptor: str = "learned"
     manifest: str = "evaluation/heldout.jsonl"
+    path: str = ""
 
 
 @dataclass(frozen=True)
@@ -158,14 +161,26 @@ def count_rooms(pairs: Sequence[EvaluationPair]) -> int:
     return sum(len(pair.maps()[0].rooms) for pair in pairs)
 
 
+def find_manifest(settings: Settings, say: Say) -> Path:
+    """Find the manifest of the pairs; that of one's own is made where it is missing.
+
+    Raises:
+        InputError: whatever is wrong with the folder.
+    """
+    check_own_path(settings.data.set, settings.path)
+    if settings.path:
+        return build_own_sets(settings.path, settings.cache, settings.jobs, say).manifests["test"]
+    return Path(settings.cache) / settings.manifest
+
+
 def list_inputs(settings: Settings) -> list[str]:
     """Names of set and descriptor."""
-    return [settings.data.set, settings.manifest, settings.descriptor]
+    return [settings.data.set, settings.path or settings.manifest, settings.descriptor]
 
 
 def measure(settings: Settings, say: Say) -> list[Row]:
     """Look for every map: one row with the tables' words, as searches are seconds beside the descriptors."""
-    pairs = load_set(Path(settings.cache) / settings.manifest)[: settings.data.limit or None]
+    pairs = load_set(find_manifest(settings, say))[: settings.data.limit or None]
     name, describe = settings.descriptor, embedder(settings.descriptor)
     rows = [(describe(a), describe(b)) for a, b in (pair.maps() for pair in pairs)]
     say(f"{len(rows)} pairs described")

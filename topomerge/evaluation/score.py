@@ -69,19 +69,21 @@ def group_of(pair: EvaluationPair, settings: Evaluation) -> Row:
     about = pair.about
     source, common, kind = about["source"], float(about["common"]), about["kind"]
     real = source in REAL_SOURCES
-    origins = captures(source, about["title"]) if real else (f"{pair.name}a", f"{pair.name}b")
+    own = "captures" in about
+    title = about["title"] if real or own else pair.name
+    origins = captures(source, title) if real else about["captures"] if own else (f"{pair.name}a", f"{pair.name}b")
     size = next(name for name, limit in AREAS if common < limit) if kind == "overlap" and common >= 1 else "none"
     change = about.get("change") or ("", 0.0)
     change = ("", 0.0) if change[0] == "plan" else change  # another sensor, no curve
     return {
         "pair": pair.name,
-        "title": about["title"] if real else pair.name,
+        "title": title,
         "building": physical_building(source, about["building"]),
         "capture_a": origins[0],
         "capture_b": origins[1],
         "independent": origins[0] != origins[1],
         "source": source,
-        "origin": "real maps" if real else "procedural" if source == "procedural" else "real plans",
+        "origin": "real maps" if real or own else "procedural" if source == "procedural" else "real plans",
         "seen": "trained" if source in settings.data.trained else "unseen",
         "sensors": "-".join(sorted(about["sensors"])),
         "modality": modality(about["sensors"]),

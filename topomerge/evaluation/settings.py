@@ -46,7 +46,8 @@ class Evaluation:
     Args:
         run: trained embedders: runs, what was exported of them, or folders of runs (a sweep's), of which each is taken.
         name: folder below `folder`; empty: from the data and the runs.
-        cache: of the pairs and of descriptors.
+        path: of ``data=folder``: a folder of captures with a `pairs.yaml`, of which the part ``data.split`` is evaluated.
+        cache: of the pairs and of descriptors; one's own pairs lie where those of the training do, in the folder above.
         limit: only the first so many pairs; 0: all.
         jobs: processes.
         descriptors: name -> options of `embedder`, its `name` among them.
@@ -73,6 +74,7 @@ class Evaluation:
     run: list[str] = field(default_factory=list)
     name: str = ""
     folder: str = "runs/eval"
+    path: str = ""
     cache: str = "cache/evaluation"
     limit: int = 0
     jobs: int = 1

@@ -32,7 +32,7 @@ from topomerge.training.loop import Loop, Schedule, State, build_diverged, group
 from topomerge.training.packed import EXTRAS, GraphPair, load_pairs
 from topomerge.training.provenance import describe_provenance
 from topomerge.training.run_folder import begin_run, export_files
-from topomerge.training.settings import Augment, Training, check, to_dict
+from topomerge.training.settings import VALIDATION, Augment, Training, check, to_dict
 from topomerge.training.splits import hold_out
 from topomerge.training.tasks import check_start
 from topomerge.training.validate import validate
@@ -58,6 +58,7 @@ def fit(settings: Training, say: Say = lambda text: print(text, file=sys.stderr,
     fabric = start_fabric(settings)
     chief = fabric.is_global_zero
     say = say if chief else lambda text: None
+    settings = with_own_pairs(settings, say, fabric)
     train, watched = _data(settings, say, fabric)
     network = _network(settings, train)
     fused = fabric.device.type == "cuda"  # one launch for all weights
@@ -249,6 +250,22 @@ def find_precision(settings: Training) -> str:
     """Return the precision of a training: what is asked for, or what suits the accelerator."""
     on_cuda = settings.accelerator in ("cuda", "gpu", "auto") and torch.cuda.is_available()
     return ("bf16-mixed" if on_cuda else "32-true") if settings.precision == "auto" else settings.precision
+
+
+def with_own_pairs(settings: Training, say: Say, fabric: Any) -> Training:
+    """Name the sets of a folder of one's own captures, made by one process while the others wait.
+
+    Raises:
+        InputError: whatever is wrong with the folder.
+    """
+    if not settings.path:
+        return settings
+    from topomerge.datasets.pairs.own_pairs import build_own_sets
+
+    with fabric.rank_zero_first():
+        manifests = build_own_sets(settings.path, settings.cache, say=say).manifests
+    watched = str(manifests["val"]) if settings.validation == VALIDATION else settings.validation
+    return replace(settings, data=str(manifests["train"]), validation=watched)
 
 
 def _data(settings: Training, say: Say, fabric: Any) -> tuple[list[GraphPair], list[GraphPair]]:

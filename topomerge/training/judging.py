@@ -41,12 +41,14 @@ def judge_task(task: str, words: Sequence[str], say: Say) -> Judgement:
     file = weights_of(task, named.get("run", ""))
     module = import_module(f"topomerge.training.{TASKS[task].module}")
     scores = dict(module.judge(settings, file, say))
-    folder = Path(named.get("folder", "runs/eval")) / f"{task}-{settings.heldout.name}"
+    own = getattr(settings, "path", "")
+    heldout = Path(own).resolve().name if own else settings.heldout.name
+    folder = Path(named.get("folder", "runs/eval")) / f"{task}-{heldout}"
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    record = {"task": task, "weights": str(file), "sha256": digest, "heldout": settings.heldout.name, "scores": scores}
+    record = {"task": task, "weights": str(file), "sha256": digest, "heldout": heldout, "scores": scores}
     texts = {name: f"{value:.3f}" if isinstance(value, float) else str(value) for name, value in scores.items()}
     rows = [f"| {name} | {text} |" for name, text in texts.items()]
-    head = f"{task}: {file.name} of {named.get('run') or 'the package'} on {settings.heldout.name}"
+    head = f"{task}: {file.name} of {named.get('run') or 'the package'} on {heldout}"
     summary = "\n".join([f"{head}\n", "| score | value |", "|---|---|", *rows])
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in (("scores.json", json.dumps(record, indent=1)), ("report.md", f"# {summary}")):

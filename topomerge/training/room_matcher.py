@@ -9,7 +9,7 @@ none has any. The turn is learned with it: matchings at the true turn are to be 
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -222,6 +222,7 @@ def fit(settings: RoomMatching, say: Say) -> dict[str, float]:
     Raises:
         InputError: no pairs, or the embedder that ships has no rows for turns.
     """
+    settings = with_own_sets(settings, say)
     network, embedder = shipped_embedder()
     learned = read_examples(settings, settings.data.name, network, settings.views, say)
     watched = read_examples(settings, settings.validation, network, 0, say)
@@ -233,9 +234,27 @@ def fit(settings: RoomMatching, say: Say) -> dict[str, float]:
 
 def judge(settings: RoomMatching, file: Path, say: Say) -> dict[str, Any]:
     """Scores of weights on pairs of buildings that trained nothing."""
+    settings = with_own_sets(settings, say)
     network, _ = shipped_embedder()
     watched = read_examples(settings, settings.heldout.name, network, 0, say)
     return {**matcher_scores(watched, read_matcher(file)), "pairs": len(watched)}
+
+
+def with_own_sets(settings: RoomMatching, say: Say) -> RoomMatching:
+    """Name the sets of a folder of one's own captures, made where they are missing.
+
+    Raises:
+        InputError: whatever is wrong with the folder.
+    """
+    if not settings.path:
+        return settings
+    from topomerge.datasets.pairs.own_pairs import build_own_sets
+    from topomerge.datasets.pairs.pairs_file import PARTS
+
+    manifests = build_own_sets(settings.path, settings.cache, settings.jobs, say).manifests
+    train, val, test = (str(manifests[part]) for part in PARTS)
+    data, heldout = replace(settings.data, name=train), replace(settings.heldout, name=test)
+    return replace(settings, data=data, heldout=heldout, validation=val)
 
 
 def shipped_embedder() -> tuple[Embedder, str]:

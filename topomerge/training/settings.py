@@ -17,6 +17,7 @@ from topomerge.training.shared_settings import check_numbers
 
 FREEZE = ("", "geometry")
 ACCELERATORS, PRECISIONS = ("cpu", "cuda", "gpu", "auto"), ("auto", "32-true", "bf16-mixed", "16-mixed")
+VALIDATION = "val_small"  # the set that is watched
 BATCHES = ("auto", "host", "device")
 
 
@@ -60,6 +61,7 @@ class Training:
     name: of the run; its folder is `runs`/`name`.
     data: name of the set of pairs to train on: `cache`/`data`.jsonl, or the path of a manifest or packed file.
     validation: likewise of the set to watch; empty: a tenth of the training buildings is held out.
+    path: of ``data=folder``: a folder of captures with a `pairs.yaml`; its own pairs are watched, where `validation` is not set.
     limit: of the first pairs only; 0: all.
     epochs: at most; rate: of learning, rises over `warmup` of all steps and falls to nothing.
     batch: pairs of maps a step, of each process.
@@ -80,7 +82,8 @@ class Training:
     runs: str = "runs"
     cache: str = "cache"
     data: str = "train_small"
-    validation: str = "val_small"
+    validation: str = VALIDATION
+    path: str = ""
     limit: int = 0
     seed: int = 0
     epochs: int = 40
@@ -159,6 +162,9 @@ def with_recipe() -> type[Training]:
 
 def composed(given: Any) -> Training:
     """`Training` out of what `with_recipe` says: of the data only the name is needed."""
+    from topomerge.datasets.pairs.own_pairs import check_own_path
+
+    check_own_path(given.data.name, given.path)
     values = {f.name: getattr(given, f.name) for f in fields(Training)}
     return Training(**{**values, "data": given.data.name})
 

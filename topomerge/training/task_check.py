@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
+from topomerge.datasets.pairs.own_pairs import OWN_DATA, check_own_path
 from topomerge.errors import InputError
 from topomerge.extraction.elevations.elevation import WALL_CLASSES
 from topomerge.training.scan_settings import PlanSegmentation, WallSegmentation
 from topomerge.training.shared_settings import TaskSettings, check_numbers
-from topomerge.training.task_settings import LOOKALIKES_TAKEN, MergeBelief
+from topomerge.training.task_settings import LOOKALIKES_TAKEN, MergeBelief, RoomMatching
 
 
 def check_task(settings: TaskSettings) -> None:
@@ -43,6 +44,11 @@ def check_task(settings: TaskSettings) -> None:
         raise InputError(f"accelerator must be cpu or cuda, not {settings.accelerator!r}")  # type: ignore[attr-defined]
     if len(getattr(settings, "halves", [])) not in (0, 2):
         raise InputError(f"halves must name two runs, not {settings.halves}")  # type: ignore[attr-defined]
+    data = getattr(getattr(settings, "data", None), "name", "")
+    if isinstance(settings, RoomMatching):
+        check_own_path(data, settings.path)
+    elif data == OWN_DATA:
+        raise InputError(f"data={OWN_DATA}: is for the tasks embedding and room_matcher, not for {settings.task}")
     if not settings.name or Path(settings.name).is_absolute() or ".." in Path(settings.name).parts:
         raise InputError(f"name must name a folder inside {settings.runs}, not {settings.name!r}")
     if isinstance(settings, PlanSegmentation):

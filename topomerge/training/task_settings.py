@@ -103,6 +103,7 @@ class MergeBelief(TaskSettings):
 class RoomMatching(NetworkTask):
     """Args:
     data: name of a set of pairs (`cache`/<name>.jsonl) or a manifest, and validation the one that is watched, as of `embedding`.
+    path: of ``data=folder``, as of `embedding`; ``evaluate.py task=room_matcher`` judges by the pairs of its test.
     views: of each map that are changed, beside the one that is as it is.
     width: numbers of a room within the network; layers: of attention.
     without: parts that are left out (`models.room_matcher.MATCHER_PARTS`): votes, ways, facts, within, across.
@@ -115,6 +116,7 @@ class RoomMatching(NetworkTask):
     data: Recipe = field(default_factory=Recipe)
     heldout: Recipe = field(default_factory=Recipe)
     validation: str = "val_small"
+    path: str = ""
     views: int = 5
     width: int = 96
     layers: int = 3
